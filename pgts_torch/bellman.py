@@ -1,0 +1,112 @@
+"""What may follow a state and an action, and the one Bellman kernel that everything else is built on.
+
+A tabular MDP is a table of outcomes for all its states. A level of a lookahead is a table of outcomes for its frontier.
+Both are `Outcomes` and both are backed up by `backup`, so exact truth and search cannot drift apart.
+"""
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+_INT32_LIMIT = 2**31
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """What may follow each of N states under each of A actions: at most K weighted children.
+
+    A terminal outcome has discount 0: nothing after it counts. There is no other mark for it, and no gamma beside it.
+    Rows with fewer than K outcomes are padded with probability 0.
+
+    Args:
+        reward_NA: expected immediate reward r(s, a), in reward units.
+        prob_NAK: probability p_k of each outcome; every (s, a) sums to 1.
+        discount_NAK: gamma_k in [0, 1] of each outcome. An expanded (stride 0) tensor costs no memory.
+        child_NAK: position of each child in the table of `num_children` values that `backup` reads.
+        num_children: how many values that table holds.
+    """
+
+    reward_NA: Float[Tensor, "N A"]
+    prob_NAK: Float[Tensor, "N A K"]
+    discount_NAK: Float[Tensor, "N A K"]
+    child_NAK: Int[Tensor, "N A K"]
+    num_children: int
+
+    @property
+    def num_states(self) -> int:
+        return self.reward_NA.shape[0]
+
+    @property
+    def num_actions(self) -> int:
+        return self.reward_NA.shape[1]
+
+    @property
+    def num_outcomes(self) -> int:
+        """K, the most outcomes that one (s, a) has."""
+        return self.child_NAK.shape[2]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.reward_NA.dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self.reward_NA.device
+
+    @cached_property
+    def weight(self) -> Tensor:
+        """Sparse CSR matrix of p_k gamma_k, shape [N * A, num_children]; its indices are int32 where they fit,
+        which makes its product with a vector two to four times faster than int64 does."""
+        N, A, K = self.child_NAK.shape
+        index = torch.int32 if max(N * A * K, self.num_children) < _INT32_LIMIT else torch.int64
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+            return torch.sparse_csr_tensor(
+                torch.arange(N * A + 1, dtype=index, device=self.device) * K,
+                self.child_NAK.reshape(-1).to(index),
+                (self.prob_NAK * self.discount_NAK).reshape(-1),
+                size=(N * A, self.num_children),
+                check_invariants=False,
+            )
+
+    def rows(self, row_N: Int[Tensor, "N"]) -> Self:
+        """The outcomes of some of the states, in the order asked for."""
+        return type(self)(
+            self.reward_NA[row_N],
+            self.prob_NAK[row_N],
+            self.discount_NAK[row_N],
+            self.child_NAK[row_N],
+            self.num_children,
+        )
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
+        """The same outcomes on another device or in another floating dtype."""
+        return type(self)(
+            self.reward_NA.to(device, dtype),
+            self.prob_NAK.to(device, dtype),
+            self.discount_NAK.to(device, dtype),
+            self.child_NAK.to(device),
+            self.num_children,
+        )
+
+
+def backup(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
+    """Action values one step above the values `v` of the children.
+
+        q(s, a) = r(s, a) + sum_k p_k gamma_k v(s'_k)        [PGTS Sec. 2]
+
+    Args:
+        outcomes: what may follow each of N states under each action.
+        v_C: one value for each of `outcomes.num_children` children, in reward units and in the dtype of `outcomes`.
+
+    Returns:
+        q, in the dtype of `outcomes`; it carries no gradient.
+    """
+    N, A = outcomes.reward_NA.shape
+    with torch.no_grad():
+        return outcomes.reward_NA + torch.mv(outcomes.weight, v_C).view(N, A)

@@ -1,0 +1,13 @@
+"""The errors that a caller can cause. Each message names the culprit, its value and what is required."""
+
+
+class PgtsError(ValueError):
+    """Something that the caller gave cannot be used."""
+
+
+class NodeBudgetExceeded(PgtsError):
+    """A lookahead would need more nodes than its budget allows."""
+
+
+class MissingModel(PgtsError):
+    """An environment offers no model that a lookahead could ask."""

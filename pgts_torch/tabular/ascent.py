@@ -1,0 +1,111 @@
+"""Algorithm 1 of the paper with exact quantities, and the three ways in which a policy may move."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.tabular import exact
+from pgts_torch.tabular.mdp import TabularMDP
+
+
+@dataclass(frozen=True, eq=False)
+class Ascent:
+    """What Algorithm 1 did in K iterations: the return of pi_0 .. pi_K, and pi_K."""
+
+    J_K: Float[Tensor, "K"]
+    pi_SA: Float[Tensor, "S A"]
+
+
+def ascend(
+    mdp: TabularMDP,
+    pi_SA: Float[Tensor, "S A"],
+    *,
+    depth: int,
+    step_size: float,
+    iterations: int,
+    step: Callable[[Tensor, Tensor, Tensor, float], Tensor] | None = None,
+) -> Ascent:
+    """Algorithm 1 with exact quantities: only states with d^pi(s) > 0 move.        [PGTS Alg. 1]
+
+    Args:
+        mdp: the MDP.
+        pi_SA: the initial policy pi_0.
+        depth: m, how often T is applied to Q^pi. 0 is plain policy gradient.
+        step_size: eta, at least 0; the same in every iteration.
+        iterations: how many updates.
+        step: `projected_step` (the paper's, default), `softmax_step` or `mirror_step`.
+    """
+    step = step or projected_step
+    if step_size < 0:
+        raise PgtsError(f"step_size is {step_size}; it must be at least 0")
+    exact.check_depth(depth)
+    returns = []
+    for _ in range(iterations):
+        evaluation = exact.evaluate(mdp, pi_SA)
+        returns.append(evaluation.J)
+        look_SA = exact.lookahead(mdp, evaluation.q_SA, depth)
+        visited = evaluation.d_S > 0
+        pi_SA = pi_SA.clone()
+        pi_SA[visited] = step(pi_SA[visited], look_SA[visited], evaluation.d_S[visited], step_size)
+    returns.append(exact.evaluate(mdp, pi_SA).J)
+    return Ascent(torch.tensor(returns, dtype=torch.float64), pi_SA)
+
+
+def project_simplex(x_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
+    """The nearest distribution to each row, in the Euclidean norm.
+
+        proj[x] = max(x - tau, 0),  tau such that it sums to 1
+
+    tau is found by sorting (Held, Wolfe and Crowder 1974; Duchi et al. 2008). Rows are shifted by their maximum first,
+    which changes nothing but the rounding.
+    """
+    x_NA = x_NA - x_NA.amax(-1, keepdim=True)
+    sorted_NA = x_NA.sort(-1, descending=True).values
+    rank_A = torch.arange(1, x_NA.shape[-1] + 1, dtype=x_NA.dtype, device=x_NA.device)
+    tau_NA = (sorted_NA.cumsum(-1) - 1) / rank_A
+    last_N1 = (sorted_NA > tau_NA).sum(-1, keepdim=True) - 1
+    return (x_NA - tau_NA.gather(-1, last_N1)).clamp(min=0)
+
+
+def projected_step(
+    pi_NA: Float[Tensor, "N A"], q_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"], step_size: float
+) -> Float[Tensor, "N A"]:
+    """The paper's update.        [PGTS Eq. (3)]
+
+    pi'(.|s) = proj[ pi(.|s) + eta w(s) q(s, .) ]
+    """
+    return project_simplex(pi_NA + step_size * weight_N[:, None] * q_NA)
+
+
+def mirror_step(
+    pi_NA: Float[Tensor, "N A"], q_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"], step_size: float
+) -> Float[Tensor, "N A"]:
+    """Mirror ascent with the KL divergence (Protopapas and Barakat 2024; Xiao 2022). It leaves zeros at zero.
+
+    pi'(a|s) ~ pi(a|s) exp(eta w(s) q(s, a)) = argmax_p  eta w(s) <p, q(s, .)> - KL(p, pi(.|s))
+    """
+    return (pi_NA.log() + step_size * weight_N[:, None] * q_NA).softmax(-1)
+
+
+def softmax_direction(
+    pi_NA: Float[Tensor, "N A"], q_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]
+) -> Float[Tensor, "N A"]:
+    """Gradient in the logits of sum_s w(s) sum_a pi(a|s) q(s, a), with w and q held fixed.
+
+        w(s) pi(a|s) (q(s, a) - <pi(.|s), q(s, .)>)
+
+    With w = d^pi and q = Q^pi it is the gradient of J (Sutton et al. 1999); with q = T^m Q^pi the direction of PGTS.
+    """
+    baseline_N1 = (pi_NA * q_NA).sum(-1, keepdim=True)
+    return weight_N[:, None] * pi_NA * (q_NA - baseline_N1)
+
+
+def softmax_step(
+    pi_NA: Float[Tensor, "N A"], q_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"], step_size: float
+) -> Float[Tensor, "N A"]:
+    """One gradient step of size eta on the logits log pi. It leaves zeros at zero."""
+    return (pi_NA.log() + step_size * softmax_direction(pi_NA, q_NA, weight_N)).softmax(-1)

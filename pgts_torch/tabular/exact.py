@@ -1,0 +1,190 @@
+"""The exact theory of a tabular MDP, in float64: what every estimate in this library is held to."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pgts_torch.bellman import backup
+from pgts_torch.errors import PgtsError
+from pgts_torch.tabular.mdp import TabularMDP
+
+DENSE_LIMIT = 1500
+"""Up to this many states a policy is evaluated by a dense solve, beyond it by a sparse iterative one."""
+
+SOLVE_TOLERANCE = 1e-12
+"""Largest residual of the iterative solve, relative to the right-hand side, in the maximum norm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What a policy is worth.
+
+    v_S: v^pi = (I - gamma P^pi)^-1 R^pi.   q_SA: Q^pi = R + gamma P v^pi.
+    d_S: occupancy mu^T (I - gamma P^pi)^-1, unnormalised.   J: return mu^T v^pi.        [PGTS Sec. 2]
+    """
+
+    v_S: Float[Tensor, "S"]
+    q_SA: Float[Tensor, "S A"]
+    d_S: Float[Tensor, "S"]
+    J: float
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """v*, Q* and J* = mu^T v*, with a deterministic policy that attains them."""
+
+    v_S: Float[Tensor, "S"]
+    q_SA: Float[Tensor, "S A"]
+    pi_SA: Float[Tensor, "S A"]
+    J: float
+
+
+def evaluate(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Evaluation:
+    """v^pi, Q^pi, d^pi and J^pi.        [PGTS Sec. 2]
+
+    Args:
+        mdp: the MDP.
+        pi_SA: pi(a|s), each row a distribution.
+
+    Raises:
+        PgtsError: a row of pi is not a distribution, or the policy neither discounts nor ends (no finite value).
+    """
+    v_S = policy_values(mdp, pi_SA)
+    return Evaluation(v_S, backup(mdp.outcomes, v_S), occupancy(mdp, pi_SA), float(mdp.start_S @ v_S))
+
+
+def policy_values(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S"]:
+    """v^pi = (I - gamma P^pi)^-1 R^pi.        [PGTS Sec. 2]"""
+    pi_SA = check_policy(mdp, pi_SA)
+    return _solve(mdp, pi_SA, (pi_SA * mdp.outcomes.reward_NA).sum(-1), transpose=False)
+
+
+def occupancy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S"]:
+    """d^pi = mu^T (I - gamma P^pi)^-1, unnormalised: it sums to 1/(1 - gamma).        [PGTS Sec. 2]
+
+    States that pi never reaches from the start distribution get exactly 0.
+    """
+    pi_SA = check_policy(mdp, pi_SA)
+    d_S = _solve(mdp, pi_SA, mdp.start_S, transpose=True)
+    return torch.where(support(mdp, pi_SA), d_S, 0.0)
+
+
+def support(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Tensor:
+    """sigma_pi = {s : d^pi(s) > 0} as a mask, by reachability instead of rounding.        [PGTS Sec. 4]"""
+    matrix = _policy_matrix(mdp, pi_SA)
+    reached = mdp.start_S.numpy() > 0
+    frontier = reached
+    while frontier.any():
+        frontier = ((matrix.T @ frontier.astype(np.float64)) > 0) & ~reached
+        reached = reached | frontier
+    return torch.from_numpy(reached)
+
+
+def bellman(mdp: TabularMDP, q_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S A"]:
+    """(T Q)(s, a) = r(s, a) + sum_s' gamma P(s'|s, a) max_a' Q(s', a').        [PGTS Sec. 3]"""
+    return backup(mdp.outcomes, q_SA.amax(-1))
+
+
+def lookahead(mdp: TabularMDP, q_SA: Float[Tensor, "S A"], depth: int) -> Float[Tensor, "S A"]:
+    """T^m Q for m = depth.        [PGTS Sec. 3]
+
+    With Q = Q^pi it equals h-PMD's Q_h for h = m + 1 (Protopapas and Barakat, NeurIPS 2024).
+    """
+    for _ in range(check_depth(depth)):
+        q_SA = bellman(mdp, q_SA)
+    return q_SA
+
+
+def optimal(mdp: TabularMDP) -> Optimum:
+    """v*, Q*, J* by policy iteration: v^{pi_0} <= v^{pi_1} <= ... ends at v* = T v*  (Howard, 1960).
+
+    The policy changes only where an action is better by more than rounding, so it ends after finitely many steps.
+    """
+    action_S = mdp.outcomes.reward_NA.argmax(-1)
+    while True:
+        pi_SA = torch.nn.functional.one_hot(action_S, mdp.num_actions).double()
+        v_S = policy_values(mdp, pi_SA)
+        q_SA = backup(mdp.outcomes, v_S)
+        rounding = 1e-11 * max(1.0, float(q_SA.abs().max()))
+        kept_S = q_SA.gather(1, action_S[:, None]).squeeze(1)
+        better_S = q_SA.amax(-1) > kept_S + rounding
+        if not better_S.any():
+            return Optimum(v_S, q_SA, pi_SA, float(mdp.start_S @ v_S))
+        action_S = torch.where(better_S, q_SA.argmax(-1), action_S)
+
+
+def check_policy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S A"]:
+    """pi in float64; PgtsError unless each row is a distribution."""
+    if pi_SA.shape != (mdp.num_states, mdp.num_actions):
+        raise PgtsError(f"pi_SA has shape {tuple(pi_SA.shape)}; the MDP asks for {(mdp.num_states, mdp.num_actions)}")
+    tolerance = 1e-9 if pi_SA.dtype == torch.float64 else 1e-5
+    pi_SA = pi_SA.detach().to("cpu", torch.float64)
+    bad_S = ~((pi_SA >= 0).all(-1) & ((pi_SA.sum(-1) - 1).abs() <= tolerance))
+    if bad_S.any():
+        s = int(torch.nonzero(bad_S)[0])
+        raise PgtsError(f"pi_SA[{s}] is not a distribution: {pi_SA[s].tolist()}")
+    return pi_SA
+
+
+def check_depth(depth: int) -> int:
+    """The depth; PgtsError unless it is a finite whole number of at least 0."""
+    if isinstance(depth, bool) or not isinstance(depth, int) or depth < 0:
+        raise PgtsError(f"depth is {depth!r}; it must be a finite whole number of at least 0")
+    return depth
+
+
+def _policy_matrix(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> scipy.sparse.csr_array:
+    """gamma P^pi as a sparse [S, S] matrix that shares the column indices of the outcomes."""
+    S, A, K = mdp.outcomes.child_NAK.shape
+    weight = mdp.outcomes.weight
+    values = (pi_SA[:, :, None] * weight.values().view(S, A, K)).reshape(-1)
+    rows = np.arange(S + 1, dtype=np.int32) * (A * K)
+    return scipy.sparse.csr_array((values.numpy(), weight.col_indices().numpy(), rows), shape=(S, S), copy=False)
+
+
+def _solve(mdp: TabularMDP, pi_SA: Tensor, b_S: Float[Tensor, "S"], *, transpose: bool) -> Float[Tensor, "S"]:
+    """x with (I - gamma P^pi) x = b, or with the transposed matrix."""
+    matrix = _policy_matrix(mdp, pi_SA)
+    _check_ends(matrix)
+    solve = _solve_dense if mdp.num_states <= DENSE_LIMIT else _solve_iterative
+    return torch.from_numpy(solve(matrix.T if transpose else matrix, b_S.numpy()))
+
+
+def _check_ends(matrix: scipy.sparse.csr_array) -> None:
+    """PgtsError unless every state can reach one where the policy discounts or terminates: else I - M is singular."""
+    ends = np.asarray(matrix.sum(axis=1)) < 1 - 1e-12
+    while not ends.all():
+        grown = ends | ((matrix @ ends.astype(np.float64)) > 0)
+        if (grown == ends).all():
+            raise PgtsError(
+                f"the policy has no finite value in state {int(np.argmin(ends))}: from there on it neither "
+                f"discounts (gamma is 1) nor terminates"
+            )
+        ends = grown
+
+
+def _solve_dense(matrix: scipy.sparse.sparray, b: np.ndarray) -> np.ndarray:
+    return np.linalg.solve(np.eye(len(b)) - matrix.toarray(), b)
+
+
+def _solve_iterative(matrix: scipy.sparse.sparray, b: np.ndarray) -> np.ndarray:
+    """BiCGSTAB, restarted until the residual b - (I - M) x is within SOLVE_TOLERANCE of b."""
+
+    def identity_minus(x: np.ndarray) -> np.ndarray:
+        return x - matrix @ x
+
+    operator = scipy.sparse.linalg.LinearOperator(matrix.shape, matvec=identity_minus, dtype=b.dtype)
+    scale = max(float(np.abs(b).max()), np.finfo(float).tiny)
+    x = np.zeros_like(b)
+    for _ in range(20):
+        residual = b - identity_minus(x)
+        if np.abs(residual).max() <= SOLVE_TOLERANCE * scale:
+            return x
+        correction, _ = scipy.sparse.linalg.bicgstab(operator, residual, rtol=1e-10, atol=0.0, maxiter=2000)
+        x = x + correction
+    raise PgtsError(f"the iterative solve of {len(b)} states stopped at a residual of {np.abs(residual).max():.1e}")

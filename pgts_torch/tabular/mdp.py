@@ -1,0 +1,269 @@
+"""Finite Markov decision processes, validated when they are made."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import gymnasium
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.errors import MissingModel, PgtsError
+
+ROW_SUM_TOLERANCE = 1e-9
+"""How far from 1 the probabilities of a row may sum before it is refused."""
+
+Transition = tuple[float, int, float, bool]
+"""(probability, next state, reward, terminated), as in the P tables of Gymnasium's toy-text environments."""
+
+
+@dataclass(frozen=True, eq=False)
+class TabularMDP:
+    """Outcomes over all S states and a start distribution, in float64.
+
+    Args:
+        outcomes: what may follow every state; children are states.
+        start_S: start distribution mu [PGTS Sec. 2].
+        action_names: one word an action, for pictures and messages. Default "0", "1", ...
+        shape: (rows, columns) in which a picture lays the states out, row by row. Default one row.
+
+    Raises:
+        PgtsError: a row is not a distribution, a discount is outside [0, 1], a value is not finite, a child does not
+            exist or a shape is wrong; the message names the first offending (s, a).
+    """
+
+    outcomes: Outcomes
+    start_S: Float[Tensor, "S"]
+    action_names: tuple[str, ...] = ()
+    shape: tuple[int, int] = (0, 0)
+
+    def __post_init__(self) -> None:
+        if not self.action_names:
+            object.__setattr__(self, "action_names", tuple(str(a) for a in range(self.num_actions)))
+        if self.shape == (0, 0):
+            object.__setattr__(self, "shape", (1, self.num_states))
+        _check_outcomes(self.outcomes)
+        if self.outcomes.num_children != self.num_states:
+            raise PgtsError(f"outcomes point into {self.outcomes.num_children} states; the MDP has {self.num_states}")
+        _check_start(self.start_S, self.num_states)
+        if len(self.action_names) != self.num_actions:
+            raise PgtsError(f"{len(self.action_names)} action names for {self.num_actions} actions")
+        if self.shape[0] * self.shape[1] != self.num_states:
+            raise PgtsError(f"shape {self.shape} does not hold {self.num_states} states")
+
+    @property
+    def num_states(self) -> int:
+        return self.outcomes.num_states
+
+    @property
+    def num_actions(self) -> int:
+        return self.outcomes.num_actions
+
+    @classmethod
+    def from_dense(
+        cls, P_SAS: ArrayLike, R_SA: ArrayLike, gamma: float, *, start: int | ArrayLike | None = None
+    ) -> Self:
+        """An MDP from the arrays of a textbook.
+
+        Args:
+            P_SAS: P[s, a, s'], each P[s, a] a distribution.
+            R_SA: expected rewards.
+            gamma: discount in [0, 1].
+            start: a state, a distribution over states, or None for the uniform one.
+        """
+        P = np.asarray(P_SAS, dtype=np.float64)
+        R = np.asarray(R_SA, dtype=np.float64)
+        if P.ndim != 3 or P.shape[0] != P.shape[2] or 0 in P.shape:
+            raise PgtsError(f"P_SAS has shape {P.shape}; it must be [S, A, S] with at least one state and one action")
+        if R.shape != P.shape[:2]:
+            raise PgtsError(f"R_SA has shape {R.shape}; P_SAS asks for {P.shape[:2]}")
+        check_gamma(gamma)
+        off = (P < 0) | ~np.isfinite(P)
+        if off.any():
+            s, a, t = np.argwhere(off)[0]
+            raise PgtsError(f"P_SAS[{s}, {a}, {t}] is {P[s, a, t]}; probabilities are finite and at least 0")
+        K = max(1, int((P > 0).sum(-1).max()))
+        child = np.argsort(P == 0, axis=-1, kind="stable")[..., :K]
+        prob = torch.from_numpy(np.take_along_axis(P, child, axis=-1))
+        outcomes = Outcomes(
+            torch.from_numpy(R.copy()),
+            prob,
+            torch.tensor(float(gamma), dtype=torch.float64).expand(prob.shape),
+            torch.from_numpy(child),
+            len(P),
+        )
+        return cls(outcomes, start_distribution(start, len(P)))
+
+    @classmethod
+    def from_transitions(
+        cls,
+        P: Mapping[int, Mapping[int, Sequence[Transition]]] | Sequence[Sequence[Sequence[Transition]]],
+        gamma: float,
+        *,
+        start: int | ArrayLike | None = None,
+        action_names: tuple[str, ...] = (),
+        shape: tuple[int, int] = (0, 0),
+    ) -> Self:
+        """An MDP from lists of transitions, `P[s][a] = [(probability, next state, reward, terminated), ...]`.
+
+        A successor that is listed twice is counted twice. A terminated transition has discount 0. A state that, as far
+        as `start` reaches it at all, is entered only by terminated transitions is terminal: nothing is earned from it,
+        whatever its own rows say.
+
+        Args:
+            P: transitions for states 0..S-1 and actions 0..A-1.
+            gamma: discount in [0, 1] of the transitions that do not terminate.
+            start: a state, a distribution over states, or None for the uniform one.
+        """
+        check_gamma(gamma)
+        S = len(P)
+        A = len(P[0]) if S else 0
+        if S == 0 or A == 0:
+            raise PgtsError("P is empty; it must hold at least one state and one action")
+        rows = [[_merge_successors(P, s, a, S, A) for a in range(A)] for s in range(S)]
+        start_S = start_distribution(start, S)
+        for s in _terminal_states(rows, start_S):
+            rows[s] = [(0.0, {(s, True): 1.0}) for _ in range(A)]
+        K = max(len(successors) for row in rows for _, successors in row)
+        reward = np.zeros((S, A))
+        prob, discount = np.zeros((S, A, K)), np.zeros((S, A, K))
+        child = np.zeros((S, A, K), dtype=np.int64)
+        for s, row in enumerate(rows):
+            for a, (expected_reward, successors) in enumerate(row):
+                reward[s, a] = expected_reward
+                child[s, a] = s
+                for k, ((next_state, terminated), p) in enumerate(successors.items()):
+                    prob[s, a, k], child[s, a, k] = p, next_state
+                    discount[s, a, k] = 0.0 if terminated else gamma
+        arrays = (torch.from_numpy(array) for array in (reward, prob, discount, child))
+        return cls(Outcomes(*arrays, S), start_S, action_names, shape)
+
+    @classmethod
+    def from_gymnasium(cls, env: gymnasium.Env, gamma: float, *, start: int | ArrayLike | None = None) -> Self:
+        """The MDP of a Gymnasium environment that publishes its transitions as `env.unwrapped.P`.
+
+        Args:
+            env: FrozenLake, CliffWalking, Taxi, or any environment with a P table of the same form.
+            gamma: discount in [0, 1].
+            start: a state or a distribution. Default: the environment's `initial_state_distrib`, or the uniform one.
+
+        Raises:
+            MissingModel: the environment has no P table.
+        """
+        unwrapped: Any = env.unwrapped
+        table = getattr(unwrapped, "P", None)
+        if table is None:
+            raise MissingModel(f"{env} has no transition table: env.unwrapped.P is missing")
+        if start is None:
+            start = getattr(unwrapped, "initial_state_distrib", None)
+        rows, columns = getattr(unwrapped, "nrow", 0), getattr(unwrapped, "ncol", 0)
+        shape = getattr(unwrapped, "shape", (int(rows), int(columns)))
+        return cls.from_transitions(table, gamma, start=start, shape=shape)
+
+
+def start_distribution(start: int | ArrayLike | None, num_states: int) -> Float[Tensor, "S"]:
+    """mu as a vector: one state, a given distribution, or None for the uniform one."""
+    if start is None:
+        return torch.full((num_states,), 1 / num_states, dtype=torch.float64)
+    if isinstance(start, int | np.integer):
+        if not 0 <= start < num_states:
+            raise PgtsError(f"start state {start} does not exist; states are 0 to {num_states - 1}")
+        return torch.nn.functional.one_hot(torch.tensor(int(start)), num_states).double()
+    return torch.from_numpy(np.array(start, dtype=np.float64))
+
+
+def check_gamma(gamma: float) -> None:
+    """Raise PgtsError unless gamma is in [0, 1]."""
+    if not 0 <= gamma <= 1:
+        raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
+
+
+def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> tuple[float, dict[tuple[int, bool], float]]:
+    """Expected reward and the probability of each (next state, terminated) that (s, a) may lead to."""
+    if len(P[s]) != A:
+        raise PgtsError(f"P[{s}] has {len(P[s])} actions; P[0] has {A}")
+    expected_reward, successors = 0.0, dict[tuple[int, bool], float]()
+    for p, next_state, reward, terminated in P[s][a]:
+        if not 0 <= next_state < S:
+            raise PgtsError(f"P[{s}][{a}] leads to state {next_state}; states are 0 to {S - 1}")
+        if p < 0 or not np.isfinite(p):
+            raise PgtsError(f"P[{s}][{a}] has probability {p}; probabilities are finite and at least 0")
+        if p > 0:
+            key = (int(next_state), bool(terminated))
+            successors[key] = successors.get(key, 0.0) + float(p)
+            expected_reward += float(p) * float(reward)
+    if not successors:
+        raise PgtsError(f"P[{s}][{a}] has no outcome with positive probability")
+    return expected_reward, successors
+
+
+def _terminal_states(rows: list[list[tuple[float, dict[tuple[int, bool], float]]]], start_S: Tensor) -> set[int]:
+    """States entered by terminated transitions only, as far as the start distribution reaches them."""
+    frontier = torch.nonzero(start_S).flatten().tolist()
+    alive, ended = set(frontier), set[int]()
+    while frontier:
+        s = frontier.pop()
+        for _, successors in rows[s]:
+            for next_state, terminated in successors:
+                if terminated:
+                    ended.add(next_state)
+                elif next_state not in alive:
+                    alive.add(next_state)
+                    frontier.append(next_state)
+    return ended - alive
+
+
+def _check_start(start_S: Tensor, num_states: int) -> None:
+    if start_S.shape != (num_states,):
+        raise PgtsError(f"start_S has shape {tuple(start_S.shape)}; the MDP asks for ({num_states},)")
+    off = torch.nonzero(~torch.isfinite(start_S) | (start_S < 0)).flatten()
+    if len(off):
+        raise PgtsError(f"start_S[{off[0]}] is {start_S[off[0]]}; probabilities are finite and at least 0")
+    if abs(float(start_S.sum()) - 1) > ROW_SUM_TOLERANCE:
+        raise PgtsError(f"start_S is not a distribution: it sums to {float(start_S.sum())}")
+
+
+def _check_outcomes(outcomes: Outcomes) -> None:
+    """Raise PgtsError with the first offending (s, a) unless the table is one of valid outcomes."""
+    reward, prob = outcomes.reward_NA, outcomes.prob_NAK
+    N, A, K = outcomes.child_NAK.shape
+    if min(N, A, K) == 0:
+        raise PgtsError(f"outcomes have shape {(N, A, K)}; each side must be at least 1")
+    for name, tensor, shape in [
+        ("reward_NA", reward, (N, A)),
+        ("prob_NAK", prob, (N, A, K)),
+        ("discount_NAK", outcomes.discount_NAK, (N, A, K)),
+    ]:
+        if tensor.shape != shape:
+            raise PgtsError(f"{name} has shape {tuple(tensor.shape)}; child_NAK asks for {shape}")
+        if tensor.dtype != torch.float64:
+            raise PgtsError(f"{name} is {tensor.dtype}; the exact world is float64")
+    _refuse(~torch.isfinite(reward), lambda s, a: f"R_SA[{s}, {a}] is {reward[s, a]}; rewards must be finite")
+    _refuse(
+        ~((prob >= 0) & (prob <= 1 + ROW_SUM_TOLERANCE)).all(-1),
+        lambda s, a: f"P_SAS[{s}, {a}] has probabilities {prob[s, a].tolist()}; each must be in [0, 1]",
+    )
+    total = prob.sum(-1)
+    _refuse(
+        (total - 1).abs() > ROW_SUM_TOLERANCE,
+        lambda s, a: f"P_SAS[{s}, {a}] is not a distribution: it sums to {float(total[s, a]):.10g}",
+    )
+    discount = outcomes.discount_NAK
+    _refuse(
+        ~((discount >= 0) & (discount <= 1)).all(-1),
+        lambda s, a: f"discount of ({s}, {a}) is {discount[s, a].tolist()}; each must be in [0, 1]",
+    )
+    child = outcomes.child_NAK
+    _refuse(
+        ((child < 0) | (child >= outcomes.num_children)).any(-1),
+        lambda s, a: f"children of ({s}, {a}) are {child[s, a].tolist()}; states are 0 to {outcomes.num_children - 1}",
+    )
+
+
+def _refuse(bad_SA: Tensor, message: Any) -> None:
+    if bad_SA.any():
+        raise PgtsError(message(*torch.nonzero(bad_SA)[0].tolist()))

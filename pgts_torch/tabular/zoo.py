@@ -1,0 +1,203 @@
+"""The MDPs of the paper and of its neighbours, each with its source.
+
+`start` is a state, a distribution over states, or None for the uniform start distribution.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from numpy.typing import ArrayLike
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.errors import PgtsError
+from pgts_torch.seeding import numpy_stream
+from pgts_torch.tabular.mdp import TabularMDP, Transition, check_gamma, start_distribution
+
+LEFT, RIGHT = 0, 1
+Start = int | ArrayLike | None
+
+
+def ladder(n: int = 5, *, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
+    """A chain of n states; only 'right' in the last one is rewarded, with 1.        [PGTS Ex. 1]
+
+    Always 'left' is stationary for every depth below n - 1. J* = gamma^(n-1) / (1 - gamma) from state 0.
+    """
+    _check_size("n", n, 1)
+    P = [
+        [
+            [(1.0, max(s - 1, 0), 0.0, False)],
+            [(1.0, min(s + 1, n - 1), float(s == n - 1), False)],
+        ]
+        for s in range(n)
+    ]
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=("left", "right"))
+
+
+def tightrope(*, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
+    """Four states: s0 -> s1 -> s2 by 'right', where every step earns 1; 'left' in s1 falls to s3, where every step
+    costs 10.        [PGTS Ex. 3; Efroni et al. 2018]
+
+    J* = gamma^2 / (1 - gamma) from state 0.
+    """
+    loop_2, loop_3 = [(1.0, 2, 1.0, False)], [(1.0, 3, -10.0, False)]
+    P = [
+        [[(1.0, 0, 0.0, False)], [(1.0, 1, 0.0, False)]],
+        [[(1.0, 3, 0.0, False)], [(1.0, 2, 0.0, False)]],
+        [loop_2, loop_2],
+        [loop_3, loop_3],
+    ]
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=("left", "right"))
+
+
+def random_mdp(
+    num_states: int = 10,
+    num_actions: int = 2,
+    *,
+    branching: int | None = None,
+    seed: int = 0,
+    gamma: float = 0.9,
+    start: Start = 0,
+) -> TabularMDP:
+    """Random transitions and rewards.        [PGTS Ex. 2; with `branching` a Garnet, Archibald et al. 1995]
+
+    Each (s, a) leads to `branching` distinct states, drawn uniformly, with probabilities uniform on the simplex and a
+    reward uniform in [0, 1].
+
+    Args:
+        branching: successors of each (s, a); None: every state.
+    """
+    _check_size("num_states", num_states, 1)
+    _check_size("num_actions", num_actions, 1)
+    K = num_states if branching is None else branching
+    if not 1 <= K <= num_states:
+        raise PgtsError(f"branching is {branching}; it must be between 1 and num_states = {num_states}")
+    check_gamma(gamma)
+    random = numpy_stream(seed, "random_mdp")
+    prob = random.exponential(size=(num_states, num_actions, K))
+    prob /= prob.sum(-1, keepdims=True)
+    child = _distinct(random, num_states * num_actions, num_states, K).reshape(prob.shape)
+    outcomes = Outcomes(
+        torch.from_numpy(random.random((num_states, num_actions))),
+        torch.from_numpy(prob),
+        torch.tensor(float(gamma), dtype=torch.float64).expand(prob.shape),
+        torch.from_numpy(child),
+        num_states,
+    )
+    return TabularMDP(outcomes, start_distribution(start, num_states))
+
+
+def grid(
+    size: int = 10,
+    *,
+    gamma: float = 0.9,
+    start: Start = 0,
+    slip: float = 0.01,
+    goal: int | None = None,
+    traps: tuple[int, ...] = (12, 32),
+    goal_reward: float = 10.0,
+    trap_reward: float = -10.0,
+    absorbing: bool = False,
+) -> TabularMDP:
+    """A size x size grid; state `size * row + column`; actions left, right, up, down.        [PGTS Ex. 4]
+
+    An action moves one step as intended with probability 1 - slip and in a uniformly random direction with probability
+    slip; a move into the wall stays. Every action in the goal earns `goal_reward`, in a trap `trap_reward`.
+
+    Args:
+        goal: default the last state (99).
+        traps: the text says states 12 and 32; the paper's drawing shows 11 and 32.
+        absorbing: goal and traps end the episode when they are left, instead of being ordinary states.
+    """
+    _check_size("size", size, 1)
+    goal = size * size - 1 if goal is None else goal
+    for name, state in [("goal", goal), *(("trap", trap) for trap in traps)]:
+        if not 0 <= state < size * size:
+            raise PgtsError(f"{name} {state} is not on the grid; states are 0 to {size * size - 1}")
+    if goal in traps:
+        raise PgtsError(f"state {goal} is both goal and trap")
+    if not 0 <= slip <= 1:
+        raise PgtsError(f"slip is {slip}; it must be in [0, 1]")
+    reward = {goal: goal_reward} | dict.fromkeys(traps, trap_reward)
+
+    def transitions(s: int, intended: int) -> list[Transition]:
+        r, ends = reward.get(s, 0.0), absorbing and s in reward
+        return [
+            (slip / 4 + (1 - slip) * (a == intended), next_state, r, ends)
+            for a, next_state in enumerate(_neighbours(s, size))
+        ]
+
+    P = [[transitions(s, a) for a in range(4)] for s in range(size * size)]
+    return TabularMDP.from_transitions(
+        P, gamma, start=start, action_names=("left", "right", "up", "down"), shape=(size, size)
+    )
+
+
+def deep_sea(
+    n: int = 10,
+    *,
+    gamma: float = 0.99,
+    start: Start = 0,
+    move_cost: float = 0.01,
+    mapping_seed: int | None = None,
+    stochastic: bool = False,
+) -> TabularMDP:
+    """An n x n sea; each step sinks one row, left or right; the treasure (1) lies at the bottom right.
+    [Osband et al., bsuite, 2020]
+
+    Going right costs move_cost / n, so only the one path that goes right n times pays. The episode ends after n steps.
+
+    Args:
+        mapping_seed: which of the two actions is 'right' is drawn for each cell; None: action 1 everywhere.
+        stochastic: going right fails with probability 1/n.
+    """
+    _check_size("n", n, 1)
+    right_action = np.ones((n, n), dtype=int)
+    if mapping_seed is not None:
+        right_action = numpy_stream(mapping_seed, "deep_sea").integers(0, 2, size=(n, n))
+
+    def transitions(row: int, column: int, goes_right: bool) -> list[Transition]:
+        ends = row == n - 1
+        next_row = row if ends else row + 1
+
+        def to(next_column: int) -> int:
+            return n * next_row + min(max(next_column, 0), n - 1)
+
+        if not goes_right:
+            return [(1.0, to(column - 1), 0.0, ends)]
+        reward = float(column == n - 1) - move_cost / n
+        fails = 1 / n if stochastic else 0.0
+        return [(1 - fails, to(column + 1), reward, ends), (fails, to(column), reward, ends)]
+
+    P = [
+        [transitions(row, column, a == right_action[row, column]) for a in range(2)]
+        for row in range(n)
+        for column in range(n)
+    ]
+    names = ("left", "right") if mapping_seed is None else ("0", "1")
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=names, shape=(n, n))
+
+
+def _neighbours(s: int, size: int) -> tuple[int, int, int, int]:
+    """The states left, right, above and below; the state itself where there is a wall."""
+    row, column = divmod(s, size)
+    return (
+        s - (column > 0),
+        s + (column < size - 1),
+        s - size * (row > 0),
+        s + size * (row < size - 1),
+    )
+
+
+def _distinct(random: np.random.Generator, rows: int, high: int, count: int) -> Int[np.ndarray, "rows count"]:
+    """`count` distinct integers below `high` in each row, every set equally likely (Floyd's algorithm by rows)."""
+    chosen = np.empty((rows, count), dtype=np.int64)
+    for k, top in enumerate(range(high - count, high)):
+        drawn = random.integers(0, top + 1, size=rows)
+        taken = (chosen[:, :k] == drawn[:, None]).any(-1)
+        chosen[:, k] = np.where(taken, top, drawn)
+    return chosen
+
+
+def _check_size(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise PgtsError(f"{name} is {value}; it must be at least {least}")
