@@ -1,5 +1,6 @@
 """Algorithm 1 of the paper with exact quantities, and the three ways in which a policy may move."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -35,14 +36,15 @@ def ascend(
         mdp: the MDP.
         pi_SA: the initial policy pi_0.
         depth: m, how often T is applied to Q^pi. 0 is plain policy gradient.
-        step_size: eta, at least 0; the same in every iteration.
+        step_size: eta, finite and at least 0; the same in every iteration.
         iterations: how many updates.
         step: `projected_step` (the paper's, default), `softmax_step` or `mirror_step`.
     """
     step = step or projected_step
-    if step_size < 0:
-        raise PgtsError(f"step_size is {step_size}; it must be at least 0")
+    if not 0 <= step_size < math.inf:
+        raise PgtsError(f"step_size is {step_size}; it must be finite and at least 0")
     exact.check_depth(depth)
+    pi_SA = exact.check_policy(mdp, pi_SA)
     returns = []
     for _ in range(iterations):
         evaluation = exact.evaluate(mdp, pi_SA)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgts_torch.bellman import backup
+from pgts_torch.bellman import Outcomes, backup
 from pgts_torch.errors import PgtsError
 from pgts_torch.tabular.mdp import TabularMDP
 
@@ -18,6 +18,9 @@ DENSE_LIMIT = 1500
 
 SOLVE_TOLERANCE = 1e-12
 """Largest residual of the iterative solve, relative to the right-hand side, in the maximum norm."""
+
+UNDISCOUNTED = 1 - 1e-12
+"""A discount from here on counts as 1: a policy must terminate to have a value that float64 can tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +70,17 @@ def policy_values(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor,
 def occupancy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S"]:
     """d^pi = mu^T (I - gamma P^pi)^-1, unnormalised: it sums to 1/(1 - gamma).        [PGTS Sec. 2]
 
-    States that pi never reaches from the start distribution get exactly 0.
+    It is exactly 0 where pi never goes from the start distribution, and positive everywhere else.
     """
     pi_SA = check_policy(mdp, pi_SA)
     d_S = _solve(mdp, pi_SA, mdp.start_S, transpose=True)
-    return torch.where(support(mdp, pi_SA), d_S, 0.0)
+    least = torch.finfo(torch.float64).tiny  # the iterative solve may miss a rare state by more than its occupancy
+    return torch.where(support(mdp, pi_SA), d_S.clamp(min=least), 0.0)
 
 
 def support(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Tensor:
     """sigma_pi = {s : d^pi(s) > 0} as a mask, by reachability instead of rounding.        [PGTS Sec. 4]"""
-    matrix = _policy_matrix(mdp, pi_SA)
+    matrix = _policy_matrix(mdp, check_policy(mdp, pi_SA))
     reached = mdp.start_S.numpy() > 0
     frontier = reached
     while frontier.any():
@@ -104,8 +108,12 @@ def optimal(mdp: TabularMDP) -> Optimum:
     """v*, Q*, J* by policy iteration: v^{pi_0} <= v^{pi_1} <= ... ends at v* = T v*  (Howard, 1960).
 
     The policy changes only where an action is better by more than rounding, so it ends after finitely many steps.
+    Where gamma is 1, the policies that end the episode compete.
+
+    Raises:
+        PgtsError: no finite value: from some state nothing ends, or the return grows without limit.
     """
-    action_S = mdp.outcomes.reward_NA.argmax(-1)
+    action_S = _ending_actions(mdp.outcomes, mdp.outcomes.reward_NA.argmax(-1))
     while True:
         pi_SA = torch.nn.functional.one_hot(action_S, mdp.num_actions).double()
         v_S = policy_values(mdp, pi_SA)
@@ -119,7 +127,7 @@ def optimal(mdp: TabularMDP) -> Optimum:
 
 
 def check_policy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S A"]:
-    """pi in float64; PgtsError unless each row is a distribution."""
+    """pi in float64, its rows summing to 1 in that precision; PgtsError unless each row is a distribution."""
     if pi_SA.shape != (mdp.num_states, mdp.num_actions):
         raise PgtsError(f"pi_SA has shape {tuple(pi_SA.shape)}; the MDP asks for {(mdp.num_states, mdp.num_actions)}")
     tolerance = 1e-9 if pi_SA.dtype == torch.float64 else 1e-5
@@ -128,7 +136,7 @@ def check_policy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, 
     if bad_S.any():
         s = int(torch.nonzero(bad_S)[0])
         raise PgtsError(f"pi_SA[{s}] is not a distribution: {pi_SA[s].tolist()}")
-    return pi_SA
+    return pi_SA / pi_SA.sum(-1, keepdim=True)
 
 
 def check_depth(depth: int) -> int:
@@ -143,21 +151,42 @@ def _policy_matrix(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> scipy.sparse
     S, A, K = mdp.outcomes.child_NAK.shape
     weight = mdp.outcomes.weight
     values = (pi_SA[:, :, None] * weight.values().view(S, A, K)).reshape(-1)
-    rows = np.arange(S + 1, dtype=np.int32) * (A * K)
-    return scipy.sparse.csr_array((values.numpy(), weight.col_indices().numpy(), rows), shape=(S, S), copy=False)
+    children = weight.col_indices().numpy()
+    rows = np.arange(S + 1, dtype=children.dtype) * (A * K)
+    return scipy.sparse.csr_array((values.numpy(), children, rows), shape=(S, S), copy=False)
 
 
 def _solve(mdp: TabularMDP, pi_SA: Tensor, b_S: Float[Tensor, "S"], *, transpose: bool) -> Float[Tensor, "S"]:
     """x with (I - gamma P^pi) x = b, or with the transposed matrix."""
     matrix = _policy_matrix(mdp, pi_SA)
-    _check_ends(matrix)
+    _check_ends(mdp.outcomes, pi_SA, matrix)
     solve = _solve_dense if mdp.num_states <= DENSE_LIMIT else _solve_iterative
     return torch.from_numpy(solve(matrix.T if transpose else matrix, b_S.numpy()))
 
 
-def _check_ends(matrix: scipy.sparse.csr_array) -> None:
+def _ends(outcomes: Outcomes) -> Tensor:
+    """Where an outcome of (s, a) discounts or terminates, as a mask of shape [S, A]."""
+    if float(outcomes.discount_NAK.amax()) < UNDISCOUNTED:
+        return torch.ones_like(outcomes.reward_NA, dtype=torch.bool)
+    return ((outcomes.discount_NAK < UNDISCOUNTED) & (outcomes.prob_NAK > 0)).any(-1)
+
+
+def _ending_actions(outcomes: Outcomes, action_S: Tensor) -> Tensor:
+    """The given actions, but in states from which these might never end, one that leads toward an end."""
+    ends_SA, found_S = _ends(outcomes), torch.zeros(outcomes.num_states, dtype=torch.bool)
+    while True:
+        leads_SA = ends_SA | (torch.mv(outcomes.weight, found_S.double()).view(ends_SA.shape) > 0)
+        new_S = leads_SA.any(-1) & ~found_S
+        if not new_S.any():
+            return action_S
+        kept_S = leads_SA.gather(1, action_S[:, None]).squeeze(1)
+        action_S = torch.where(new_S & ~kept_S, leads_SA.int().argmax(-1), action_S)
+        found_S = found_S | new_S
+
+
+def _check_ends(outcomes: Outcomes, pi_SA: Tensor, matrix: scipy.sparse.csr_array) -> None:
     """PgtsError unless every state can reach one where the policy discounts or terminates: else I - M is singular."""
-    ends = np.asarray(matrix.sum(axis=1)) < 1 - 1e-12
+    ends = (_ends(outcomes) & (pi_SA > 0)).any(-1).numpy()
     while not ends.all():
         grown = ends | ((matrix @ ends.astype(np.float64)) > 0)
         if (grown == ends).all():
@@ -168,11 +197,11 @@ def _check_ends(matrix: scipy.sparse.csr_array) -> None:
         ends = grown
 
 
-def _solve_dense(matrix: scipy.sparse.sparray, b: np.ndarray) -> np.ndarray:
+def _solve_dense(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array, b: np.ndarray) -> np.ndarray:
     return np.linalg.solve(np.eye(len(b)) - matrix.toarray(), b)
 
 
-def _solve_iterative(matrix: scipy.sparse.sparray, b: np.ndarray) -> np.ndarray:
+def _solve_iterative(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array, b: np.ndarray) -> np.ndarray:
     """BiCGSTAB, restarted until the residual b - (I - M) x is within SOLVE_TOLERANCE of b."""
 
     def identity_minus(x: np.ndarray) -> np.ndarray:

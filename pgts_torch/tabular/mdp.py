@@ -42,11 +42,11 @@ class TabularMDP:
     shape: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
+        _check_outcomes(self.outcomes)
         if not self.action_names:
             object.__setattr__(self, "action_names", tuple(str(a) for a in range(self.num_actions)))
         if self.shape == (0, 0):
             object.__setattr__(self, "shape", (1, self.num_states))
-        _check_outcomes(self.outcomes)
         if self.outcomes.num_children != self.num_states:
             raise PgtsError(f"outcomes point into {self.outcomes.num_children} states; the MDP has {self.num_states}")
         _check_start(self.start_S, self.num_states)
@@ -139,8 +139,8 @@ class TabularMDP:
                 for k, ((next_state, terminated), p) in enumerate(successors.items()):
                     prob[s, a, k], child[s, a, k] = p, next_state
                     discount[s, a, k] = 0.0 if terminated else gamma
-        arrays = (torch.from_numpy(array) for array in (reward, prob, discount, child))
-        return cls(Outcomes(*arrays, S), start_S, action_names, shape)
+        reward_SA, prob_SAK, discount_SAK, child_SAK = map(torch.from_numpy, (reward, prob, discount, child))
+        return cls(Outcomes(reward_SA, prob_SAK, discount_SAK, child_SAK, S), start_S, action_names, shape)
 
     @classmethod
     def from_gymnasium(cls, env: gymnasium.Env, gamma: float, *, start: int | ArrayLike | None = None) -> Self:
@@ -230,6 +230,8 @@ def _check_start(start_S: Tensor, num_states: int) -> None:
 def _check_outcomes(outcomes: Outcomes) -> None:
     """Raise PgtsError with the first offending (s, a) unless the table is one of valid outcomes."""
     reward, prob = outcomes.reward_NA, outcomes.prob_NAK
+    if outcomes.child_NAK.ndim != 3:
+        raise PgtsError(f"child_NAK has shape {tuple(outcomes.child_NAK.shape)}; it must have three axes")
     N, A, K = outcomes.child_NAK.shape
     if min(N, A, K) == 0:
         raise PgtsError(f"outcomes have shape {(N, A, K)}; each side must be at least 1")

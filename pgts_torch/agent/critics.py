@@ -1,0 +1,269 @@
+"""Estimates of Q^pi or v^pi, each from what it is allowed to see."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Literal, final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.rollout import GeometricHorizon, Horizon, Rollout, simulate
+from pgts_torch.errors import PgtsError
+from pgts_torch.models.base import SamplingModel
+from pgts_torch.tabular import exact
+from pgts_torch.tabular.mdp import TabularMDP
+
+Target = Literal["v", "q"]
+
+
+class Critic(ABC):
+    """An estimate of the values of the policy it was last fitted to.
+
+    target: whether a lookahead stands on its v (one more level) or its Q.
+    """
+
+    target: Target
+
+    @abstractmethod
+    def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
+        """Estimate the values of `policy`, which made `rollout`; the losses, by name."""
+
+    @abstractmethod
+    def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+        """Estimates of v^pi(s)."""
+
+    @abstractmethod
+    def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+        """Estimates of Q^pi(s, .). Only where target is "q" does a lookahead ask for them."""
+
+    @property
+    def model_calls(self) -> int:
+        """How many (state, action) this critic has asked of a model so far."""
+        return 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """What has been learned, as tensors on the CPU and plain values."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave."""
+        if state:
+            raise PgtsError(f"{type(self).__name__} learns nothing; it cannot take over {sorted(state)}")
+
+
+@final
+class ExactCritic(Critic):
+    """v^pi and Q^pi of the true MDP. For validation: what is trained with it has learned from the truth."""
+
+    def __init__(self, mdp: TabularMDP, *, target: Target = "v") -> None:
+        self.mdp = mdp
+        self.target = check_target(target)
+
+    def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
+        """Solve the Bellman equation of the policy; the rollout is not looked at."""
+        self._evaluation = exact.evaluate(self.mdp, policy.table())
+        return {}
+
+    def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+        return self._evaluation.v_S.to(state_N.device)[state_N]
+
+    def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+        return self._evaluation.q_SA.to(state_N.device)[state_N]
+
+
+@final
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Targets are sums of observed rewards. Where a fixed horizon or a time limit cut an episode, the present estimate
+    stands for the rest; a geometric horizon cuts nothing, its sums are unbiased as they are."""
+
+
+@final
+@dataclass(frozen=True)
+class TDLambda:
+    """Targets are lambda-returns (Sutton and Barto 2018, Sec. 12.1)."""
+
+    lambda_: float = 0.9
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.lambda_ <= 1:
+            raise PgtsError(f"lambda is {self.lambda_}; it must be in [0, 1]")
+
+
+Method = MonteCarlo | TDLambda
+
+
+@final
+class TabularCritic(Critic):
+    """One number for each state, or each (state, action), moved toward targets from rollouts.
+
+        V(s) <- V(s) + alpha (mean of the targets at s - V(s))
+
+    A state that was never visited keeps the value 0.
+
+    Args:
+        num_states, num_actions: the shape of the table.
+        target: learn "v", or "q" at the actions taken.
+        method: how targets are made.
+        step_size: alpha in (0, 1]; or "mean": alpha is the share of the new visits among all so far, which makes the
+            estimate the mean of all targets. "mean" suits a policy that stands still.
+    """
+
+    def __init__(
+        self,
+        num_states: int,
+        num_actions: int,
+        *,
+        target: Target = "v",
+        method: Method = TDLambda(),
+        step_size: float | Literal["mean"] = 0.5,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if step_size != "mean" and not (isinstance(step_size, int | float) and 0 < step_size <= 1):
+            raise PgtsError(f"step_size is {step_size!r}; it must be in (0, 1] or 'mean'")
+        self.num_states, self.num_actions = num_states, num_actions
+        self.target = check_target(target)
+        self.method = method
+        self.step_size = step_size
+        cells = num_states if target == "v" else num_states * num_actions
+        self._value_C = torch.zeros(cells, dtype=torch.float64, device=device)
+        self._count_C = torch.zeros(cells, dtype=torch.float64, device=device)
+
+    def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
+        """Move every visited cell toward the mean of its targets; returns the mean squared error before."""
+        self._policy = policy
+        target_TB = self._targets(rollout)[rollout.alive_TB]
+        cell_TB = rollout.state_TB
+        if self.target == "q":
+            cell_TB = cell_TB * self.num_actions + rollout.action_TB
+        cell_V = cell_TB[rollout.alive_TB]
+        loss = float((target_TB - self._value_C[cell_V]).square().mean())
+        ones_V = torch.ones_like(target_TB)
+        count_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, ones_V)
+        sum_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, target_TB)
+        self._count_C += count_C
+        alpha_C = count_C / self._count_C.clamp(min=1) if self.step_size == "mean" else self.step_size
+        seen_C = count_C > 0
+        mean_C = sum_C / count_C.clamp(min=1)
+        self._value_C = torch.where(seen_C, self._value_C + alpha_C * (mean_C - self._value_C), self._value_C)
+        return {"value": loss}
+
+    def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+        """The table, or sum_a pi(a|s) Q(s, a) of it."""
+        if self.target == "v":
+            return self._value_C[state_N]
+        return (self._policy.probs(state_N) * self.q(state_N)).sum(-1)
+
+    def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+        if self.target != "q":
+            raise PgtsError("this critic learns v; it has no Q. Make it with target='q', or search with v_leaf")
+        return self._value_C.view(self.num_states, self.num_actions)[state_N]
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"value_C": self._value_C.cpu().clone(), "count_C": self._count_C.cpu().clone()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        for name in ("value_C", "count_C"):
+            if name not in state or state[name].shape != self._value_C.shape:
+                raise PgtsError(f"the critic's {name} is missing or not of shape {tuple(self._value_C.shape)}")
+        self._value_C = state["value_C"].to(self._value_C)
+        self._count_C = state["count_C"].to(self._count_C)
+
+    def _targets(self, rollout: Rollout) -> Float[Tensor, "T B"]:
+        bootstrap_TB = self.v(rollout.next_state_TB)
+        if isinstance(self.method, TDLambda):
+            return lambda_returns(rollout, bootstrap_TB, rollout.discount_TB, self.method.lambda_)
+        return lambda_returns(rollout, bootstrap_TB, rollout.survival_TB, 1.0)
+
+
+@final
+class RolloutCritic(Critic):
+    """Monte-Carlo through the model from the very states that are asked for.
+
+    So states that the policy never visits get values as good as the others; with the geometric horizon, unbiased ones.
+    Nothing is remembered between fits; each question is answered by fresh episodes.
+
+    Args:
+        model: samples outcomes.
+        samples: episodes for each state, or for each (state, action).
+        target: whether lookaheads stand on v or on Q; both can be asked for.
+        horizon: a fixed one leaves out what comes after it.
+    """
+
+    def __init__(
+        self,
+        model: SamplingModel,
+        *,
+        samples: int = 8,
+        target: Target = "v",
+        horizon: Horizon = GeometricHorizon(),  # noqa: B008 - frozen
+    ) -> None:
+        if samples < 1:
+            raise PgtsError(f"samples is {samples}; it must be at least 1")
+        self.model = model
+        self.samples = samples
+        self.target = check_target(target)
+        self.horizon = horizon
+        self._model_calls = 0
+
+    @property
+    def model_calls(self) -> int:
+        return self._model_calls
+
+    def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
+        """Take the policy to be followed; the rollout is not looked at."""
+        self._policy, self._generator = policy, generator
+        return {}
+
+    def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+        return self._mean_return(state_N, None)
+
+    def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+        A = self.model.num_actions
+        action_NA = torch.arange(A, device=state_N.device).expand(len(state_N), A)
+        return self._mean_return(state_N.repeat_interleave(A), action_NA.reshape(-1)).view(-1, A)
+
+    def _mean_return(self, state_N: Tensor, action_N: Tensor | None) -> Tensor:
+        episodes = simulate(
+            self.model,
+            self._policy,
+            state_N.repeat(self.samples),
+            self.horizon,
+            first_action_B=None if action_N is None else action_N.repeat(self.samples),
+            generator=self._generator,
+        )
+        self._model_calls += episodes.num_steps
+        return episodes.returns().view(self.samples, -1).mean(0)
+
+
+def lambda_returns(
+    rollout: Rollout,
+    bootstrap_TB: Float[Tensor, "T B"],
+    discount_TB: Float[Tensor, "T B"],
+    lambda_: float,
+) -> Float[Tensor, "T B"]:
+    """G_t = r_t + gamma_t ((1 - lambda) V(s_{t+1}) + lambda G_{t+1}); V(s_{t+1}) alone where the episode's data end.
+
+    Args:
+        rollout: B episodes.
+        bootstrap_TB: V(s_{t+1}).
+        discount_TB: gamma_t; 0 after a terminated step, so that nothing is bootstrapped there.
+        lambda_: in [0, 1]; 1 gives Monte-Carlo returns.
+    """
+    returns_TB = torch.empty_like(bootstrap_TB)
+    later_B = torch.zeros_like(bootstrap_TB[0])
+    follows_TB = rollout.follows_TB
+    for t in reversed(range(len(bootstrap_TB))):
+        mixed_B = (1 - lambda_) * bootstrap_TB[t] + lambda_ * later_B
+        next_B = torch.where(follows_TB[t], mixed_B, bootstrap_TB[t])
+        later_B = returns_TB[t] = rollout.reward_TB[t] + discount_TB[t] * next_B
+    return returns_TB
+
+
+def check_target(target: Target) -> Target:
+    """PgtsError unless target is "v" or "q"."""
+    if target not in ("v", "q"):
+        raise PgtsError(f"target is {target!r}; it must be 'v' or 'q'")
+    return target

@@ -1,0 +1,251 @@
+"""Policy gradient with tree search, from rollouts.        [PGTS Alg. 1]"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self, final
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+from torch import Tensor
+from tqdm import tqdm
+
+from pgts_torch.agent import saving
+from pgts_torch.agent.build import Description, make_critic, make_horizon, make_policy, make_update
+from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.policies import Policy, SimplexPolicy
+from pgts_torch.agent.rollout import Rollout, check_vector_env, make_vector_env, rollout
+from pgts_torch.agent.updates import Update
+from pgts_torch.errors import PgtsError
+from pgts_torch.models.tabular import TabularModel, tabular_truth
+from pgts_torch.search.expectimax import MAX_NODES, Lookahead, expectimax
+from pgts_torch.search.topology import Topology
+from pgts_torch.seeding import stream
+from pgts_torch.tabular.exact import check_depth
+
+DEFAULT_GAMMA = 0.99
+"""Discount of an environment that carries none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Iteration:
+    """What one pass through the loop of Algorithm 1 saw and did.
+
+    experience: the episodes of pi_k.
+    state_N, weight_N: the states it visited, and what each counted for in the update.
+    pi_NA: pi_k at these states, before the update.
+    look: (T^m Q)(s, .) at these states.
+    gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, as far as the critic knows v.
+    losses: the critic's, by name.
+    model_calls: (state, action) asked of the model in this pass, by the lookahead and by the critic.
+    """
+
+    experience: Rollout
+    state_N: Int[Tensor, "N"]
+    weight_N: Float[Tensor, "N"]
+    pi_NA: Float[Tensor, "N A"]
+    look: Lookahead
+    gap_N: Float[Tensor, "N"]
+    losses: dict[str, float]
+    model_calls: int
+
+
+Callback = Callable[["PGTS", Iteration], bool | None]
+"""Called after each iteration; returning False ends the training."""
+
+
+@final
+class PGTS:
+    """A policy that is pushed toward what a depth-m lookahead sees at the states it visits.
+
+        pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d^pi(s) (T^m Q^pi)(s, .) ]        [PGTS Eq. (3)]
+
+    The tree is used in training only; acting is one look into the policy. Everything random in iteration k is drawn
+    from streams named by (seed, k), so a loaded model goes on exactly as the saved one would have.
+
+    Args:
+        env: a Gymnasium id with a tabular model behind it (pgts/*, or an environment with a P table), or copies of one
+            as a VectorEnv that resets by mask.
+        depth: m. 0 is plain policy gradient.
+        policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax",
+            {"type": "tabular", "target": "q"}, ...
+        num_envs: episodes in each iteration.
+        gamma: discount. Default: the environment's own (pgts/*), else 0.99.
+        max_nodes: the most nodes of one lookahead.
+        seed: of everything random.
+        device: where policy, critic and model live.
+        env_kwargs: for gymnasium.make.
+
+    Raises:
+        PgtsError: parts that do not fit each other, or options out of range.
+        MissingModel: nothing that a lookahead could ask.
+    """
+
+    def __init__(
+        self,
+        env: str | VectorEnv,
+        *,
+        depth: int = 4,
+        policy: Description | Policy = "softmax",
+        critic: Description | Critic = "tabular",
+        update: Description | Update | None = None,
+        horizon: Description = "fixed",
+        num_envs: int = 32,
+        gamma: float | None = None,
+        max_nodes: int = MAX_NODES,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        env_kwargs: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._arguments = {name: value for name, value in locals().items() if name != "self"}
+        self.depth = check_depth(depth)
+        self.seed = seed
+        self.max_nodes = max_nodes
+        self.device = torch.device(device)
+        self.gamma = DEFAULT_GAMMA if gamma is None else gamma
+        self.env = make_vector_env(env, num_envs, gamma=gamma, **(env_kwargs or {})) if isinstance(env, str) else env
+        check_vector_env(self.env)
+        self.mdp = tabular_truth(self.env, gamma=self.gamma)
+        self.model = TabularModel(self.mdp, device=self.device)
+        self.topology = Topology(self.model)
+        self.horizon = make_horizon(horizon)
+        S, A = self.mdp.num_states, self.mdp.num_actions
+        if isinstance(policy, str | Mapping):
+            policy = make_policy(policy, S, A, seed=seed, device=self.device)
+        if isinstance(critic, str | Mapping):
+            critic = make_critic(critic, self.model, self.mdp)
+        if update is None:
+            update = "projected" if isinstance(policy, SimplexPolicy) else "softmax"
+        if isinstance(update, str | Mapping):
+            update = make_update(update)
+        self.policy, self.critic, self.update = policy, critic, update
+        self.update.check(self.policy)
+        self.num_iterations = 0
+        self.num_env_steps = 0
+        self.num_model_calls = 0
+
+    def iterate(self) -> Iteration:
+        """One pass through the loop: visit states, estimate Q^pi, look m steps ahead, move pi.        [PGTS Alg. 1]"""
+        names = ("iteration", self.num_iterations)
+        generator = stream(self.seed, *names, device=self.device)
+        calls_before = self.topology.model_calls + self.critic.model_calls
+
+        # Visit states with pi_k and estimate Q^{pi_k} (line 2).
+        experience = rollout(
+            self.env, self.policy, self.horizon, gamma=self.gamma, seed=self.seed, names=names, generator=generator
+        )
+        losses = self.critic.fit(self.policy, experience, generator=generator)
+
+        # Look m steps ahead from the states with d(s) > 0.
+        states, weight_N = experience.visits(self.update.state_weight)
+        look = self.lookahead(states)
+
+        # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3).
+        pi_NA = self.policy.probs(states)
+        gap_N = (look.q_BA.amax(-1) - self.critic.v(states)).clamp(min=0)
+        self.update(self.policy, states, look.q_BA, weight_N)
+
+        self.num_iterations += 1
+        self.num_env_steps += experience.num_steps
+        model_calls = self.topology.model_calls + self.critic.model_calls - calls_before
+        self.num_model_calls += model_calls
+        return Iteration(experience, states, weight_N, pi_NA, look, gap_N, losses, model_calls)
+
+    def lookahead(self, state_N: Int[Tensor, "N"]) -> Lookahead:
+        """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves."""
+        v_leaf = self.critic.v if self.critic.target == "v" else None
+        q_leaf = self.critic.q if self.critic.target == "q" else None
+        return expectimax(
+            self.model,
+            state_N,
+            depth=self.depth,
+            q_leaf=q_leaf,
+            v_leaf=v_leaf,
+            topology=self.topology,
+            max_nodes=self.max_nodes,
+        )
+
+    def learn(self, total_steps: int, *, callback: Callback | None = None, progress: bool = False) -> Self:
+        """Iterate until `total_steps` environment steps have been made in all, counting those before this call.
+
+        Args:
+            callback: called with (self, iteration) after each iteration; returning False ends the training.
+            progress: show a progress bar.
+        """
+        with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=not progress) as bar:
+            while self.num_env_steps < total_steps:
+                iteration = self.iterate()
+                bar.update(iteration.experience.num_steps)
+                if callback is not None and callback(self, iteration) is False:
+                    break
+        return self
+
+    def predict(
+        self, observation: ArrayLike, *, deterministic: bool = True, generator: torch.Generator | None = None
+    ) -> np.ndarray:
+        """Actions for observations; no search.
+
+        Args:
+            observation: one state or an array of states.
+            deterministic: the most probable action, else one drawn from pi.
+            generator: for drawing; default a stream of this model's seed, the same in each call.
+        """
+        state = torch.as_tensor(np.asarray(observation, dtype=np.int64))
+        flat = state.reshape(-1).to(self.device)
+        if not bool(((flat >= 0) & (flat < self.mdp.num_states)).all()):
+            raise PgtsError(f"observation is {state.tolist()}; states are 0 to {self.mdp.num_states - 1}")
+        if deterministic:
+            action = self.policy.probs(flat).argmax(-1)
+        else:
+            generator = generator or stream(self.seed, "predict", device=self.device)
+            action = self.policy.sample(flat, generator=generator)
+        return action.reshape(state.shape).cpu().numpy()
+
+    def save(self, path: str | Path) -> None:
+        """Write everything that training or acting goes on from into one file with a checksum.
+
+        Raises:
+            PgtsError: the environment or a part was given as an object, so that no file can describe it.
+        """
+        plain = {**self._arguments, "device": str(self.device), "env_kwargs": dict(self._arguments["env_kwargs"] or {})}
+        for name in ("env", "policy", "critic", "update"):
+            if not isinstance(plain[name], str | Mapping | None):
+                raise PgtsError(f"{name} was given as {plain[name]!r}; only models made from descriptions can be saved")
+        saving.write(path, {"arguments": plain, "state": self.state_dict()})
+
+    @classmethod
+    def load(cls, path: str | Path, *, device: torch.device | str | None = None) -> Self:
+        """The model that `save` wrote; it trains on exactly as the saved one would have.
+
+        Args:
+            device: where to load it; default the device it was saved from.
+
+        Raises:
+            PgtsError: no such file, damaged, or not ours.
+        """
+        content = saving.read(path)
+        arguments = content["arguments"] | ({} if device is None else {"device": str(device)})
+        model = cls(**arguments)
+        model.load_state_dict(content["state"])
+        return model
+
+    def state_dict(self) -> dict[str, Any]:
+        """Policy, critic and counters, as tensors on the CPU and plain values."""
+        return {
+            "policy": self.policy.state_dict(),
+            "critic": self.critic.state_dict(),
+            "num_iterations": self.num_iterations,
+            "num_env_steps": self.num_env_steps,
+            "num_model_calls": self.num_model_calls,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave."""
+        self.policy.load_state_dict(state["policy"])
+        self.critic.load_state_dict(state["critic"])
+        self.num_iterations = state["num_iterations"]
+        self.num_env_steps = state["num_env_steps"]
+        self.num_model_calls = state["num_model_calls"]

@@ -1,0 +1,152 @@
+"""Tabular policies: a distribution over actions for each state."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.seeding import stream
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """All actions alike."""
+
+    def probs(self, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
+        return torch.full((num_states, num_actions), 1 / num_actions, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Random:
+    """Each state's distribution drawn uniformly from the simplex."""
+
+    def probs(self, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
+        uniform_SA = torch.rand(num_states, num_actions, generator=generator, dtype=torch.float64)
+        exponential_SA = -torch.log1p(-uniform_SA).clamp(max=-1e-12)
+        return exponential_SA / exponential_SA.sum(-1, keepdim=True)
+
+
+@dataclass(frozen=True)
+class Biased:
+    """One action with the given probability in every state, the others sharing the rest.
+
+    `Biased(action=0, probability=1)` on the Ladder is the paper's "always left".
+    """
+
+    action: int
+    probability: float
+
+    def probs(self, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
+        if not 0 <= self.action < num_actions:
+            raise PgtsError(f"action is {self.action}; actions are 0 to {num_actions - 1}")
+        if not 0 < self.probability <= 1:
+            raise PgtsError(f"probability is {self.probability}; it must be above 0 and at most 1")
+        if num_actions == 1:
+            return torch.ones(num_states, 1, dtype=torch.float64)
+        rest = (1 - self.probability) / (num_actions - 1)
+        probs_SA = torch.full((num_states, num_actions), rest, dtype=torch.float64)
+        probs_SA[:, self.action] = self.probability
+        return probs_SA
+
+
+Initialisation = Uniform | Random | Biased
+
+
+class Policy(ABC):
+    """pi(a|s) over numbered states, in float64."""
+
+    num_states: int
+    num_actions: int
+
+    @abstractmethod
+    def probs(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+        """pi(.|s) for each state."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """The parameters, as tensors on the CPU."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over parameters of the same shape; PgtsError if they do not fit."""
+
+    def table(self) -> Float[Tensor, "S A"]:
+        """pi(.|s) for all states, on the CPU."""
+        return self.probs(torch.arange(self.num_states)).cpu()
+
+    def sample(self, state_N: Int[Tensor, "N"], *, generator: torch.Generator) -> Int[Tensor, "N"]:
+        """One action for each state, drawn with the caller's generator."""
+        return torch.multinomial(self.probs(state_N), 1, generator=generator).squeeze(-1)
+
+
+@final
+class SoftmaxPolicy(Policy):
+    """pi(a|s) ~ exp(logits[s, a]): every action keeps a positive probability.
+
+    Raises:
+        PgtsError: an initialisation with a probability of 0 (its logit would be infinite).
+    """
+
+    def __init__(
+        self,
+        num_states: int,
+        num_actions: int,
+        *,
+        init: Initialisation = Uniform(),
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        probs_SA = init.probs(num_states, num_actions, stream(seed, "policy"))
+        if not bool((probs_SA > 0).all()):
+            raise PgtsError(f"{init} gives some action probability 0; a softmax policy cannot: use a simplex policy")
+        self.num_states, self.num_actions = num_states, num_actions
+        self.logits_SA = probs_SA.log().to(device)
+
+    def probs(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+        """softmax(logits[s])."""
+        return self.logits_SA[state_N].softmax(-1)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"logits_SA": self.logits_SA.cpu().clone()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.logits_SA = _fitting(state, "logits_SA", self.logits_SA)
+
+
+@final
+class SimplexPolicy(Policy):
+    """The paper's direct parameters: pi(a|s) is the parameter itself, and may be 0 or 1.        [PGTS Sec. 2]"""
+
+    def __init__(
+        self,
+        num_states: int,
+        num_actions: int,
+        *,
+        init: Initialisation = Uniform(),
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.num_states, self.num_actions = num_states, num_actions
+        self.probs_SA = init.probs(num_states, num_actions, stream(seed, "policy")).to(device)
+
+    def probs(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+        """The rows of the parameter."""
+        return self.probs_SA[state_N]
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"probs_SA": self.probs_SA.cpu().clone()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.probs_SA = _fitting(state, "probs_SA", self.probs_SA)
+
+
+def _fitting(state: dict[str, Any], name: str, like: Tensor) -> Tensor:
+    value = state.get(name)
+    if not isinstance(value, Tensor) or value.shape != like.shape:
+        found = tuple(value.shape) if isinstance(value, Tensor) else value
+        raise PgtsError(f"{name} is {found}; a tensor of shape {tuple(like.shape)} is needed")
+    return value.to(like)

@@ -1,0 +1,90 @@
+"""How a policy moves, given lookahead values at the states it visited."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, final
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy
+from pgts_torch.agent.rollout import StateWeight
+from pgts_torch.errors import PgtsError
+from pgts_torch.tabular.ascent import mirror_step, projected_step, softmax_direction
+
+
+@dataclass(frozen=True)
+class Update(ABC):
+    """One step of a policy at visited states.
+
+    Args:
+        step_size: eta > 0.
+        state_weight: w(s) of a visited state. `occupancy`: the estimate of d^pi(s), as in the paper. `visits`: its
+            share of all visits, without discounts (sums to 1). `uniform`: 1, as in h-PMD.
+    """
+
+    step_size: float = 0.1
+    state_weight: StateWeight = "occupancy"
+    policies: ClassVar[tuple[type[Policy], ...]]
+
+    def __post_init__(self) -> None:
+        if not self.step_size > 0:
+            raise PgtsError(f"step_size is {self.step_size}; it must be above 0")
+        if self.state_weight not in ("occupancy", "visits", "uniform"):
+            raise PgtsError(f"state_weight is {self.state_weight!r}; it must be occupancy, visits or uniform")
+
+    def check(self, policy: Policy) -> None:
+        """PgtsError unless this update can move such a policy."""
+        if not isinstance(policy, self.policies):
+            names = " or ".join(kind.__name__ for kind in self.policies)
+            raise PgtsError(f"{type(self).__name__} moves a {names}, not a {type(policy).__name__}")
+
+    @abstractmethod
+    def __call__(
+        self,
+        policy: Policy,
+        state_N: Int[Tensor, "N"],
+        q_NA: Float[Tensor, "N A"],
+        weight_N: Float[Tensor, "N"],
+    ) -> None:
+        """Move pi(.|s) at N distinct states along q(s, .), in place; all other states stay as they are."""
+
+
+@final
+@dataclass(frozen=True)
+class ProjectedUpdate(Update):
+    """The paper's update, pi(.|s) <- proj[pi(.|s) + eta w(s) q(s, .)].        [PGTS Eq. (3)]"""
+
+    policies = (SimplexPolicy,)
+
+    def __call__(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
+        assert isinstance(policy, SimplexPolicy)
+        policy.probs_SA[state_N] = projected_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size)
+
+
+@final
+@dataclass(frozen=True)
+class SoftmaxUpdate(Update):
+    """All-action policy gradient on the logits: theta(s, .) <- theta(s, .) + eta w(s) pi (q - <pi, q>)."""
+
+    policies = (SoftmaxPolicy,)
+
+    def __call__(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
+        assert isinstance(policy, SoftmaxPolicy)
+        policy.logits_SA[state_N] += self.step_size * softmax_direction(policy.probs(state_N), q_NA, weight_N)
+
+
+@final
+@dataclass(frozen=True)
+class MirrorUpdate(Update):
+    """A KL step at visited states: pi(a|s) <- pi(a|s) exp(eta w(s) q(s, a)) / Z (Protopapas and Barakat 2024)."""
+
+    policies = (SoftmaxPolicy, SimplexPolicy)
+
+    def __call__(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
+        if isinstance(policy, SoftmaxPolicy):
+            advantage_NA = q_NA - q_NA.amax(-1, keepdim=True)
+            policy.logits_SA[state_N] += self.step_size * weight_N[:, None] * advantage_NA
+        else:
+            assert isinstance(policy, SimplexPolicy)
+            policy.probs_SA[state_N] = mirror_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size)

@@ -1,0 +1,53 @@
+"""What a lookahead may ask of a model. Ask for the smallest ability: a signature says which.
+
+A state is an integer below `num_states`. A model whose states are something else (snapshots, vectors) numbers them as
+it meets them, equal states alike, so that a search can merge them.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """One drawn outcome for each of N pairs (state, action).
+
+    reward_N: in reward units.   discount_N: in [0, 1], 0 after a terminal outcome.   next_state_N: states of the model.
+    """
+
+    reward_N: Float[Tensor, "N"]
+    discount_N: Float[Tensor, "N"]
+    next_state_N: Int[Tensor, "N"]
+
+
+class Model(ABC):
+    """A finite action set over numbered states."""
+
+    num_states: int
+    num_actions: int
+    device: torch.device
+    dtype: torch.dtype
+
+
+class EnumeratingModel(Model):
+    """A model that lists all outcomes of a state."""
+
+    @abstractmethod
+    def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
+        """What may follow each state under every action; children are states of this model."""
+
+
+class SamplingModel(Model):
+    """A model that draws one outcome of a state and an action."""
+
+    @abstractmethod
+    def sample(
+        self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, generator: torch.Generator
+    ) -> Transitions:
+        """One outcome of each (state, action), drawn with the caller's generator and with nothing else."""

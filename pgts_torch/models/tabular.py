@@ -1,0 +1,66 @@
+"""A tabular MDP as a model: it enumerates and it samples."""
+
+from typing import Any, final
+
+import gymnasium
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.tabular.mdp import TabularMDP
+
+
+@final
+class TabularModel(EnumeratingModel, SamplingModel):
+    """The transitions of a `TabularMDP`, on a device and in a floating dtype of choice.
+
+    Args:
+        mdp: the MDP.
+        device: where the tables lie.
+        dtype: float64 keeps the exact values; float32 halves the memory.
+    """
+
+    def __init__(
+        self, mdp: TabularMDP, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
+    ) -> None:
+        self.table = mdp.outcomes.to(device, dtype)
+        self.num_states = mdp.num_states
+        self.num_actions = mdp.num_actions
+        self.device = self.table.device
+        self.dtype = dtype
+        self._cumulative_NAK = self.table.prob_NAK.cumsum(-1)
+
+    def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
+        """The rows of the table. [PGTS Sec. 2]"""
+        return self.table.rows(state_N)
+
+    def sample(
+        self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, generator: torch.Generator
+    ) -> Transitions:
+        """One outcome of each (state, action) by inverting the distribution function; the reward is r(s, a)."""
+        cumulative_NK = self._cumulative_NAK[state_N, action_N]
+        total_N1 = cumulative_NK[:, -1:]
+        uniform_N1 = torch.rand(total_N1.shape, generator=generator, device=self.device, dtype=self.dtype)
+        # The first k whose cumulative probability exceeds u < total always has positive probability.
+        k_N1 = (cumulative_NK <= uniform_N1 * total_N1).sum(-1, keepdim=True)
+        return Transitions(
+            self.table.reward_NA[state_N, action_N],
+            self.table.discount_NAK[state_N, action_N].gather(-1, k_N1).squeeze(-1),
+            self.table.child_NAK[state_N, action_N].gather(-1, k_N1).squeeze(-1),
+        )
+
+
+def tabular_truth(env: gymnasium.Env | gymnasium.vector.VectorEnv, *, gamma: float) -> TabularMDP:
+    """The MDP behind an environment or its copies: its `mdp` if it is one of ours, else its `P` table.
+
+    Args:
+        gamma: discount of a P table; ours carry their own.
+
+    Raises:
+        MissingModel: the environment has neither.
+    """
+    single: Any = env.envs[0] if isinstance(env, gymnasium.vector.SyncVectorEnv) else env
+    mdp = getattr(single.unwrapped, "mdp", None)
+    return mdp if isinstance(mdp, TabularMDP) else TabularMDP.from_gymnasium(single, gamma)

@@ -1,0 +1,6 @@
+"""Lookahead values at roots."""
+
+from pgts_torch.search.expectimax import Lookahead, expectimax
+from pgts_torch.search.topology import Topology
+
+__all__ = ["Lookahead", "Topology", "expectimax"]
