@@ -106,7 +106,7 @@ class PGTS:
         self.max_nodes = max_nodes
         self.device = torch.device(device)
         self.gamma = DEFAULT_GAMMA if gamma is None else gamma
-        self.env = make_vector_env(env, num_envs, gamma=gamma, **(env_kwargs or {})) if isinstance(env, str) else env
+        self.env = self.make_copies(num_envs) if isinstance(env, str) else env
         check_vector_env(self.env)
         self.mdp = tabular_truth(self.env, gamma=self.gamma)
         self.model = TabularModel(self.mdp, device=self.device)
@@ -153,6 +153,19 @@ class PGTS:
         model_calls = self.topology.model_calls + self.critic.model_calls - calls_before
         self.num_model_calls += model_calls
         return Iteration(experience, states, weight_N, pi_NA, look, gap_N, losses, model_calls)
+
+    @property
+    def env_id(self) -> str:
+        """The environment's Gymnasium id; PgtsError if the environment was given as an object."""
+        env_id = self._arguments["env"]
+        if not isinstance(env_id, str):
+            raise PgtsError(f"the environment was given as {env_id!r}; only one given by its id can be made again")
+        return env_id
+
+    def make_copies(self, num_envs: int) -> VectorEnv:
+        """Fresh copies of the environment, without its time limit."""
+        kwargs = self._arguments["env_kwargs"] or {}
+        return make_vector_env(self.env_id, num_envs, gamma=self._arguments["gamma"], **kwargs)
 
     def lookahead(self, state_N: Int[Tensor, "N"]) -> Lookahead:
         """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves."""

@@ -229,18 +229,14 @@ def make_vector_env(env_id: str, num_envs: int, *, gamma: float | None, **kwargs
     Raises:
         PgtsError: Gymnasium knows no such environment or cannot make it.
     """
+    options: dict[str, Any] = {"max_episode_steps": -1, **kwargs}
     try:
-        ours = gymnasium.spec(env_id).namespace == "pgts"
-        if ours and gamma is not None:
-            kwargs["gamma"] = gamma
-        return gymnasium.make_vec(
-            env_id,
-            num_envs=num_envs,
-            vectorization_mode="vector_entry_point" if ours else "sync",
-            vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
-            max_episode_steps=-1,
-            **kwargs,
-        )
+        if gymnasium.spec(env_id).namespace == "pgts":
+            options |= {} if gamma is None else {"gamma": gamma}
+            options |= {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.DISABLED}
+        else:
+            options |= {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode.DISABLED}}
+        return gymnasium.make_vec(env_id, num_envs=num_envs, **options)
     except (gymnasium.error.Error, TypeError) as error:
         raise PgtsError(f"{env_id} cannot be made: {error}") from error
 

@@ -1,0 +1,71 @@
+"""What is worth watching in an iteration. Nothing here draws a random number or feeds back into training."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pgts_torch.agent.pgts import PGTS, Iteration
+from pgts_torch.agent.updates import SoftmaxUpdate
+from pgts_torch.tabular import exact
+from pgts_torch.tabular.ascent import softmax_direction
+
+
+def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
+    """Tags of one iteration, all of the policy pi_k that made its episodes."""
+    episodes = iteration.experience
+    entropy_N = -torch.special.xlogy(iteration.pi_NA, iteration.pi_NA).sum(-1)
+    return {
+        "charts/episodic_return": float((episodes.reward_TB * episodes.alive_TB).sum(0).mean()),
+        "charts/discounted_return": float(episodes.returns().mean()),
+        "charts/episodic_length": episodes.num_steps / episodes.num_episodes,
+        "losses/entropy": float(entropy_N.mean()),
+        **{f"losses/{name}": value for name, value in iteration.losses.items()},
+        "search/depth": float(algorithm.depth),
+        "search/nodes": float(iteration.look.nodes),
+        "search/model_calls": float(algorithm.num_model_calls),
+        "search/stationarity_gap": float(iteration.gap_N.max()),
+    }
+
+
+class Truth:
+    """What the exact world says of a policy and of an estimate.
+
+    Args:
+        algorithm: whose estimates are to be held to the truth.
+    """
+
+    def __init__(self, algorithm: PGTS) -> None:
+        self.mdp = algorithm.mdp
+        self.depth = algorithm.depth
+        self.update = algorithm.update
+        self.optimum = exact.optimal(self.mdp)
+
+    def metrics(self, pi_SA: Float[Tensor, "S A"], iteration: Iteration) -> dict[str, float]:
+        """The `exact/*` tags of an iteration that was made with pi_SA.
+
+        J, J* - J, the largest error of the lookahead at the visited states, and the cosine between the direction that
+        the policy moved in and the exact one; the cosine is left out where one of the two is 0.
+        """
+        evaluation = exact.evaluate(self.mdp, pi_SA)
+        look_SA = exact.lookahead(self.mdp, evaluation.q_SA, self.depth)
+        states = iteration.state_N.cpu()
+        error_NA = iteration.look.q_BA.cpu() - look_SA[states]
+        tags = {
+            "exact/J": evaluation.J,
+            "exact/optimality_gap": max(self.optimum.J - evaluation.J, 0.0),
+            "exact/lookahead_error": float(error_NA.abs().max()),
+        }
+        weight_S = evaluation.d_S if self.update.state_weight != "uniform" else (evaluation.d_S > 0).double()
+        true_SA = self._direction(pi_SA, look_SA, weight_S)
+        made_SA = torch.zeros_like(true_SA)
+        made_SA[states] = self._direction(pi_SA[states], iteration.look.q_BA.cpu(), iteration.weight_N.cpu())
+        norms = float(true_SA.norm() * made_SA.norm())
+        if norms > 0:
+            tags["exact/gradient_cosine"] = float((true_SA * made_SA).sum()) / norms
+        return tags
+
+    def _direction(self, pi_NA: Tensor, q_NA: Tensor, weight_N: Tensor) -> Tensor:
+        """The direction of the update, without what the simplex forbids: equal steps of all actions."""
+        if isinstance(self.update, SoftmaxUpdate):
+            return softmax_direction(pi_NA, q_NA, weight_N)
+        return weight_N[:, None] * (q_NA - q_NA.mean(-1, keepdim=True))

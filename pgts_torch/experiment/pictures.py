@@ -1,0 +1,113 @@
+"""What a tabular policy does and what it is worth, as one picture."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from torch import Tensor
+
+from pgts_torch.tabular import exact
+from pgts_torch.tabular.mdp import TabularMDP
+
+DIRECTIONS = {"left": (-1, 0), "right": (1, 0), "up": (0, 1), "down": (0, -1)}
+
+
+def policy_picture(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], *, title: str = "") -> Figure:
+    """v^pi as colours over the states of `mdp.shape`, and pi beside it: arrows where actions are directions of a
+    two-dimensional layout, else one column of probabilities a state. Start states are outlined, states that pi does not
+    visit are pale."""
+    evaluation = exact.evaluate(mdp, pi_SA)
+    rows, columns = mdp.shape
+    wide = columns > 3 * rows
+    size = (min(3 + 0.7 * columns, 12), 5) if wide else (11, 5)
+    figure = Figure(figsize=size, layout="constrained")
+    value_axes, policy_axes = figure.subplots(2, 1) if wide else figure.subplots(1, 2)
+    _draw_values(value_axes, mdp, evaluation.v_S, evaluation.d_S > 0)
+    if rows > 1 and all(name in DIRECTIONS for name in mdp.action_names):
+        _draw_arrows(policy_axes, mdp, pi_SA, evaluation.d_S > 0)
+    else:
+        _draw_columns(policy_axes, mdp, pi_SA)
+    figure.suptitle(f"{title}   J = {evaluation.J:.4g}".strip())
+    return figure
+
+
+def _draw_values(axes: Axes, mdp: TabularMDP, v_S: Tensor, visited_S: Tensor) -> None:
+    rows, columns = mdp.shape
+    image = axes.imshow(v_S.view(rows, columns), cmap="viridis", aspect="auto" if columns > 3 * rows else "equal")
+    axes.figure.colorbar(image, ax=axes, label="reward units")
+    _draw_marks(axes, mdp)
+    if mdp.num_states <= 100:
+        low, high = float(v_S.min()), float(v_S.max())
+        for s, value in enumerate(v_S.tolist()):
+            dark = value < (low + high) / 2
+            alpha = 1.0 if visited_S[s] else 0.5
+            axes.text(
+                s % columns,
+                s // columns,
+                f"{value:.2g}",
+                ha="center",
+                va="center",
+                fontsize=7,
+                color="w" if dark else "k",
+                alpha=alpha,
+            )
+    axes.set_title("value of the policy, v(s)")
+
+
+def _draw_arrows(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, visited_S: Tensor) -> None:
+    rows, columns = mdp.shape
+    state = np.arange(mdp.num_states)
+    shade = np.where(visited_S.numpy(), 1.0, 0.25)
+    for a, name in enumerate(mdp.action_names):
+        dx, dy = DIRECTIONS[name]
+        length = 0.45 * pi_SA[:, a].numpy()
+        axes.quiver(
+            state % columns,
+            state // columns,
+            dx * length,
+            -dy * length,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            alpha=shade,
+            color="C0",
+            width=0.004,
+            headwidth=4,
+        )
+    axes.set_xlim(-0.5, columns - 0.5)
+    axes.set_ylim(rows - 0.5, -0.5)
+    axes.set_aspect("equal")
+    _draw_marks(axes, mdp)
+    axes.set_title("policy, arrow length is probability")
+
+
+def _draw_columns(axes: Axes, mdp: TabularMDP, pi_SA: Tensor) -> None:
+    image = axes.imshow(pi_SA.T, cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+    axes.figure.colorbar(image, ax=axes, label="probability")
+    axes.set_yticks(range(mdp.num_actions), mdp.action_names)
+    axes.set_xlabel("state")
+    if mdp.num_states <= 20:
+        axes.set_xticks(range(mdp.num_states))
+        for s in range(mdp.num_states):
+            for a in range(mdp.num_actions):
+                p = float(pi_SA[s, a])
+                axes.text(s, a, f"{p:.2f}", ha="center", va="center", fontsize=8, color="w" if p > 0.5 else "k")
+    axes.set_title("policy")
+
+
+def _draw_marks(axes: Axes, mdp: TabularMDP) -> None:
+    """Start states outlined, unless every state is one."""
+    columns = mdp.shape[1]
+    starts = torch.nonzero(mdp.start_S).flatten().tolist()
+    if len(starts) < mdp.num_states:
+        for s in starts:
+            corner = (s % columns - 0.5, s // columns - 0.5)
+            axes.add_patch(_outline(corner))
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def _outline(corner: tuple[float, float]) -> Rectangle:
+    return Rectangle(corner, 1, 1, fill=False, edgecolor="tab:orange", linewidth=2.5)

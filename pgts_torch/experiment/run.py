@@ -1,0 +1,229 @@
+"""The loop around the algorithm: build it from a configuration, iterate, write down what happened."""
+
+import json
+import shutil
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.experiment import diagnostics
+from pgts_torch.experiment.config import Config, dump
+from pgts_torch.experiment.evaluate import Evaluation, evaluate, last_checkpoint
+from pgts_torch.experiment.pictures import policy_picture
+from pgts_torch.experiment.tracking import (
+    CHECKPOINTS,
+    CONFIG_FILE,
+    SUMMARY_FILE,
+    VERSIONS_FILE,
+    RunFolder,
+    prepare_folder,
+    versions,
+)
+from pgts_torch.tabular import exact, stationary
+
+PLAIN_LINES = 20
+"""About how many lines a run prints where there is no terminal to draw a progress bar on."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a finished run came to.
+
+    J, J_optimal: exact return of the trained policy and of the best one.
+    stationarity_gap: max over visited states of the exact g_m.
+    """
+
+    run: str
+    seed: int
+    depth: int
+    J: float
+    J_optimal: float
+    stationarity_gap: float
+    iterations: int
+    env_steps: int
+    model_calls: int
+    seconds: float
+    deterministic: Evaluation
+    sampled: Evaluation
+
+
+def build(config: Config) -> PGTS:
+    """The algorithm that a configuration describes.
+
+    Raises:
+        PgtsError: the environment does not exist or has no model, or parts do not fit it.
+    """
+    plain = config.model_dump(by_alias=True)
+    return PGTS(
+        config.env.id,
+        depth=config.search.depth,
+        policy=plain["policy"],
+        critic=plain["critic"],
+        update=plain["update"],
+        horizon=plain["rollout"]["horizon"],
+        num_envs=config.rollout.num_envs,
+        gamma=config.env.gamma,
+        max_nodes=config.search.max_nodes,
+        seed=config.seed,
+        device=config.device,
+        env_kwargs=plain["env"]["kwargs"],
+    )
+
+
+def train(config: Config) -> Summary:
+    """Run a configuration to its end and leave a run folder.
+
+    Raises:
+        PgtsError: something in the configuration cannot be built, or the folder is taken; nothing was written.
+    """
+    torch.set_num_threads(config.threads)
+    algorithm = build(config)
+    path = Path(config.run.dir) if config.run.dir else _new_folder(config)
+    prepare_folder(path, overwrite=config.run.overwrite)
+    if path.exists():
+        shutil.rmtree(path)
+    if config.critic.type == "exact":
+        print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
+    with RunFolder(path, tensorboard=config.run.tensorboard) as folder:
+        folder.text(CONFIG_FILE, dump(config))
+        folder.text(VERSIONS_FILE, json.dumps(versions() | {"threads": config.threads}, indent=2) + "\n")
+        summary = _loop(config, algorithm, folder)
+        folder.text(SUMMARY_FILE, json.dumps(asdict(summary), indent=2) + "\n")
+    return summary
+
+
+def evaluate_run(run: str | Path, *, episodes: int, seed: int) -> dict[str, Evaluation]:
+    """Evaluate the last checkpoint of a run: greedily and by drawing actions from the policy."""
+    torch.set_num_threads(1)
+    algorithm = PGTS.load(last_checkpoint(Path(run)))
+    return {
+        kind: evaluate(algorithm, episodes=episodes, deterministic=kind == "deterministic", seed=seed)
+        for kind in ("deterministic", "sampled")
+    }
+
+
+def _loop(config: Config, algorithm: PGTS, folder: RunFolder) -> Summary:
+    started = time.perf_counter()
+    truth = diagnostics.Truth(algorithm)
+    report = _Reporter(config.total_steps)
+    while algorithm.num_env_steps < config.total_steps:
+        pi_SA = algorithm.policy.table()
+        begun, steps_before = time.perf_counter(), algorithm.num_env_steps
+        iteration = algorithm.iterate()
+        seconds = time.perf_counter() - begun
+        k, step = algorithm.num_iterations, algorithm.num_env_steps
+        if k % config.log.every == 0:
+            tags = diagnostics.metrics(algorithm, iteration) | truth.metrics(pi_SA, iteration)
+            tags["charts/SPS"] = (step - steps_before) / seconds
+            folder.log(step, tags)
+            report.line(step, tags)
+        if config.eval.every and k % config.eval.every == 0:
+            folder.log(step, _evaluation_tags(algorithm, config))
+        if config.log.checkpoint_every and k % config.log.checkpoint_every == 0:
+            _save(algorithm, folder)
+    report.close()
+    _save(algorithm, folder)
+    return _finish(config, algorithm, truth, folder, time.perf_counter() - started)
+
+
+def _finish(config: Config, algorithm: PGTS, truth: diagnostics.Truth, folder: RunFolder, seconds: float) -> Summary:
+    pi_SA = algorithm.policy.table()
+    title = f"{config.env.id}, depth {config.search.depth}, seed {config.seed}"
+    folder.picture("policy", policy_picture(algorithm.mdp, pi_SA, title=title), algorithm.num_env_steps)
+    deterministic, sampled = (
+        evaluate(algorithm, episodes=config.eval.episodes, deterministic=kind, seed=config.seed)
+        for kind in (True, False)
+    )
+    return Summary(
+        run=str(folder.path),
+        seed=config.seed,
+        depth=config.search.depth,
+        J=exact.evaluate(algorithm.mdp, pi_SA).J,
+        J_optimal=truth.optimum.J,
+        stationarity_gap=float(stationary.gap(algorithm.mdp, pi_SA, config.search.depth).max()),
+        iterations=algorithm.num_iterations,
+        env_steps=algorithm.num_env_steps,
+        model_calls=algorithm.num_model_calls,
+        seconds=seconds,
+        deterministic=deterministic,
+        sampled=sampled,
+    )
+
+
+def _evaluation_tags(algorithm: PGTS, config: Config) -> dict[str, float]:
+    scores = {
+        kind: evaluate(
+            algorithm, episodes=config.eval.episodes, deterministic=kind == "deterministic", seed=config.seed
+        )
+        for kind in ("deterministic", "sampled")
+    }
+    return {f"eval/{kind}_return": score.episodic_return.mean for kind, score in scores.items()}
+
+
+def _save(algorithm: PGTS, folder: RunFolder) -> None:
+    algorithm.save(folder.path / CHECKPOINTS / f"{algorithm.num_env_steps:012d}.pt")
+
+
+def _new_folder(config: Config) -> Path:
+    stem = f"{config.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    names = (stem, *(f"{stem}-{n}" for n in range(2, 1000)))
+    return next(path for path in (Path("runs") / name for name in names) if not path.exists())
+
+
+class _Reporter:
+    """A progress bar on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, total_steps: int) -> None:
+        self._total = total_steps
+        self._terminal = sys.stderr.isatty()
+        self._bar = tqdm(total=total_steps, unit="step", disable=not self._terminal, dynamic_ncols=True)
+        self._next = 0
+
+    def line(self, step: int, tags: Mapping[str, float]) -> None:
+        """What a person wants to see while it runs."""
+        numbers = {
+            "return": tags["charts/discounted_return"],
+            "J": tags["exact/J"],
+            "gap": tags["search/stationarity_gap"],
+        }
+        if self._terminal:
+            self._bar.set_postfix({name: f"{value:.3g}" for name, value in numbers.items()}, refresh=False)
+            self._bar.update(min(step, self._total) - self._bar.n)
+        elif step >= self._next:
+            self._next = step + self._total // PLAIN_LINES
+            print(
+                f"step {step:>9}  " + "  ".join(f"{name} {value:8.3f}" for name, value in numbers.items()), flush=True
+            )
+
+    def close(self) -> None:
+        self._bar.close()
+
+
+def describe(summary: Summary) -> str:
+    """The summary as a person reads it, within 80 columns."""
+    share = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 else ""
+    rows: dict[str, Any] = {
+        "return of the policy, J": f"{summary.J:.4g}{share}",
+        "optimal return, J*": f"{summary.J_optimal:.4g}",
+        f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
+        "greedy episodes, return": _score_text(summary.deterministic),
+        "sampled episodes, return": _score_text(summary.sampled),
+        "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",
+        "model calls": summary.model_calls,
+        "seconds": f"{summary.seconds:.1f}",
+        "run folder": summary.run,
+    }
+    return "\n".join(f"{name:<28}{value}" for name, value in rows.items())
+
+
+def _score_text(evaluation: Evaluation) -> str:
+    score = evaluation.episodic_return
+    spread = "" if score.half_width is None else f" +- {score.half_width:.2g}"
+    return f"{score.mean:.4g}{spread} over {evaluation.episodes} episodes"
