@@ -198,9 +198,8 @@ class _Reporter:
             self._bar.update(min(step, self._total) - self._bar.n)
         elif step >= self._next:
             self._next = step + self._total // PLAIN_LINES
-            print(
-                f"step {step:>9}  " + "  ".join(f"{name} {value:8.3f}" for name, value in numbers.items()), flush=True
-            )
+            shown = "  ".join(f"{name} {value:8.3f}" for name, value in numbers.items())
+            print(f"step {step:>9}  {shown}", file=sys.stderr)
 
     def close(self) -> None:
         self._bar.close()

@@ -1,0 +1,240 @@
+"""The command `pgts`: one function for each subcommand.
+
+Torch is imported only after the arguments have proved themselves, so that mistakes and help appear at once.
+"""
+
+import argparse
+import difflib
+import json
+import os
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NoReturn
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.config import INT64_MAX, Config, dump
+from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.schema import Option, Schema
+
+USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
+WIDTH = 79
+
+Arguments = Sequence[str]
+COMMANDS: dict[str, Callable[[Arguments], None]] = {}
+"""The subcommands by name; the first line of a function's docstring is its help."""
+
+
+def command(function: Callable[[Arguments], None]) -> Callable[[Arguments], None]:
+    """Register a subcommand under the function's name, with dashes for underscores."""
+    COMMANDS[function.__name__.replace("_", "-")] = function
+    return function
+
+
+def main(arguments: Arguments | None = None) -> int:
+    """Run `pgts` with these arguments (default: those of the process).
+
+    Returns:
+        The exit code: 0; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C.
+    """
+    try:
+        code = _dispatch(sys.argv[1:] if arguments is None else arguments)
+        sys.stdout.flush()  # meets a broken pipe here, not while the interpreter shuts down
+        return code
+    except PgtsError as error:
+        for line in str(error).splitlines():
+            print(f"error: {line}", file=sys.stderr)
+        return USAGE_ERROR
+    except BrokenPipeError:
+        # Nobody reads on: what is still in the buffer goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+@command
+def train(arguments: Arguments) -> None:
+    """Train a policy with tree search."""
+    parser = _Parser("train", train, usage="%(prog)s [--config FILE] [--print-config] [--json] [--KEY VALUE ...]")
+    parser.add_argument("--config", metavar="FILE", help="YAML file with any of the keys below; none: the defaults")
+    parser.add_argument("--print-config", action="store_true", help="print the whole configuration as YAML and stop")
+    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    if {"-h", "--help"} & set(arguments):
+        parser.epilog = "\n".join(_describe(Schema(Config).options()))
+    fixed, overrides = parser.parse_known_args(arguments)
+    config = load(fixed.config, overrides)
+    if fixed.print_config:
+        sys.stdout.write(dump(config))
+        return
+    if fixed.config is None:
+        print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
+    from pgts_torch.experiment import run
+
+    summary = run.train(config)
+    print(json.dumps(asdict(summary)) if fixed.json else run.describe(summary))
+
+
+@command
+def evaluate(arguments: Arguments) -> None:
+    """Measure the policy that a run has left, in fresh episodes."""
+    parser = _Parser("evaluate", evaluate)
+    parser.add_argument("run_dir", metavar="RUN_DIR", type=_run_folder, help="the folder of a run")
+    parser.add_argument("--episodes", metavar="N", type=_whole(1), default=100, help="how many (default: %(default)s)")
+    parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the episodes (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
+    given = parser.parse_args(arguments)
+    from pgts_torch.experiment import run
+
+    answer = run.evaluate_run(given.run_dir, episodes=given.episodes, seed=given.seed)
+    _answer({kind: asdict(evaluation) for kind, evaluation in answer.items()}, as_json=given.json)
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argparse parser that reports a mistake in one line and takes no abbreviations."""
+
+    def __init__(self, name: str, function: Callable[..., Any], **settings: Any) -> None:
+        super().__init__(
+            prog=f"pgts {name}".strip(),
+            description=(function.__doc__ or "").partition("\n")[0],
+            allow_abbrev=False,
+            formatter_class=_Formatter,
+            **settings,
+        )
+
+    def print_help(self, file: Any = None) -> None:
+        """As argparse does, but without hiding that nobody reads."""
+        (file or sys.stdout).write(self.format_help())
+
+    def error(self, message: str) -> NoReturn:
+        raise PgtsError(f"{message} (see {self.prog} --help)")
+
+
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, width=WIDTH)
+
+
+def _dispatch(arguments: Arguments) -> int:
+    """Run a subcommand and return its exit code; argparse leaves by SystemExit after --help."""
+    try:
+        _run_command(arguments)
+    except SystemExit as leave:
+        return leave.code if isinstance(leave.code, int) else int(leave.code is not None)
+    return 0
+
+
+def _run_command(arguments: Arguments) -> None:
+    """Hand the arguments after the subcommand to its function."""
+    summaries = [f"  {name:<12}{(function.__doc__ or '').partition(chr(10))[0]}" for name, function in COMMANDS.items()]
+    parser = _Parser("", main, usage="pgts [-h] [--version] COMMAND ...")
+    parser.description = "Policy gradient with tree search."
+    parser.epilog = "\n".join(["commands:", *summaries, "", "pgts COMMAND --help explains each."])
+    parser.add_argument("--version", action="store_true", help="print the version and stop")
+    parser.add_argument("command", metavar="COMMAND", nargs="?", help="what to do")
+    parser.add_argument("arguments", metavar="...", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    given = parser.parse_args(arguments)
+    if given.version:
+        print(f"pgts {_version()}")
+    elif given.command is None:
+        parser.error(f"a command is missing; choose from {', '.join(COMMANDS)}")
+    elif given.command not in COMMANDS:
+        close = difflib.get_close_matches(given.command, COMMANDS, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(COMMANDS)}"
+        parser.error(f"{given.command!r} is not a command; {hint}")
+    else:
+        COMMANDS[given.command](given.arguments)
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("pgts_torch")
+
+
+def _describe(options: Sequence[Option]) -> Iterator[str]:
+    """The keys of a configuration for --help, by section."""
+    yield "keys, each --KEY VALUE or --KEY=VALUE, with the value in YAML:"
+    yield from textwrap.wrap(
+        "A mapping replaces its whole section, as in --critic '{type: exact}'; a single key changes nothing but "
+        "itself. true may be left out.",
+        WIDTH,
+        initial_indent="  ",
+        subsequent_indent="  ",
+    )
+    section, when = None, ""
+    for option in options:
+        name = option.key.partition(".")[0] if "." in option.key else "general"
+        if name != section:
+            yield from ("", name)
+            when = ""
+        if option.when != when and option.when:
+            yield f"  with {option.when}:"
+        section, when = name, option.when
+        yield from _describe_option(option, "    " if option.when else "  ")
+
+
+def _describe_option(option: Option, indent: str) -> Iterator[str]:
+    deeper = indent + "    "
+    head = f"--{option.key}  {option.requirement} (default: {_value(option.default)})"
+    yield from textwrap.wrap(head, WIDTH, initial_indent=indent, subsequent_indent=deeper, break_on_hyphens=False)
+    yield from textwrap.wrap(option.meaning, WIDTH, initial_indent=deeper, subsequent_indent=deeper)
+    for value, meaning in option.choices:
+        yield from textwrap.wrap(
+            f"{value}: {meaning}", WIDTH, initial_indent=deeper + "  ", subsequent_indent=deeper + "    "
+        )
+
+
+def _value(value: Any) -> str:
+    """A default as it would be written on the command line."""
+    if isinstance(value, str):
+        return value
+    return f"{value:_}" if type(value) is int else json.dumps(value)
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    """An argparse type: a whole number of at least `least`, below 2**63."""
+
+    def convert(text: str) -> int:
+        if not (text.isascii() and text.isdecimal() and len(text) < 20 and least <= int(text) <= INT64_MAX):
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number >= {least} and below 2**63")
+        return int(text)
+
+    return convert
+
+
+def _run_folder(text: str) -> Path:
+    """An argparse type: a folder with the configuration of a run in it."""
+    path = Path(text)
+    if not path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
+    if not (path / "config.yaml").is_file():
+        raise argparse.ArgumentTypeError(f"{text!r} is not the folder of a run: it has no config.yaml")
+    return path
+
+
+def _answer(answer: Mapping[str, Any], *, as_json: bool) -> None:
+    """Print named values, for a program or for a person."""
+    if as_json:
+        print(json.dumps(answer))
+        return
+    rows = list(_rows(answer))
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, value in rows:
+        print(f"{name:<{width}}  {value:.6g}" if isinstance(value, float) else f"{name:<{width}}  {value}")
+
+
+def _rows(answer: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted name, value) of nested values."""
+    for name, value in answer.items():
+        if isinstance(value, Mapping):
+            yield from _rows(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", "none" if value is None else value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,295 @@
+"""From a file and command-line overrides to a `Config`, with every mistake reported at once."""
+
+import functools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment import strict_yaml
+from pgts_torch.experiment.config import INT64_MAX, Config
+from pgts_torch.experiment.schema import KeyPath, Node, Place, Schema, is_nullable, is_text, requirement
+from pgts_torch.experiment.strict_yaml import Document, YamlMistake
+
+MAX_BYTES = 2**15
+"""A larger configuration file is refused."""
+
+MAX_MISTAKES = 50
+"""So many are listed; the rest is counted."""
+
+
+class ConfigError(PgtsError):
+    """What is wrong with a configuration: one line for each mistake."""
+
+    def __init__(self, mistakes: Sequence[str]) -> None:
+        self.mistakes = tuple(mistakes)
+        super().__init__("\n".join(self.mistakes))
+
+
+def load(path: str | Path | None = None, arguments: Sequence[str] = ()) -> Config:
+    """The defaults, changed by a file, changed by command-line arguments.
+
+    Args:
+        path: a YAML file with some of the keys; None: none.
+        arguments: overrides as on the command line, `--KEY VALUE` or `--KEY=VALUE`; a later one wins. A mapping as the
+            value replaces the whole section; a single key changes nothing but itself.
+
+    Raises:
+        ConfigError: with every mistake in the file and in the arguments.
+    """
+    return _Loader().load(path, arguments)
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """Where a value was given, the line if it was in a file, and a scalar's text as it was written."""
+
+    where: str
+    line: int = 0
+    text: str | None = None
+
+
+@dataclass(frozen=True)
+class _Mistake:
+    message: str
+    origin: _Origin
+
+    def __str__(self) -> str:
+        return f"{self.origin.where}: {self.message}" if self.origin.where else self.message
+
+
+@functools.cache
+def _schema() -> Schema:
+    return Schema(Config)
+
+
+@dataclass
+class _Loader:
+    """Collects values with their origins, and mistakes."""
+
+    schema: Schema = field(default_factory=_schema)
+    data: dict[str, Any] = field(default_factory=dict)
+    origins: dict[KeyPath, _Origin] = field(default_factory=dict)
+    mistakes: list[_Mistake] = field(default_factory=list)
+
+    def load(self, path: str | Path | None, arguments: Sequence[str]) -> Config:
+        file_is_read = path is None or self._read_file(Path(path))
+        for key, text in self._flags(arguments):
+            self._override(key, text)
+        self._fill_types(self.schema.root, self.data)
+        config = self._validate(file_is_read)
+        if self.mistakes or config is None:
+            raise ConfigError(self._lines())
+        return config
+
+    def _refuse(self, message: str, where: str, line: int | None = None) -> None:
+        self.mistakes.append(_Mistake(message, _Origin(f"{where}:{line}" if line else where, line or 0)))
+
+    def _lines(self) -> list[str]:
+        """The mistakes in the order of the file's lines, then those of the command line."""
+        in_order = sorted(self.mistakes, key=lambda mistake: (not mistake.origin.line, mistake.origin.line))
+        lines = list(dict.fromkeys(map(str, in_order)))
+        rest = len(lines) - MAX_MISTAKES
+        return lines if rest <= 0 else [*lines[:MAX_MISTAKES], f"and {rest} more"]
+
+    def _read_file(self, path: Path) -> bool:
+        """Whether the file could be read as YAML; what is in it goes to `data`."""
+        try:
+            document = strict_yaml.parse(_read(path))
+            self.data = _mapping(document.value)
+        except YamlMistake as mistake:
+            self._refuse(mistake.reason, str(path), mistake.line)
+            return False
+        for line, reason in document.mistakes:
+            self._refuse(reason, str(path), line)
+        for key, line in document.line.items():
+            self.origins[key] = _Origin(f"{path}:{line}", line, document.text.get(key))
+        return True
+
+    def _flags(self, arguments: Sequence[str]) -> Iterator[tuple[str, str | None]]:
+        """(key, value) of each flag; a flag without a value has None."""
+        waiting: str | None = None
+        for argument in arguments:
+            is_flag = argument.startswith("--")
+            if waiting is not None:
+                yield waiting, None if is_flag else argument
+            elif not is_flag:
+                self._refuse(f"{_quote(argument)} belongs to no option; write --KEY VALUE", "")
+            key, equals, text = argument.removeprefix("--").partition("=")
+            if is_flag and equals:
+                yield key, text
+            waiting = key if is_flag and not equals else None
+        if waiting is not None:
+            yield waiting, None
+
+    def _override(self, key: str, text: str | None) -> None:
+        path = tuple(key.split("."))
+        nodes = self.schema.find(path)
+        if not all(path) or not nodes:
+            return self._refuse(f"--{_escape(key)} is unknown{self._hint(key, '--')}", "")
+        if text is None and nodes[0].get("type") == "boolean":
+            text = "true"
+        if text is None:
+            return self._refuse(f"--{key} needs a value: {_what(nodes[0])}", "")
+        try:
+            document = _argument(text, nodes)
+        except YamlMistake as mistake:
+            return self._refuse(f"{_quote(text)}: {mistake.reason}", f"--{key}")
+        for _, reason in document.mistakes:
+            self._refuse(reason, f"--{key}")
+        self._put(path, document)
+
+    def _put(self, path: KeyPath, document: Document) -> None:
+        """Set one key, and where it and what is below it come from."""
+        section: Any = self.data
+        for part in path[:-1]:
+            section = section.setdefault(part, {})
+            if not isinstance(section, dict):
+                return  # the file has something else than a section here, which is reported by itself
+        section[path[-1]] = document.value
+        where = f"--{'.'.join(path)}"
+        self.origins = {known: origin for known, origin in self.origins.items() if known[: len(path)] != path}
+        for key in ((), *document.line):
+            self.origins[(*path, *key)] = _Origin(where, text=document.text.get(key))
+
+    def _fill_types(self, node: Node, data: Any) -> None:
+        """Where a section leaves its `type` out, the default's holds."""
+        if not isinstance(data, dict):
+            return
+        if variants := self.schema.variants(node):
+            data.setdefault("type", node["default"]["type"])
+            node = variants.get(data["type"], {}) if isinstance(data["type"], str) else {}
+        for name, child in self.schema.fields(node).items():
+            if name in data:
+                self._fill_types(child, data[name])
+
+    def _validate(self, file_is_read: bool) -> Config | None:
+        try:
+            return Config.model_validate(self.data)
+        except ValidationError as error:
+            for each in error.errors(include_url=False):
+                depends_on_file = each["type"] in ("conflict", "extra_forbidden")
+                if file_is_read or not depends_on_file:
+                    self.mistakes.append(self._translate(each))
+        return None
+
+    def _translate(self, error: Mapping[str, Any]) -> _Mistake:
+        """One error of pydantic in our words."""
+        place = self.schema.locate(error["loc"])
+        if error["type"] == "conflict":
+            keys = [tuple(key.split(".")) for key in error["ctx"]["keys"]] or [place.path]
+            given = [self.origins[key] for key in keys if key in self.origins]
+            return _Mistake(error["ctx"]["reason"], given[0] if given else self._origin(place.path))
+        if error["type"] == "union_tag_invalid":
+            tag = error["input"]["type"]
+            return self._unmet(place, (*place.path, "type"), tag)
+        if place.node is None:
+            return _Mistake(self._unknown(place), self._origin(place.path))
+        return self._unmet(place, place.path, error["input"])
+
+    def _unmet(self, place: Place, path: KeyPath, value: Any) -> _Mistake:
+        assert place.node is not None
+        origin = self._origin(path)
+        shown = _show(value, origin.text)
+        key = ".".join(path)
+        must = _what(place.node) if path == place.path else requirement(place.node)
+        sentence = f"{key} is {shown}; it must be {must}{_advice(place.node, value)}"
+        if origin.where == f"--{key}":
+            return _Mistake(f"--{sentence}", _Origin(""))
+        return _Mistake(sentence, origin)
+
+    def _unknown(self, place: Place) -> str:
+        key = ".".join(place.path)
+        if self.schema.find(place.path):
+            section = ".".join(place.path[:-1])
+            tag = place.parent["properties"]["type"]["const"]
+            return f"{key} does not belong to {section}.type {tag}; it must be left out, or {section}.type changed"
+        return f"{_escape(key)} is unknown{self._hint(key)}"
+
+    def _hint(self, key: str, prefix: str = "") -> str:
+        nearest = self.schema.nearest(key)
+        return f"; did you mean {prefix}{nearest}?" if nearest else "; `pgts train --help` lists all keys"
+
+    def _origin(self, path: KeyPath) -> _Origin:
+        """The origin of a key, or of what was given below it, or of the nearest section around it that was given."""
+        below = [origin for key, origin in self.origins.items() if key[: len(path)] == path]
+        if path and path not in self.origins and below:
+            return below[0]
+        for end in range(len(path), -1, -1):
+            if path[:end] in self.origins:
+                return self.origins[path[:end]]
+        return _Origin("")
+
+
+def _read(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise YamlMistake(f"the configuration cannot be read: {error.strerror}", None) from None
+    if len(content) > MAX_BYTES:
+        raise YamlMistake(f"the configuration is larger than {MAX_BYTES} bytes", None)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise YamlMistake(f"the configuration is not UTF-8 (at byte {error.start})", None) from None
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    if value is None:
+        raise YamlMistake("the configuration is empty; it must be a mapping of keys to values", None)
+    if not isinstance(value, dict):
+        raise YamlMistake(f"the configuration is {_show(value)}; it must be a mapping of keys to values", None)
+    return value
+
+
+def _argument(text: str, nodes: Sequence[Node]) -> Document:
+    """The value of a flag: text where the key asks for text, else YAML."""
+    if all(is_text(node) for node in nodes):
+        is_null = text == "null" and all(is_nullable(node) for node in nodes)
+        return Document(None if is_null else text, text={(): text})
+    return strict_yaml.parse(text) if text else Document(None, text={(): ""})
+
+
+def _what(node: Node) -> str:
+    if "oneOf" in node:
+        return f"a mapping with the key type ({requirement(node)})"
+    return requirement(node)
+
+
+def _advice(node: Node, value: Any) -> str:
+    """How to write what was probably meant."""
+    if isinstance(value, bool):
+        return ""
+    if isinstance(value, int) and value > INT64_MAX:
+        return " and below 2**63" if node.get("maximum") == INT64_MAX else ""
+    if isinstance(value, float) and value.is_integer() and node.get("type") == "integer" and abs(value) < 1e15:
+        return f" (write {int(value)})"
+    if isinstance(value, int | float) and is_text(node):
+        return " (in quotes, to make it text)"
+    return ""
+
+
+def _show(value: Any, text: str | None = None) -> str:
+    """A value in one short line; a number as it was written, text in quotes."""
+    if isinstance(value, dict | list):
+        return "a mapping" if isinstance(value, dict) else "a list"
+    if text == "":
+        return "empty"
+    if isinstance(value, str):
+        return _quote(value)
+    return _escape(json.dumps(value) if text is None else text)
+
+
+def _quote(text: str) -> str:
+    return f"'{_escape(text)}'"
+
+
+def _escape(text: str, length: int = 60) -> str:
+    """Printable ASCII and letters as they are, everything else escaped; cut where it is long."""
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: length + 1])
+    return shown if len(shown) <= length else f"{shown[:length]}..."

@@ -1,0 +1,190 @@
+"""The keys of a configuration as a person reads them: dotted, with requirement, default and meaning.
+
+Everything is read from the JSON schema of the pydantic model, so help and messages cannot drift from what is accepted.
+"""
+
+import difflib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from pydantic import BaseModel
+
+from pgts_torch.experiment.config import INT64_MAX
+
+Node = dict[str, Any]
+KeyPath = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Option:
+    """One key.
+
+    Args:
+        key: dotted, for instance "search.depth".
+        requirement: what its value must be, in words.
+        default: its value where nothing is said.
+        meaning: one sentence.
+        choices: (value, meaning) of each value, where they have one.
+        when: the choice that the key belongs to, for instance "critic.type tabular"; "" for the others.
+    """
+
+    key: str
+    requirement: str
+    default: Any
+    meaning: str
+    choices: tuple[tuple[str, str], ...] = ()
+    when: str = ""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an error is: its key, the node of that key (None: there is no such key) and the section around it."""
+
+    path: KeyPath
+    node: Node | None
+    parent: Node
+
+
+class Schema:
+    """The tree of keys below a model. A node is a JSON schema with its reference followed."""
+
+    def __init__(self, model: type[BaseModel]) -> None:
+        schema = model.model_json_schema(by_alias=True)
+        self._definitions = schema.get("$defs", {})
+        self.root = self._follow(schema)
+
+    def fields(self, node: Node) -> dict[str, Node]:
+        """The keys right below a section; {} for anything else."""
+        return {name: self._follow(child) for name, child in node.get("properties", {}).items()}
+
+    def variants(self, node: Node) -> dict[str, Node]:
+        """The sections that `type` chooses from, in the order of the model; {} for anything else."""
+        nodes = [self._follow(variant) for variant in node.get("oneOf", ())]
+        return {variant["properties"]["type"]["const"]: variant for variant in nodes}
+
+    def find(self, path: Sequence[str]) -> list[Node]:
+        """The nodes that a path may mean, one for each variant that has it. What is inside kwargs asks for nothing."""
+        nodes = [self.root]
+        for part in path:
+            if any(node.get("additionalProperties") is True for node in nodes):
+                return [{}]
+            sections = [section for node in nodes for section in (node, *self.variants(node).values())]
+            nodes = [fields[part] for fields in map(self.fields, sections) if part in fields]
+        return nodes
+
+    def locate(self, location: Sequence[str | int]) -> Place:
+        """The place that a pydantic error location means; its union tags and type names are no part of the key."""
+        path: KeyPath = ()
+        node = parent = self.root
+        for part in location:
+            if variants := self.variants(node):
+                node = variants[str(part)]
+                continue
+            fields = self.fields(node)
+            if not fields:
+                break
+            path, parent = (*path, str(part)), node
+            if part not in fields:
+                return Place(path, None, parent)
+            node = fields[str(part)]
+        return Place(path, node, parent)
+
+    def options(self) -> list[Option]:
+        """Every key with a value, in the order of the model."""
+        return list(self._options(self.root, (), ""))
+
+    def nearest(self, key: str) -> str | None:
+        """The key that was probably meant: one that ends the same, or one that is spelled nearly the same."""
+        same_end = [known for known in self._keys if known.rpartition(".")[2] == key.rpartition(".")[2]]
+        close = difflib.get_close_matches(key, same_end or self._keys, n=1, cutoff=0.0 if same_end else 0.7)
+        return close[0] if close else None
+
+    @cached_property
+    def _keys(self) -> list[str]:
+        """All dotted keys, sections too."""
+        parts = [option.key.split(".") for option in self.options()]
+        return list(dict.fromkeys(".".join(part[:end]) for part in parts for end in range(1, len(part) + 1)))
+
+    def _options(self, section: Node, path: KeyPath, when: str) -> Iterator[Option]:
+        for name, node in self.fields(section).items():
+            child = (*path, name)
+            key = ".".join(child)
+            if variants := self.variants(node):
+                yield self._choice(node, f"{key}.type", variants, when)
+                for tag, variant in variants.items():
+                    options = self._options(variant, child, f"{key}.type {tag}")
+                    yield from (option for option in options if option.key != f"{key}.type")
+            elif self.fields(node):
+                yield from self._options(node, child, when)
+            else:
+                yield Option(key, requirement(node), node["default"], _sentence(node), when=when)
+
+    def _choice(self, node: Node, key: str, variants: dict[str, Node], when: str) -> Option:
+        choices = tuple((tag, _sentence(variant)) for tag, variant in variants.items())
+        return Option(key, requirement(node), node["default"]["type"], _sentence(node), choices, when)
+
+    def _follow(self, node: Node) -> Node:
+        """The node with what its reference points at; what stands beside the reference goes first."""
+        [inner] = node.get("allOf", [node])
+        if "$ref" not in inner:
+            return node
+        return self._definitions[inner["$ref"].rpartition("/")[2]] | {
+            name: value for name, value in node.items() if name not in ("$ref", "allOf")
+        }
+
+
+def requirement(node: Node) -> str:
+    """What a value must be, in words: "a whole number >= 1"."""
+    if "requirement" in node:
+        return node["requirement"]
+    if "anyOf" in node:
+        return " or ".join(requirement(each) for each in node["anyOf"])
+    if "oneOf" in node:
+        return _either(list(node["discriminator"]["mapping"]))
+    if "const" in node or "enum" in node:
+        return _either(node.get("enum") or [node["const"]])
+    match node.get("type"):
+        case None:
+            return "a plain value"
+        case "integer":
+            return f"a whole number{_bounds(node)}"
+        case "number":
+            return f"a number{_bounds(node)}"
+        case "boolean":
+            return "true or false"
+        case "null":
+            return "null"
+        case kind:
+            assert kind == "object", f"a configuration key of type {kind} has no words yet"
+            keys = ", ".join(node.get("properties", ()))
+            return f"a mapping with the keys {keys}" if keys else "a mapping"
+
+
+def is_text(node: Node) -> bool:
+    """Whether every value but null is text."""
+    kinds = {each.get("type") for each in node.get("anyOf", [node])}
+    return "string" in kinds and kinds <= {"string", "null"}
+
+
+def is_nullable(node: Node) -> bool:
+    return any(each.get("type") == "null" for each in node.get("anyOf", ()))
+
+
+def _bounds(node: Node) -> str:
+    """An interval, or one comparison."""
+    low, above = node.get("minimum"), node.get("exclusiveMinimum")
+    high = node.get("maximum")
+    if high is None or high == INT64_MAX:
+        return f" >= {low:g}" if above is None else f" > {above:g}"
+    return f" in {'[' if above is None else '('}{low if above is None else above:g}, {high:g}]"
+
+
+def _either(values: list[str]) -> str:
+    *others, last = values
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _sentence(node: Node) -> str:
+    return " ".join(node.get("description", "").split())

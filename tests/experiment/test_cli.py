@@ -1,0 +1,263 @@
+"""The command `pgts`: help, exit codes, and what it hands on."""
+
+import json
+import re
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pgts_torch import experiment
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment import strict_yaml
+from pgts_torch.experiment.cli import COMMANDS, main
+from pgts_torch.experiment.config import Config, dump
+from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.schema import Schema
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Stands for what training or an evaluation returns."""
+
+    mean: float
+    half_width: float | None = None
+
+
+class FakeRun(types.ModuleType):
+    """Stands for the run loop, and remembers what it was given."""
+
+    def __init__(self) -> None:
+        super().__init__("pgts_torch.experiment.run")
+        self.calls: list[Any] = []
+        self.error: BaseException | None = None
+
+    def train(self, config: Config) -> Answer:
+        self.calls.append(config)
+        if self.error is not None:
+            raise self.error
+        return Answer(0.5)
+
+    def describe(self, answer: Answer) -> str:
+        return f"mean: {answer.mean}"
+
+    def evaluate_run(self, run: Path, *, episodes: int, seed: int) -> dict[str, Answer]:
+        self.calls.append((run, episodes, seed))
+        return {"sampled": Answer(0.25), "deterministic": Answer(0.5, 0.125)}
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> FakeRun:
+    fake = FakeRun()
+    monkeypatch.setitem(sys.modules, "pgts_torch.experiment.run", fake)
+    monkeypatch.setattr(experiment, "run", fake, raising=False)
+    return fake
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "mistake"),
+    [
+        ([], "a command is missing; choose from train, evaluate (see pgts --help)"),
+        (["trian"], "'trian' is not a command; did you mean train? (see pgts --help)"),
+        (["xyz"], "'xyz' is not a command; choose from train, evaluate (see pgts --help)"),
+        (["--verbose"], "unrecognized arguments: --verbose (see pgts --help)"),
+        (["train", "--config"], "argument --config: expected one argument (see pgts train --help)"),
+        (["train", "--config", "none.yaml"], "none.yaml: the configuration cannot be read: No such file or directory"),
+        (["train", "--conf", "x.yaml"], "--conf is unknown; `pgts train --help` lists all keys"),
+        (["train", "--depth", "4"], "--depth is unknown; did you mean --search.depth?"),
+        (["train", "--search.depth", "-1"], "--search.depth is -1; it must be a whole number >= 0"),
+        (["train", "--print-config", "--seed", "x"], "--seed is 'x'; it must be a whole number >= 0"),
+        (["evaluate"], "the following arguments are required: RUN_DIR (see pgts evaluate --help)"),
+        (["evaluate", "none"], "argument RUN_DIR: 'none' is not a folder (see pgts evaluate --help)"),
+        (
+            ["evaluate", "."],
+            "argument RUN_DIR: '.' is not the folder of a run: it has no config.yaml (see pgts evaluate --help)",
+        ),
+        (
+            ["evaluate", "--episodes", "0", "."],
+            "argument --episodes: '0' is not a whole number >= 1 and below 2**63 (see pgts evaluate --help)",
+        ),
+        (
+            ["evaluate", "--seed", "1e3", "."],
+            "argument --seed: '1e3' is not a whole number >= 0 and below 2**63 (see pgts evaluate --help)",
+        ),
+    ],
+)
+def test_a_mistake_is_one_line_on_stderr_with_exit_code_2_and_leaves_nothing(
+    run: FakeRun, here: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], mistake: str
+) -> None:
+    assert main(arguments) == 2
+    assert capsys.readouterr() == ("", f"error: {mistake}\n")
+    assert not run.calls
+    assert not list(here.iterdir())
+
+
+def test_several_mistakes_are_several_lines(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--seed", "-1", "--threads", "0"]) == 2
+    assert capsys.readouterr().err.splitlines() == [
+        "error: --seed is -1; it must be a whole number >= 0",
+        "error: --threads is 0; it must be a whole number in [1, 1024]",
+    ]
+
+
+def test_train_hands_on_the_file_with_its_overrides(
+    run: FakeRun, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "c.yaml").write_text("search: {depth: 2}\ncritic: {target: q}\n")
+    arguments = [
+        "--search.depth",
+        "4",
+        "--config",
+        "c.yaml",
+        "--seed=1",
+        "--run.dir",
+        "out",
+        "--update.step_size",
+        "1e-3",
+    ]
+    assert main(["train", *arguments]) == 0
+    overrides = [argument for argument in arguments if argument not in ("--config", "c.yaml")]
+    assert run.calls == [load("c.yaml", overrides)]
+    assert (run.calls[0].search.depth, run.calls[0].critic.target, run.calls[0].run.dir) == (4, "q", "out")
+    assert capsys.readouterr() == ("mean: 0.5\n", "")
+
+
+def test_train_without_a_file_says_that_the_defaults_apply(run: FakeRun, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--json"]) == 0
+    assert run.calls == [Config()]
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"mean": 0.5, "half_width": None}
+    assert err == "no --config: starting from the defaults (pgts/Ladder-v0)\n"
+
+
+def test_print_config_prints_yaml_that_loads_to_the_same_configuration(
+    run: FakeRun, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--config", str(ROOT / "configs" / "ladder.yaml"), "--env.kwargs.n", "7", "--run.overwrite"]
+    assert main(["train", "--print-config", *arguments]) == 0
+    out, err = capsys.readouterr()
+    assert Config.model_validate(strict_yaml.parse(out).value) == load(arguments[1], arguments[2:])
+    assert (err, run.calls, list(here.iterdir())) == ("", [], [])
+
+
+def test_evaluate_hands_on_its_arguments_and_prints_for_people_or_programs(
+    run: FakeRun, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "config.yaml").write_text(dump(Config()))
+    assert main(["evaluate", ".", "--episodes", "7", "--seed", "3"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "sampled.mean              0.25",
+        "sampled.half_width        none",
+        "deterministic.mean        0.5",
+        "deterministic.half_width  0.125",
+    ]
+    assert main(["evaluate", "--json", "."]) == 0
+    assert json.loads(capsys.readouterr().out)["deterministic"] == {"mean": 0.5, "half_width": 0.125}
+    assert run.calls == [(Path("."), 7, 3), (Path("."), 100, 0)]
+
+
+def test_an_error_of_the_run_is_one_line_and_ctrl_c_exits_with_130(
+    run: FakeRun, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run.error = PgtsError("no such environment: Laddr-v0")
+    assert main(["train", "--seed", "1"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == "error: no such environment: Laddr-v0"
+    run.error = KeyboardInterrupt()
+    assert main(["train", "--seed", "1"]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
+
+
+def test_a_defect_of_ours_keeps_its_traceback(run: FakeRun) -> None:
+    run.error = AssertionError("a defect")
+    with pytest.raises(AssertionError, match="a defect"):
+        main(["train", "--seed", "1"])
+
+
+def test_version_and_help_exit_with_0(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert re.fullmatch(r"pgts \d+\.\d+\.\d+\n", capsys.readouterr().out)
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    for name, function in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(str(function.__doc__))}$", out, re.MULTILINE)
+        assert main([name, "--help"]) == 0
+
+
+def test_the_help_of_train_names_every_key_with_requirement_default_and_meaning_within_80_columns(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    main(["train", "--help"])
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) < 80
+    text = " ".join(out.split())
+    options = Schema(Config).options()
+    assert {"seed", "search.depth", "critic.method.lambda", "env.kwargs"} <= {option.key for option in options}
+    for option in options:
+        default = strict_yaml.parse(_default_in(text, option.key, option.requirement)).value
+        assert option.when == "" or f"with {option.when}:" in text
+        assert default == option.default or option.when
+        assert option.meaning, option.key
+        assert option.meaning in text
+        for value, meaning in option.choices:
+            assert f"{value}: {meaning}" in text
+
+
+def _default_in(text: str, key: str, requirement: str) -> str:
+    found = re.search(rf"--{re.escape(key)} {re.escape(requirement)} \(default: (.*?)\)", text)
+    assert found, key
+    return found[1]
+
+
+@pytest.fixture
+def shell(tmp_path: Path) -> Callable[..., "subprocess.CompletedProcess[str]"]:
+    def call(*command: str) -> "subprocess.CompletedProcess[str]":
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+
+    return call
+
+
+TORCH_FREE = """
+import sys
+from pgts_torch.experiment.cli import main
+for arguments in (["--help"], ["train", "--help"], ["train", "--print-config"], ["train", "--search.depth", "-1"],
+                  ["train", "--config", "none.yaml"], ["evaluate", "none"], ["trian"]):
+    main(arguments)
+sys.exit(3 if "torch" in sys.modules else 0)
+"""
+
+
+def test_help_and_mistakes_do_not_wait_for_torch(shell: Callable[..., "subprocess.CompletedProcess[str]"]) -> None:
+    done = shell(sys.executable, "-c", TORCH_FREE)
+    assert done.returncode == 0, "torch was imported"
+    assert len(done.stderr.splitlines()) == 4
+
+
+def test_train_py_is_pgts_train(shell: Callable[..., "subprocess.CompletedProcess[str]"], tmp_path: Path) -> None:
+    done = shell(sys.executable, str(ROOT / "train.py"), "--serch.depth", "4")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: --serch.depth is unknown; did you mean --search.depth?\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pgts_torch.experiment.cli", "train", "--help"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141

@@ -1,0 +1,484 @@
+"""Configuration files and overrides: what is read, what is refused, and in which words."""
+
+import math
+import random
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+import pgts_torch  # noqa: F401  (registers the environments)
+from pgts_torch.agent import build
+from pgts_torch.experiment import strict_yaml
+from pgts_torch.experiment.config import Config, FixedHorizonConfig, dump
+from pgts_torch.experiment.loading import MAX_BYTES, MAX_MISTAKES, ConfigError, load
+from pgts_torch.experiment.schema import Schema
+from pgts_torch.models.tabular import TabularModel
+from pgts_torch.tabular import ladder
+
+SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+
+
+@pytest.fixture
+def mistakes(tmp_path: Path) -> Callable[..., list[str]]:
+    """The mistakes in a file `c.yaml` of this content and in these arguments, without the folder."""
+
+    def find(content: str | bytes | None, *arguments: str) -> list[str]:
+        path = tmp_path / "c.yaml"
+        if content is not None:
+            path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        with pytest.raises(ConfigError) as caught:
+            load(None if content is None else path, arguments)
+        assert caught.value.mistakes == tuple(str(caught.value).splitlines())
+        return [line.replace(f"{tmp_path}/", "") for line in caught.value.mistakes]
+
+    return find
+
+
+@pytest.mark.parametrize(
+    ("content", "mistake"),
+    [
+        ("", "c.yaml: the configuration is empty; it must be a mapping of keys to values"),
+        ("# nothing\n", "c.yaml: the configuration is empty; it must be a mapping of keys to values"),
+        ("- seed", "c.yaml: the configuration is a list; it must be a mapping of keys to values"),
+        ("seed", "c.yaml: the configuration is 'seed'; it must be a mapping of keys to values"),
+        (b"name: \xff", "c.yaml: the configuration is not UTF-8 (at byte 6)"),
+        (b"#" * (MAX_BYTES + 1), f"c.yaml: the configuration is larger than {MAX_BYTES} bytes"),
+        ("a: &x 1\nb: *x", "c.yaml:1: anchors (&) and aliases (*) are not allowed; write the value out"),
+        ("a: 1\nb: *x", "c.yaml:2: anchors (&) and aliases (*) are not allowed; write the value out"),
+        (
+            "a: !!python/name:os.system x",
+            "c.yaml:1: tags are not allowed, here tag:yaml.org,2002:python/name:os.system; write plain values",
+        ),
+        ("seed: 1\n---\nseed: 2", "c.yaml:2: a second document starts here; only one is allowed"),
+        ("%YAML 1.1\n---\nseed: 1", "c.yaml:1: directives (%) are not allowed; the text is read as YAML 1.2"),
+        ("seed: [1, 2", "c.yaml:1: this is not YAML: expected ',' or ']', but got '<stream end>'"),
+        ("seed: 1\n\tname: x", "c.yaml:2: this is not YAML: found character '\\t' that cannot start any token"),
+        ("a: " + "[" * 3000, "c.yaml:1: values are nested more than 32 deep"),
+        ("- " * 3000, "c.yaml:1: values are nested more than 32 deep"),
+        ("seed: " + "9" * 5000, f"c.yaml:1: a number cannot be read: {'9' * 57}..."),
+        ("[a]: 1", "c.yaml:1: a key must be a word, not a mapping or a sequence"),
+        ('name: "\\ud800"', "c.yaml:1: text holds half of a surrogate pair, which is no character"),
+        ('name: "\\UFFFFFFFF"', "c.yaml: this is not YAML: Python int too large to convert to C int"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_one_clear_line(
+    mistakes: Callable[..., list[str]], content: str | bytes, mistake: str
+) -> None:
+    assert mistakes(content) == [mistake]
+
+
+def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: the configuration cannot be read: No such file or directory$"):
+        load(tmp_path / "none.yaml")
+    with pytest.raises(ConfigError, match=r"the configuration cannot be read: Is a directory$"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "mistake"),
+    [
+        ("seed: -1", "seed is -1; it must be a whole number >= 0"),
+        ("seed: 1.0", "seed is 1.0; it must be a whole number >= 0 (write 1)"),
+        ("total_steps: 1e6", "total_steps is 1e6; it must be a whole number >= 1 (write 1000000)"),
+        ("seed: 9223372036854775808", "seed is 9223372036854775808; it must be a whole number >= 0 and below 2**63"),
+        ("seed: '1'", "seed is '1'; it must be a whole number >= 0"),
+        ("seed: true", "seed is true; it must be a whole number >= 0"),
+        ("seed:", "seed is empty; it must be a whole number >= 0"),
+        ("seed: {a: 1}", "seed is a mapping; it must be a whole number >= 0"),
+        ("threads: 2000", "threads is 2000; it must be a whole number in [1, 1024]"),
+        (
+            "name: 010",
+            "name is 010; it must be letters, digits, '.', '_', '-', at most 100 (in quotes, to make it text)",
+        ),
+        ("name: ../x", "name is '../x'; it must be letters, digits, '.', '_', '-', at most 100"),
+        ('name: "a\\nb"', "name is 'a\\nb'; it must be letters, digits, '.', '_', '-', at most 100"),
+        ("device: gpu", "device is 'gpu'; it must be cpu, cuda or cuda:N"),
+        ("env: {gamma: 1.5}", "env.gamma is 1.5; it must be a number in [0, 1] or null"),
+        ("env: {gamma: .nan}", "env.gamma is .nan; it must be a number in [0, 1] or null"),
+        ("env: {id: }", "env.id is empty; it must be the id of a Gymnasium environment"),
+        ("env: {kwargs: 3}", "env.kwargs is 3; it must be a mapping"),
+        ("env: {kwargs: {n: .inf}}", "env.kwargs holds inf; numbers must be finite"),
+        ("env: {kwargs: {n: [1, .nan]}}", "env.kwargs holds nan; numbers must be finite"),
+        ("env: {kwargs: {1: 2}}", "env.kwargs has the key '1', which cannot be the name of an argument"),
+        ("env: {kwargs: {gamma: 0.9}}", "env.kwargs must not have the key gamma: env.gamma sets it"),
+        ("update: {step_size: 0}", "update.step_size is 0; it must be a number > 0"),
+        ("update: {step_size: .inf}", "update.step_size is .inf; it must be a number > 0"),
+        ("update: {type: adam}", "update.type is 'adam'; it must be projected, softmax or mirror"),
+        ("run: {overwrite: yes}", "run.overwrite is 'yes'; it must be true or false"),
+        ("run: {dir: 5}", "run.dir is 5; it must be a folder or null (in quotes, to make it text)"),
+        ("search: 4", "search is 4; it must be a mapping with the keys depth, max_nodes"),
+        ("search:", "search is empty; it must be a mapping with the keys depth, max_nodes"),
+        ("critic: 4", "critic is 4; it must be a mapping with the key type (exact, rollout or tabular)"),
+        ("critic: {type: neural}", "critic.type is 'neural'; it must be exact, rollout or tabular"),
+        ("critic: {type: [1]}", "critic.type is a list; it must be exact, rollout or tabular"),
+        ("critic: {type: null}", "critic.type is null; it must be exact, rollout or tabular"),
+        ("critic: {step_size: men}", "critic.step_size is 'men'; it must be a number in (0, 1] or mean"),
+        ("critic: {method: {lambda: 2}}", "critic.method.lambda is 2; it must be a number in [0, 1]"),
+        ("critic: {method: {type: td}}", "critic.method.type is 'td'; it must be monte_carlo or td_lambda"),
+        (
+            "critic: {samples: 3}",
+            "critic.samples does not belong to critic.type tabular; it must be left out, or critic.type changed",
+        ),
+        ("critic: {method: {lambda_: 1}}", "critic.method.lambda_ is unknown; did you mean critic.method.lambda?"),
+        ("serach: {depth: 4}", "serach is unknown; did you mean search?"),
+        ("search: {depht: 4}", "search.depht is unknown; did you mean search.depth?"),
+        ("depth: 4", "depth is unknown; did you mean search.depth?"),
+        ("xyz: 4", "xyz is unknown; `pgts train --help` lists all keys"),
+        ("<<: {seed: 1}", "<< is unknown; `pgts train --help` lists all keys"),
+        ("seed: 1\nseed: 2", "the key seed is given twice"),
+        ("env: {kwargs: {n: 1, n: 2}}", "the key env.kwargs.n is given twice"),
+        (
+            "policy: {init: {type: biased, probability: 1.0}}",
+            "policy.init.probability is 1, which policy.type softmax cannot represent (infinite logits); "
+            "it must be below 1, or policy.type simplex",
+        ),
+        (
+            "update: {type: projected}",
+            "update.type is projected, which needs policy.type simplex; policy.type is softmax",
+        ),
+        ("policy: {type: simplex}", "update.type is softmax, which needs policy.type softmax; policy.type is simplex"),
+        (
+            "{policy: {type: simplex, init: {type: biased, probability: 1}}, update: {type: mirror}}",
+            "update.type is mirror, which leaves probabilities of 0 at 0; "
+            "a policy with policy.init.probability 1 would never move",
+        ),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_line_its_key_and_what_is_required(
+    mistakes: Callable[..., list[str]], content: str, mistake: str
+) -> None:
+    line = 1 + content.count("\n")
+    assert mistakes(content) == [f"c.yaml:{line}: {mistake}"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "mistake"),
+    [
+        (["--search.depth", "-1"], "--search.depth is -1; it must be a whole number >= 0"),
+        (["--search.depth=-1"], "--search.depth is -1; it must be a whole number >= 0"),
+        (
+            ["--search.depth", "[1"],
+            "--search.depth: '[1': this is not YAML: expected ',' or ']', but got '<stream end>'",
+        ),
+        (
+            ["--search.depth", "*a"],
+            "--search.depth: '*a': anchors (&) and aliases (*) are not allowed; write the value out",
+        ),
+        (["--seed="], "--seed is empty; it must be a whole number >= 0"),
+        (["--name="], "--name is empty; it must be letters, digits, '.', '_', '-', at most 100"),
+        (["--search.depth"], "--search.depth needs a value: a whole number >= 0"),
+        (["--search.depth", "--run.overwrite"], "--search.depth needs a value: a whole number >= 0"),
+        (["--run.overwrite", "no"], "--run.overwrite is 'no'; it must be true or false"),
+        (["--run.dir", "a\udcff"], "--run.dir is 'a\\udcff'; it must be a folder or null"),
+        (["--search.depht", "4"], "--search.depht is unknown; did you mean --search.depth?"),
+        (["--depth", "4"], "--depth is unknown; did you mean --search.depth?"),
+        (["--search.depth.more", "4"], "--search.depth.more is unknown; did you mean --search.depth?"),
+        (["--env.", "4"], "--env. is unknown; did you mean --env?"),
+        (["--", "4"], "-- is unknown; `pgts train --help` lists all keys"),
+        (["depth"], "'depth' belongs to no option; write --KEY VALUE"),
+        (["--seed", "1", "2"], "'2' belongs to no option; write --KEY VALUE"),
+        (["--critic", "{type: exact, target: x}"], "--critic: critic.target is 'x'; it must be v or q"),
+        (["--critic", "{type: exact, type: exact}"], "--critic: the key type is given twice"),
+        (
+            ["--critic.type", "exact", "--critic.method.lambda", "0.4"],
+            "--critic.method.lambda: critic.method does not belong to critic.type exact; it must be left out, "
+            "or critic.type changed",
+        ),
+        (
+            ["--policy.type", "simplex"],
+            "--policy.type: update.type is softmax, which needs policy.type softmax; policy.type is simplex",
+        ),
+        (["--env.kwargs.n"], "--env.kwargs.n needs a value: a plain value"),
+        (["--env.kwargs.id", "x"], "--env.kwargs.id: env.kwargs must not have the key id: env.id sets it"),
+    ],
+)
+def test_a_wrong_argument_is_named_with_its_flag_and_what_is_required(
+    mistakes: Callable[..., list[str]], arguments: list[str], mistake: str
+) -> None:
+    assert mistakes(None, *arguments) == [mistake]
+
+
+def test_all_mistakes_are_reported_at_once_in_the_order_of_lines_then_flags(
+    mistakes: Callable[..., list[str]],
+) -> None:
+    content = "update: {type: projected}\nnam: x\nsearch: {depth: -1}\nseed: 1\nseed: 2\ncritic: {type: x}\n"
+    assert mistakes(content, "--sed", "3", "--threads", "0", "stray") == [
+        "c.yaml:1: update.type is projected, which needs policy.type simplex; policy.type is softmax",
+        "c.yaml:2: nam is unknown; did you mean name?",
+        "c.yaml:3: search.depth is -1; it must be a whole number >= 0",
+        "c.yaml:5: the key seed is given twice",
+        "c.yaml:6: critic.type is 'x'; it must be exact, rollout or tabular",
+        "--sed is unknown; did you mean --seed?",
+        "'stray' belongs to no option; write --KEY VALUE",
+        "--threads is 0; it must be a whole number in [1, 1024]",
+    ]
+
+
+def test_flags_are_checked_even_if_the_file_cannot_be_read_but_not_against_what_it_might_say(
+    mistakes: Callable[..., list[str]],
+) -> None:
+    found = mistakes("[", "--threads", "0", "--update.type", "projected", "--critic.samples", "3")
+    assert len(found) == 2
+    assert found[0].startswith("c.yaml:1: this is not YAML")
+    assert found[1] == "--threads is 0; it must be a whole number in [1, 1024]"
+
+
+def test_a_flood_of_mistakes_is_cut(mistakes: Callable[..., list[str]]) -> None:
+    found = mistakes("\n".join(f"key_{n}: 1" for n in range(MAX_MISTAKES + 7)))
+    assert len(found) == MAX_MISTAKES + 1
+    assert found[-1] == "and 7 more"
+
+
+def test_without_file_and_overrides_the_defaults_apply() -> None:
+    assert load() == Config()
+
+
+def test_the_readable_forms_of_yaml_1_2_mean_what_they_say(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_bytes(b"\xef\xbb\xbftotal_steps: 1_000\r\nseed: 010\r\nupdate: {step_size: 5e-2}\r\nname: no\r\n")
+    config = load(path)
+    assert (config.total_steps, config.seed, config.update.step_size, config.name) == (1000, 10, 0.05, "no")
+
+
+def test_an_override_changes_one_key_and_a_mapping_replaces_a_section(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text("critic: {type: tabular, target: q, step_size: 0.3}\nsearch: {depth: 2, max_nodes: 7}\n")
+    config = load(path, ["--critic.step_size", "mean", "--search", "{depth: 3}"])
+    assert config.critic.model_dump() == Config().critic.model_dump() | {"target": "q", "step_size": "mean"}
+    assert config.search == Config().search.model_copy(update={"depth": 3})
+    assert load(path, ["--critic", "{type: exact}"]).critic.model_dump() == {"type": "exact", "target": "v"}
+
+
+def test_the_later_override_wins() -> None:
+    config = load(None, ["--seed", "1", "--critic.target", "q", "--seed=2", "--critic", "{type: exact}"])
+    assert (config.seed, config.critic.target) == (2, "v")
+
+
+def test_text_stays_text_on_the_command_line() -> None:
+    config = load(None, ["--name", "010", "--run.dir", "1e3", "--env.kwargs.n", "010", "--env.kwargs.word", "'010'"])
+    assert (config.name, config.run.dir, config.env.kwargs) == ("010", "1e3", {"n": 10, "word": "010"})
+    assert load(None, ["--run.dir", "x", "--run.dir", "null"]).run.dir is None
+    assert load(None, ["--name", "null"]).name == "null"
+
+
+def test_a_bare_flag_turns_a_switch_on() -> None:
+    assert load(None, ["--run.overwrite", "--seed", "3"]) == load(None, ["--seed=3", "--run.overwrite", "true"])
+    assert load(None, ["--run.overwrite"]).run.overwrite
+
+
+def test_a_section_without_type_has_the_default_one() -> None:
+    horizon = load(None, ["--rollout.horizon.length", "7"]).rollout.horizon
+    assert horizon == FixedHorizonConfig(length=7)
+
+
+def test_a_configuration_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        Config().seed = 1  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_a_shipped_configuration_is_valid_and_says_what_it_shows(path: Path) -> None:
+    config = load(path)
+    assert path.read_text().startswith("# ")
+    assert config.name == path.stem
+    assert gymnasium.spec(config.env.id).id == config.env.id
+    gymnasium.make(config.env.id, **config.env.kwargs).close()
+
+
+def test_the_shipped_configurations_are_those_of_the_paper_and_deep_sea() -> None:
+    assert [path.stem for path in SHIPPED] == ["deep_sea", "grid", "ladder", "random", "tightrope"]
+
+
+@pytest.mark.parametrize("path", [None, *SHIPPED], ids=lambda path: path.stem if path else "defaults")
+def test_a_printed_configuration_loads_to_the_same_one(path: Path | None, tmp_path: Path) -> None:
+    config = load(path)
+    (tmp_path / "c.yaml").write_text(dump(config))
+    assert load(tmp_path / "c.yaml") == config
+
+
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=5,
+)
+"""What may stand in env.kwargs."""
+
+SAMPLES: dict[str, st.SearchStrategy[Any]] = {
+    "a whole number >= 0": st.integers(0, 2**63 - 1),
+    "a whole number >= 1": st.integers(1, 2**63 - 1),
+    "a whole number in [1, 1024]": st.integers(1, 1024),
+    "a number > 0": st.floats(0, exclude_min=True, allow_infinity=False),
+    "a number in [0, 1]": st.floats(0, 1),
+    "a number in (0, 1]": st.floats(0, 0.5, exclude_min=True),
+    "a number in [0, 1] or null": st.none() | st.floats(0, 1),
+    "a number in (0, 1] or mean": st.just("mean") | st.floats(0, 1, exclude_min=True),
+    "true or false": st.booleans(),
+    "a folder or null": st.none() | st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"]), min_size=1),
+    "the id of a Gymnasium environment": st.from_regex(r"[A-Za-z0-9_.:/-]{1,20}", fullmatch=True),
+    "letters, digits, '.', '_', '-', at most 100": st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", fullmatch=True),
+    "cpu, cuda or cuda:N": st.sampled_from(["cpu", "cuda", "cuda:3"]),
+    "a mapping": st.dictionaries(st.sampled_from(["n", "traps", "word"]), PLAIN),
+}
+"""Valid values for each requirement."""
+
+
+OPTIONS = Schema(Config).options()
+
+
+@st.composite
+def configurations(draw: st.DrawFn) -> Config:
+    """Every key with any valid value; the policy and its update fit each other."""
+    data: dict[str, Any] = {}
+    for option in OPTIONS:
+        *sections, name = option.key.split(".")
+        section = data
+        for part in sections:
+            section = section.setdefault(part, {})
+        chosen = option.when.rpartition(" ")[2]
+        if option.when and section.get("type", chosen) != chosen:
+            continue
+        choices = option.requirement.replace(" or ", ", ").split(", ")
+        section[name] = draw(SAMPLES.get(option.requirement, st.sampled_from(choices)))
+    data["update"]["type"] = {"simplex": "projected", "softmax": "softmax"}[data["policy"]["type"]]
+    _drop_parts_of_other_choices(data)
+    return Config.model_validate(data)
+
+
+def _drop_parts_of_other_choices(data: dict[str, Any]) -> None:
+    critic = data["critic"]
+    kept = {
+        "exact": {"target"},
+        "tabular": {"target", "method", "step_size"},
+        "rollout": {"samples", "target", "horizon"},
+    }
+    data["critic"] = {"type": critic["type"]} | {k: v for k, v in critic.items() if k in kept[critic["type"]]}
+
+
+@given(configurations())
+def test_any_configuration_survives_printing_and_loading(config: Config) -> None:
+    assert Config.model_validate(strict_yaml.parse(dump(config)).value) == config
+    assert dump(config).isascii()
+
+
+def test_every_default_is_the_one_that_the_help_names() -> None:
+    defaults = Config().model_dump(by_alias=True)
+    options = {option.key: option for option in OPTIONS if _holds(option.when, defaults)}
+    for key, option in options.items():
+        assert _look_up(defaults, key) == option.default, key
+    assert set(options) == set(_leaves(defaults))
+
+
+def _holds(when: str, data: dict[str, Any]) -> bool:
+    key, _, tag = when.partition(" ")
+    return not when or (_holds_key(key, data) and _look_up(data, key) == tag)
+
+
+def _holds_key(key: str, data: dict[str, Any]) -> bool:
+    return any(leaf == key for leaf in _leaves(data))
+
+
+def _look_up(data: Any, key: str) -> Any:
+    for part in key.split("."):
+        data = data[part]
+    return data
+
+
+def _leaves(data: dict[str, Any], prefix: str = "") -> list[str]:
+    leaves: list[str] = []
+    for name, value in data.items():
+        leaves += _leaves(value, f"{prefix}{name}.") if isinstance(value, dict) and value else [f"{prefix}{name}"]
+    return leaves
+
+
+def test_the_library_accepts_every_part_that_can_be_configured() -> None:
+    mdp = ladder()
+    model = TabularModel(mdp)
+    for kind in ("exact", "tabular", "rollout"):
+        critic = load(None, ["--critic.type", kind]).model_dump(by_alias=True)["critic"]
+        assert build.make_critic(critic, model, mdp).target == "v"
+    build.make_critic(
+        load(None, ["--critic.method.type", "monte_carlo"]).model_dump(by_alias=True)["critic"], model, mdp
+    )
+    for kind in ("uniform", "random", "biased"):
+        policy = load(None, ["--policy.init.type", kind]).model_dump(by_alias=True)["policy"]
+        for form in ("softmax", "simplex"):
+            assert build.make_policy(policy | {"type": form}, 5, 2, seed=0, device="cpu").num_actions == 2
+    for kind in ("fixed", "geometric"):
+        build.make_horizon(load(None, ["--rollout.horizon.type", kind]).model_dump(by_alias=True)["rollout"]["horizon"])
+    for kind in ("projected", "softmax", "mirror"):
+        build.make_update(Config().model_dump(by_alias=True)["update"] | {"type": kind})
+
+
+CHARACTERS = [chr(n) for n in range(1, 300)]
+
+
+def _mutated(text: str, generator: random.Random) -> str:
+    """`text` after one to five small accidents."""
+    for _ in range(generator.randint(1, 5)):
+        at, end = sorted(generator.choices(range(len(text) + 1), k=2))
+        insert = generator.choice(
+            [*"{}[]:,-?&*!|>%@`'\"#\n\t \\0~.", "---\n", "null", "1e9", "\x00", "\ud7ff", "é", "!!int "]
+        )
+        match generator.randrange(4):
+            case 0:
+                text = text[:at] + insert + text[at:]
+            case 1:
+                text = text[:at] + text[min(end, at + 5) :]
+            case 2:
+                text = text[:at] + insert * generator.choice([2, 40]) + text[at:]
+            case _:
+                text = text[:at] + text[end : end + 40] + text[at:]
+    return text
+
+
+def test_damaged_files_give_a_configuration_or_clear_lines_and_nothing_else(tmp_path: Path) -> None:
+    generator = random.Random(0)
+    texts = [path.read_text().partition("\n")[2] for path in SHIPPED] + [dump(Config())]
+    outcome = {"valid": 0, "refused": 0}
+    slowest = 0.0
+    for n in range(400):
+        text = "".join(generator.choices(CHARACTERS, k=30)) if n % 8 == 0 else ""
+        text = text or _mutated(generator.choice(texts), generator)
+        path = tmp_path / "c.yaml"
+        path.write_bytes(text.encode("utf-8"))
+        started = time.perf_counter()
+        try:
+            load(path)
+            outcome["valid"] += 1
+        except ConfigError as error:
+            outcome["refused"] += 1
+            for line in str(error).splitlines():
+                assert line.isprintable()
+                assert line.startswith((f"{path}:", "and "))
+        slowest = max(slowest, time.perf_counter() - started)
+    assert min(outcome.values()) >= 5
+    assert slowest < 2
+
+
+def _mistakes_in(argument: str) -> tuple[str, ...]:
+    try:
+        load(None, [argument])
+    except ConfigError as error:
+        return error.mistakes
+    return ()
+
+
+@given(st.text(max_size=60))
+def test_any_argument_gives_a_configuration_or_clear_lines(text: str) -> None:
+    for argument in (text, f"--{text}", f"--search.depth={text}", f"--env.kwargs={text}", f"--env.kwargs.n={text}"):
+        assert all(line.isprintable() for line in _mistakes_in(argument))
+
+
+def test_numbers_that_are_not_finite_are_refused_wherever_they_stand() -> None:
+    for key in ("env.gamma", "update.step_size", "critic.step_size", "critic.method.lambda", "env.kwargs.x"):
+        for value in (".nan", ".inf", "1e999", "-.inf"):
+            with pytest.raises(ConfigError):
+                load(None, [f"--{key}", value])
+    assert math.isfinite(load(None, ["--update.step_size", "1e300"]).update.step_size)

@@ -1,0 +1,7 @@
+"""`python train.py ...` is `pgts train ...`."""
+
+import sys
+
+from pgts_torch.experiment.cli import main
+
+sys.exit(main(["train", *sys.argv[1:]]))
