@@ -1,1 +1,55 @@
-"""Policy gradient with tree search."""
+"""Policy gradient with tree search: policies trained toward what an m-step lookahead sees.
+
+A tensor's name ends in its axes:
+`S states, A actions, K outcomes of one (s, a), C children (the values that a backup reads), B batch or roots, N nodes,
+T time, D features`.
+
+Importing this package registers the `pgts/` environments with Gymnasium and does not import torch; the names below
+are loaded when they are first asked for.
+"""
+
+import importlib
+import importlib.metadata
+from typing import Any
+
+import gymnasium
+
+_SUBPACKAGES = ("agent", "envs", "models", "search", "tabular")
+
+__all__ = ["PGTS", "__version__", "agent", "envs", "models", "search", "tabular"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "PGTS":
+        return importlib.import_module("pgts_torch.agent.pgts").PGTS
+    if name == "__version__":
+        return importlib.metadata.version("pgts_torch")
+    if name in _SUBPACKAGES:
+        return importlib.import_module(f"pgts_torch.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _register_environments() -> None:
+    """Every environment in two forms, one copy and many; DeepSea ends by itself and has no time limit."""
+    for name, entry_point, max_episode_steps in [
+        ("Ladder", "ladder", 100),
+        ("Tightrope", "tightrope", 100),
+        ("Random", "random_mdp", 100),
+        ("Grid", "grid", 200),
+        ("DeepSea", "deep_sea", None),
+    ]:
+        # Registering an id twice makes Gymnasium warn, and a reload of this module is no mistake of the user.
+        if f"pgts/{name}-v0" not in gymnasium.registry:
+            gymnasium.register(
+                f"pgts/{name}-v0",
+                entry_point=f"pgts_torch.envs.entry_points:{entry_point}",
+                vector_entry_point=f"pgts_torch.envs.entry_points:{entry_point}_vector",
+                max_episode_steps=max_episode_steps,
+            )
+
+
+_register_environments()

@@ -1,0 +1,6 @@
+"""The zoo as Gymnasium environments, one copy or thousands."""
+
+from pgts_torch.envs.tabular import TabularEnv
+from pgts_torch.envs.vector import TabularVectorEnv
+
+__all__ = ["TabularEnv", "TabularVectorEnv"]

@@ -1,0 +1,231 @@
+"""Thousands of copies of a tabular MDP, stepped together."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+from gymnasium.core import RenderFrame
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from pgts_torch.envs.drawing import Drawing
+from pgts_torch.envs.sampler import OutcomeSampler
+from pgts_torch.envs.tabular import RENDER_FPS, check_options, check_render_mode
+from pgts_torch.errors import PgtsError
+from pgts_torch.tabular.mdp import TabularMDP
+
+MAX_FRAMES = 64
+"""Most copies that can be rendered: a frame is up to 0.75 MB."""
+
+
+@final
+class TabularVectorEnv(gymnasium.vector.VectorEnv):
+    """`num_envs` copies of one MDP that share one random generator; a step is a few array operations for all of them.
+
+    Rewards and `info["discount"]` are those of `TabularEnv`. A copy is truncated when it has made `max_episode_steps`
+    steps. What then happens to a copy that is over is Gymnasium's `AutoresetMode`:
+
+        NEXT_STEP   the next step starts a new episode instead of stepping: reward 0, its action ignored
+        SAME_STEP   a new episode starts at once; the last state is in `info["final_obs"]`
+        DISABLED    the caller resets it with `options={"reset_mask": mask}`; stepping it before is an error
+
+    `info["discount"]` always belongs to the step just made, also where SAME_STEP has started a new episode;
+    `info["_discount"]` is False only where NEXT_STEP made no step.
+
+    Args:
+        mdp: the MDP; kept as `mdp`.
+        num_envs: how many copies.
+        max_episode_steps: None is no limit.
+        autoreset_mode: a mode or its value, for instance "SameStep".
+        render_mode: "rgb_array" or None.
+
+    Raises:
+        PgtsError: an argument, an option, an action, or a state to start in cannot be used.
+        ResetNeeded: a step or a picture is asked for before the first reset, or in DISABLED mode a step of a copy that
+            is over.
+    """
+
+    def __init__(
+        self,
+        mdp: TabularMDP,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise PgtsError(f"num_envs is {num_envs}; it must be at least 1")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise PgtsError(f"max_episode_steps is {max_episode_steps}; it must be at least 1, or None for no limit")
+        check_render_mode(render_mode, ["rgb_array"])
+        if render_mode is not None and num_envs > MAX_FRAMES:
+            raise PgtsError(f"num_envs is {num_envs}; at most {MAX_FRAMES} copies can be rendered")
+        self.mdp = mdp
+        self.num_envs = num_envs
+        self.max_episode_steps = max_episode_steps
+        self.autoreset_mode = _check_mode(autoreset_mode)
+        self.render_mode = render_mode
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": RENDER_FPS,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.single_observation_space = gymnasium.spaces.Discrete(mdp.num_states)
+        self.single_action_space = gymnasium.spaces.Discrete(mdp.num_actions)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._sampler = OutcomeSampler(mdp)
+        self._was_reset = False
+        self._state_B = np.zeros(num_envs, dtype=np.int64)
+        self._elapsed_B = np.zeros(num_envs, dtype=np.int64)
+        self._over_B = np.zeros(num_envs, dtype=np.bool_)
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Int[np.ndarray, "B"], dict[str, Any]]:
+        """Start new episodes in all copies, or in some.
+
+        Args:
+            seed: of the one generator; num_envs integers together seed it as well.
+            options: `reset_mask` [B]: which copies, default all. `state`: where they start, one state or one a copy
+                (of which those of the mask are used), default drawn from the start distribution.
+        """
+        check_options(options, ("reset_mask", "state"))
+        options = options or {}
+        mask_B = self._check_mask(options.get("reset_mask"))
+        state_B = self._check_states(options.get("state"))
+        self._seed(seed)
+        self._start_episodes(mask_B, state_B)
+        self._was_reset = True
+        return self._state_B.copy(), {}
+
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[
+        Int[np.ndarray, "B"],
+        Float[np.ndarray, "B"],
+        Bool[np.ndarray, "B"],
+        Bool[np.ndarray, "B"],
+        dict[str, Any],
+    ]:
+        """Draw one outcome for every copy: states, rewards, terminated, truncated, info, each of shape [B]."""
+        action_B = self._check_actions(actions)
+        self._check_ready()
+        pair_B = self._state_B * self.mdp.num_actions + action_B
+        outcome_B = self._sampler.outcomes(self.np_random, pair_B)
+        self._state_B = self._sampler.child_SAK.take(outcome_B)
+        self._elapsed_B += 1
+        reward_B = self._sampler.reward_SA.take(pair_B)
+        discount_B = self._sampler.discount_SAK.take(outcome_B)
+        stepped_B = ~self._over_B
+        if self._over_B.any():
+            reward_B[self._over_B] = discount_B[self._over_B] = 0.0
+            self._start_episodes(self._over_B)
+        terminated_B = (discount_B == 0) & stepped_B
+        truncated_B = self._elapsed_B >= (self.max_episode_steps or np.inf)
+        self._over_B = terminated_B | truncated_B
+        info: dict[str, Any] = {"discount": discount_B, "_discount": stepped_B}
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over_B.any():
+            info |= self._final(discount_B)
+            self._start_episodes(self._over_B)
+        return self._state_B.copy(), reward_B, terminated_B, truncated_B, info
+
+    def render(self) -> tuple[RenderFrame, ...]:
+        """A picture [height, width, 3] of each copy."""
+        if self.render_mode is None:
+            raise PgtsError("render_mode is None; give render_mode='rgb_array' to gymnasium.make_vec")
+        if not self._was_reset:
+            raise ResetNeeded("Cannot call env.render() before calling env.reset()")
+        return tuple(self._drawing.picture(int(state)) for state in self._state_B)
+
+    @cached_property
+    def _drawing(self) -> Drawing:
+        return Drawing(self.mdp)
+
+    def _start_episodes(self, mask_B: Bool[np.ndarray, "B"], state_B: Int[np.ndarray, "B"] | None = None) -> None:
+        count = int(np.count_nonzero(mask_B))
+        self._state_B[mask_B] = self._sampler.starts(self.np_random, count) if state_B is None else state_B[mask_B]
+        self._elapsed_B[mask_B] = 0
+        self._over_B = self._over_B & ~mask_B
+
+    def _final(self, discount_B: Float[np.ndarray, "B"]) -> dict[str, Any]:
+        """How the episodes ended that are over, in the form that Gymnasium's `SyncVectorEnv` gives it."""
+        over_B = self._over_B
+        final_B = np.full(self.num_envs, None, dtype=object)
+        final_B[over_B] = self._state_B[over_B]
+        return {
+            "final_obs": final_B,
+            "_final_obs": over_B.copy(),
+            "final_info": {"discount": np.where(over_B, discount_B, 0.0), "_discount": over_B.copy()},
+            "_final_info": over_B.copy(),
+        }
+
+    def _seed(self, seed: int | Sequence[int] | None) -> None:
+        if seed is None or isinstance(seed, int):
+            super().reset(seed=seed)
+            return
+        if len(seed) != self.num_envs or not all(isinstance(word, int) and word >= 0 for word in seed):
+            raise PgtsError(f"seed is {seed}; it must be an integer or {self.num_envs} integers of at least 0")
+        self.np_random = np.random.default_rng(np.random.SeedSequence(seed))
+
+    def _check_ready(self) -> None:
+        if not self._was_reset:
+            raise ResetNeeded("Cannot call env.step() before calling env.reset()")
+        if self.autoreset_mode == AutoresetMode.DISABLED and self._over_B.any():
+            raise ResetNeeded(
+                f"the episode of copy {int(self._over_B.argmax())} is over; "
+                f"reset it with env.reset(options={{'reset_mask': mask}}) before the next env.step()"
+            )
+
+    def _check_actions(self, actions: ArrayLike) -> Int[np.ndarray, "B"]:
+        action_B = np.asarray(actions)
+        if action_B.shape != (self.num_envs,) or not np.issubdtype(action_B.dtype, np.integer):
+            raise PgtsError(
+                f"actions have shape {action_B.shape} and dtype {action_B.dtype}; they must be {self.num_envs} integers"
+            )
+        last = self.mdp.num_actions - 1
+        if action_B.min() < 0 or action_B.max() > last:
+            copy = int(((action_B < 0) | (action_B > last)).argmax())
+            raise PgtsError(f"action {action_B[copy]} of copy {copy} does not exist; actions are 0 to {last}")
+        return action_B
+
+    def _check_mask(self, mask: Any) -> Bool[np.ndarray, "B"]:
+        if mask is None:
+            return np.ones(self.num_envs, dtype=np.bool_)
+        mask_B = np.asarray(mask)
+        if mask_B.shape != (self.num_envs,) or mask_B.dtype != np.bool_ or not mask_B.any():
+            raise PgtsError(
+                f"reset_mask has shape {mask_B.shape} and dtype {mask_B.dtype} and names {np.count_nonzero(mask_B)} "
+                f"copies; it must be {self.num_envs} booleans that name at least one"
+            )
+        if not self._was_reset and not mask_B.all():
+            raise ResetNeeded("Cannot reset some copies before env.reset() has started all of them")
+        return mask_B
+
+    def _check_states(self, states: Any) -> Int[np.ndarray, "B"] | None:
+        if states is None:
+            return None
+        state_B = np.asarray(states)
+        if state_B.shape not in {(), (self.num_envs,)} or not np.issubdtype(state_B.dtype, np.integer):
+            raise PgtsError(
+                f"option state has shape {state_B.shape} and dtype {state_B.dtype}; "
+                f"it must be an integer or {self.num_envs} integers"
+            )
+        off_B = (state_B < 0) | (state_B >= self.mdp.num_states)
+        if off_B.any():
+            raise PgtsError(f"state {state_B[off_B][0]} does not exist; states are 0 to {self.mdp.num_states - 1}")
+        return np.broadcast_to(state_B, (self.num_envs,))
+
+
+def _check_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        known = [known.value for known in AutoresetMode]
+        raise PgtsError(f"autoreset_mode is {mode!r}; it must be an AutoresetMode or one of {known}") from None
