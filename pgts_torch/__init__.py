@@ -10,9 +10,14 @@ are loaded when they are first asked for.
 
 import importlib
 import importlib.metadata
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
+
+if TYPE_CHECKING:
+    from pgts_torch.agent.pgts import PGTS
+
+    __version__: str
 
 _SUBPACKAGES = ("agent", "envs", "models", "search", "tabular")
 
@@ -30,7 +35,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)
 
 
 def _register_environments() -> None:

@@ -84,8 +84,8 @@ def _make(
 
 
 def _parts(what: str, known: Mapping[str, Any], description: Description) -> tuple[str, dict[str, Any]]:
-    options = {} if isinstance(description, str) else dict(description)
-    kind = description if isinstance(description, str) else options.pop("type", None)
+    options = dict(description) if isinstance(description, Mapping) else {}
+    kind = options.pop("type", None) if isinstance(description, Mapping) else description
     if not isinstance(kind, str) or kind not in known:
         raise PgtsError(f"{what} is {kind!r}; it must be one of {', '.join(known)}")
     return kind, options

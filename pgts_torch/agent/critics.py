@@ -2,13 +2,13 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Any, Literal, TypeVar, final
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.policies import Policy, fitting
 from pgts_torch.agent.rollout import GeometricHorizon, Horizon, Rollout, simulate
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import SamplingModel
@@ -16,6 +16,7 @@ from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
 
 Target = Literal["v", "q"]
+Learned = TypeVar("Learned")
 
 
 class Critic(ABC):
@@ -60,6 +61,7 @@ class ExactCritic(Critic):
     def __init__(self, mdp: TabularMDP, *, target: Target = "v") -> None:
         self.mdp = mdp
         self.target = check_target(target)
+        self._evaluation: exact.Evaluation | None = None
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
         """Solve the Bellman equation of the policy; the rollout is not looked at."""
@@ -67,10 +69,10 @@ class ExactCritic(Critic):
         return {}
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
-        return self._evaluation.v_S.to(state_N.device)[state_N]
+        return _fitted(self._evaluation).v_S.to(state_N.device)[state_N]
 
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
-        return self._evaluation.q_SA.to(state_N.device)[state_N]
+        return _fitted(self._evaluation).q_SA.to(state_N.device)[state_N]
 
 
 @final
@@ -127,6 +129,7 @@ class TabularCritic(Critic):
         self.target = check_target(target)
         self.method = method
         self.step_size = step_size
+        self._policy: Policy | None = None
         cells = num_states if target == "v" else num_states * num_actions
         self._value_C = torch.zeros(cells, dtype=torch.float64, device=device)
         self._count_C = torch.zeros(cells, dtype=torch.float64, device=device)
@@ -154,7 +157,7 @@ class TabularCritic(Critic):
         """The table, or sum_a pi(a|s) Q(s, a) of it."""
         if self.target == "v":
             return self._value_C[state_N]
-        return (self._policy.probs(state_N) * self.q(state_N)).sum(-1)
+        return (_fitted(self._policy).probs(state_N) * self.q(state_N)).sum(-1)
 
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
         if self.target != "q":
@@ -165,14 +168,14 @@ class TabularCritic(Critic):
         return {"value_C": self._value_C.cpu().clone(), "count_C": self._count_C.cpu().clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        for name in ("value_C", "count_C"):
-            if name not in state or state[name].shape != self._value_C.shape:
-                raise PgtsError(f"the critic's {name} is missing or not of shape {tuple(self._value_C.shape)}")
-        self._value_C = state["value_C"].to(self._value_C)
-        self._count_C = state["count_C"].to(self._count_C)
+        self._value_C, self._count_C = (
+            fitting(state, "value_C", self._value_C),
+            fitting(state, "count_C", self._count_C),
+        )
 
     def _targets(self, rollout: Rollout) -> Float[Tensor, "T B"]:
-        bootstrap_TB = self.v(rollout.next_state_TB)
+        next_TB = rollout.next_state_TB
+        bootstrap_TB = self.v(next_TB.reshape(-1)).view(next_TB.shape)
         if isinstance(self.method, TDLambda):
             return lambda_returns(rollout, bootstrap_TB, rollout.discount_TB, self.method.lambda_)
         return lambda_returns(rollout, bootstrap_TB, rollout.survival_TB, 1.0)
@@ -207,6 +210,7 @@ class RolloutCritic(Critic):
         self.target = check_target(target)
         self.horizon = horizon
         self._model_calls = 0
+        self._following: tuple[Policy, torch.Generator] | None = None
 
     @property
     def model_calls(self) -> int:
@@ -214,7 +218,7 @@ class RolloutCritic(Critic):
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
         """Take the policy to be followed; the rollout is not looked at."""
-        self._policy, self._generator = policy, generator
+        self._following = policy, generator
         return {}
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -226,13 +230,14 @@ class RolloutCritic(Critic):
         return self._mean_return(state_N.repeat_interleave(A), action_NA.reshape(-1)).view(-1, A)
 
     def _mean_return(self, state_N: Tensor, action_N: Tensor | None) -> Tensor:
+        policy, generator = _fitted(self._following)
         episodes = simulate(
             self.model,
-            self._policy,
+            policy,
             state_N.repeat(self.samples),
             self.horizon,
             first_action_B=None if action_N is None else action_N.repeat(self.samples),
-            generator=self._generator,
+            generator=generator,
         )
         self._model_calls += episodes.num_steps
         return episodes.returns().view(self.samples, -1).mean(0)
@@ -252,14 +257,18 @@ def lambda_returns(
         discount_TB: gamma_t; 0 after a terminated step, so that nothing is bootstrapped there.
         lambda_: in [0, 1]; 1 gives Monte-Carlo returns.
     """
-    returns_TB = torch.empty_like(bootstrap_TB)
-    later_B = torch.zeros_like(bootstrap_TB[0])
-    follows_TB = rollout.follows_TB
-    for t in reversed(range(len(bootstrap_TB))):
-        mixed_B = (1 - lambda_) * bootstrap_TB[t] + lambda_ * later_B
-        next_B = torch.where(follows_TB[t], mixed_B, bootstrap_TB[t])
-        later_B = returns_TB[t] = rollout.reward_TB[t] + discount_TB[t] * next_B
+    lambda_TB = lambda_ * rollout.follows_TB
+    returns_TB = rollout.reward_TB + discount_TB * (1 - lambda_TB) * bootstrap_TB
+    later_TB = discount_TB * lambda_TB
+    for t in reversed(range(len(returns_TB) - 1)):
+        returns_TB[t] += later_TB[t] * returns_TB[t + 1]
     return returns_TB
+
+
+def _fitted(learned: Learned | None) -> Learned:
+    if learned is None:
+        raise PgtsError("the critic knows no policy yet; fit it, or iterate, before asking for values")
+    return learned
 
 
 def check_target(target: Target) -> Target:

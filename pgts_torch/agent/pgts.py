@@ -17,7 +17,7 @@ from pgts_torch.agent import saving
 from pgts_torch.agent.build import Description, make_critic, make_horizon, make_policy, make_update
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.policies import Policy, SimplexPolicy
-from pgts_torch.agent.rollout import Rollout, check_vector_env, make_vector_env, rollout
+from pgts_torch.agent.rollout import Horizon, Rollout, check_vector_env, make_vector_env, rollout
 from pgts_torch.agent.updates import Update
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.tabular import TabularModel, tabular_truth
@@ -73,11 +73,11 @@ class PGTS:
         policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax",
             {"type": "tabular", "target": "q"}, ...
         num_envs: episodes in each iteration.
-        gamma: discount. Default: the environment's own (pgts/*), else 0.99.
+        gamma: discount. Default: the environment's own (pgts/*), else 0.99. Copies of pgts/* bring their own.
         max_nodes: the most nodes of one lookahead.
         seed: of everything random.
         device: where policy, critic and model live.
-        env_kwargs: for gymnasium.make.
+        env_kwargs: for gymnasium.make, if the environment is given by its id.
 
     Raises:
         PgtsError: parts that do not fit each other, or options out of range.
@@ -92,7 +92,7 @@ class PGTS:
         policy: Description | Policy = "softmax",
         critic: Description | Critic = "tabular",
         update: Description | Update | None = None,
-        horizon: Description = "fixed",
+        horizon: Description | Horizon = "fixed",
         num_envs: int = 32,
         gamma: float | None = None,
         max_nodes: int = MAX_NODES,
@@ -105,27 +105,41 @@ class PGTS:
         self.seed = seed
         self.max_nodes = max_nodes
         self.device = torch.device(device)
-        self.gamma = DEFAULT_GAMMA if gamma is None else gamma
         self.env = self.make_copies(num_envs) if isinstance(env, str) else env
         check_vector_env(self.env)
-        self.mdp = tabular_truth(self.env, gamma=self.gamma)
+        self.mdp = tabular_truth(self.env, gamma=DEFAULT_GAMMA if gamma is None else gamma)
+        self.gamma = float(self.mdp.outcomes.discount_NAK.max())
         self.model = TabularModel(self.mdp, device=self.device)
         self.topology = Topology(self.model)
-        self.horizon = make_horizon(horizon)
         S, A = self.mdp.num_states, self.mdp.num_actions
-        if isinstance(policy, str | Mapping):
+        if not isinstance(policy, Policy):
             policy = make_policy(policy, S, A, seed=seed, device=self.device)
-        if isinstance(critic, str | Mapping):
+        if not isinstance(critic, Critic):
             critic = make_critic(critic, self.model, self.mdp)
         if update is None:
             update = "projected" if isinstance(policy, SimplexPolicy) else "softmax"
-        if isinstance(update, str | Mapping):
+        if not isinstance(update, Update):
             update = make_update(update)
-        self.policy, self.critic, self.update = policy, critic, update
-        self.update.check(self.policy)
+        if not isinstance(horizon, Horizon):
+            horizon = make_horizon(horizon)
+        self.policy, self.critic, self.update, self.horizon = policy, critic, update, horizon
+        self._check_parts()
         self.num_iterations = 0
         self.num_env_steps = 0
         self.num_model_calls = 0
+
+    def _check_parts(self) -> None:
+        """PgtsError where parts do not fit each other, or where an argument would have no effect."""
+        self.update.check(self.policy)
+        shape, found = (self.mdp.num_states, self.mdp.num_actions), (self.policy.num_states, self.policy.num_actions)
+        if found != shape:
+            raise PgtsError(f"the policy is one of (states, actions) = {found}; the environment has {shape}")
+        if not isinstance(self._arguments["env"], str):
+            gamma, env_kwargs = self._arguments["gamma"], self._arguments["env_kwargs"]
+            if gamma not in (None, self.gamma):
+                raise PgtsError(f"gamma is {gamma}; the given environment has its own, {self.gamma}")
+            if env_kwargs:
+                raise PgtsError(f"env_kwargs is {env_kwargs}; an environment that is given as an object takes none")
 
     def iterate(self) -> Iteration:
         """One pass through the loop: visit states, estimate Q^pi, look m steps ahead, move pi.        [PGTS Alg. 1]"""
@@ -198,33 +212,37 @@ class PGTS:
 
     def predict(
         self, observation: ArrayLike, *, deterministic: bool = True, generator: torch.Generator | None = None
-    ) -> np.ndarray:
-        """Actions for observations; no search.
+    ) -> np.ndarray | np.int64:
+        """Actions for observations, one number for one state; no search.
 
         Args:
-            observation: one state or an array of states.
+            observation: one state or an array of states, as integers.
             deterministic: the most probable action, else one drawn from pi.
             generator: for drawing; default a stream of this model's seed, the same in each call.
         """
-        state = torch.as_tensor(np.asarray(observation, dtype=np.int64))
-        flat = state.reshape(-1).to(self.device)
-        if not bool(((flat >= 0) & (flat < self.mdp.num_states)).all()):
-            raise PgtsError(f"observation is {state.tolist()}; states are 0 to {self.mdp.num_states - 1}")
+        state = np.asarray(observation)
+        if not np.issubdtype(state.dtype, np.integer):
+            raise PgtsError(f"observation is of {state.dtype}; states are integers")
+        off = state[(state < 0) | (state >= self.mdp.num_states)]
+        if off.size:
+            raise PgtsError(f"state {off[0]} does not exist; states are 0 to {self.mdp.num_states - 1}")
+        state_N = torch.from_numpy(state.astype(np.int64).reshape(-1)).to(self.device)
         if deterministic:
-            action = self.policy.probs(flat).argmax(-1)
+            action_N = self.policy.probs(state_N).argmax(-1)
         else:
             generator = generator or stream(self.seed, "predict", device=self.device)
-            action = self.policy.sample(flat, generator=generator)
-        return action.reshape(state.shape).cpu().numpy()
+            action_N = self.policy.sample(state_N, generator=generator)
+        return action_N.cpu().numpy().reshape(state.shape)[()]
 
     def save(self, path: str | Path) -> None:
         """Write everything that training or acting goes on from into one file with a checksum.
 
         Raises:
-            PgtsError: the environment or a part was given as an object, so that no file can describe it.
+            PgtsError: the environment or a part was given as an object, so that no file can describe it, or an
+                argument is no plain value.
         """
         plain = {**self._arguments, "device": str(self.device), "env_kwargs": dict(self._arguments["env_kwargs"] or {})}
-        for name in ("env", "policy", "critic", "update"):
+        for name in ("env", "policy", "critic", "update", "horizon"):
             if not isinstance(plain[name], str | Mapping | None):
                 raise PgtsError(f"{name} was given as {plain[name]!r}; only models made from descriptions can be saved")
         saving.write(path, {"arguments": plain, "state": self.state_dict()})
@@ -233,6 +251,8 @@ class PGTS:
     def load(cls, path: str | Path, *, device: torch.device | str | None = None) -> Self:
         """The model that `save` wrote; it trains on exactly as the saved one would have.
 
+        Only the lookahead starts anew: it asks the model again for what it had seen, and `num_model_calls` counts that.
+
         Args:
             device: where to load it; default the device it was saved from.
 
@@ -240,6 +260,8 @@ class PGTS:
             PgtsError: no such file, damaged, or not ours.
         """
         content = saving.read(path)
+        if content.keys() != {"arguments", "state"}:
+            raise PgtsError(f"{path} holds {sorted(map(str, content))}, not a model")
         arguments = content["arguments"] | ({} if device is None else {"device": str(device)})
         model = cls(**arguments)
         model.load_state_dict(content["state"])

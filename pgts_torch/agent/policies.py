@@ -114,7 +114,7 @@ class SoftmaxPolicy(Policy):
         return {"logits_SA": self.logits_SA.cpu().clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.logits_SA = _fitting(state, "logits_SA", self.logits_SA)
+        self.logits_SA = fitting(state, "logits_SA", self.logits_SA)
 
 
 @final
@@ -141,12 +141,13 @@ class SimplexPolicy(Policy):
         return {"probs_SA": self.probs_SA.cpu().clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.probs_SA = _fitting(state, "probs_SA", self.probs_SA)
+        self.probs_SA = fitting(state, "probs_SA", self.probs_SA)
 
 
-def _fitting(state: dict[str, Any], name: str, like: Tensor) -> Tensor:
+def fitting(state: dict[str, Any], name: str, like: Tensor) -> Tensor:
+    """A copy of state[name] like `like` in dtype and device; PgtsError unless it is a tensor of the same shape."""
     value = state.get(name)
     if not isinstance(value, Tensor) or value.shape != like.shape:
         found = tuple(value.shape) if isinstance(value, Tensor) else value
         raise PgtsError(f"{name} is {found}; a tensor of shape {tuple(like.shape)} is needed")
-    return value.to(like)
+    return value.to(like, copy=True)  # updates write in place, and the caller's tensor is not theirs

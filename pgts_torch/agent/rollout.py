@@ -229,6 +229,8 @@ def make_vector_env(env_id: str, num_envs: int, *, gamma: float | None, **kwargs
     Raises:
         PgtsError: Gymnasium knows no such environment or cannot make it.
     """
+    if num_envs < 1:
+        raise PgtsError(f"num_envs is {num_envs}; it must be at least 1")
     options: dict[str, Any] = {"max_episode_steps": -1, **kwargs}
     try:
         if gymnasium.spec(env_id).namespace == "pgts":
@@ -237,12 +239,14 @@ def make_vector_env(env_id: str, num_envs: int, *, gamma: float | None, **kwargs
         else:
             options |= {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode.DISABLED}}
         return gymnasium.make_vec(env_id, num_envs=num_envs, **options)
-    except (gymnasium.error.Error, TypeError) as error:
+    except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
         raise PgtsError(f"{env_id} cannot be made: {error}") from error
 
 
 def check_vector_env(env: gymnasium.vector.VectorEnv) -> None:
     """PgtsError unless rollouts can be made in this environment: discrete spaces, reset by mask."""
+    if not isinstance(env, gymnasium.vector.VectorEnv):
+        raise PgtsError(f"the environment is {env!r}; it must be a Gymnasium id or a VectorEnv")
     for name in ("single_observation_space", "single_action_space"):
         space = getattr(env, name)
         if not isinstance(space, gymnasium.spaces.Discrete) or space.start != 0:

@@ -3,7 +3,6 @@
 import hashlib
 import io
 import os
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,16 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def write(path: str | Path, content: dict[str, Any]) -> None:
-    """Write tensors and plain values; whoever reads `path` meanwhile finds the old file or the new one, never half."""
+    """Write tensors and plain values; whoever reads `path` meanwhile finds the old file or the new one, never half.
+
+    Raises:
+        PgtsError: `content` holds something else, for instance a numpy number.
+    """
     path = Path(path)
     buffer = io.BytesIO()
     torch.save(content, buffer)
     payload = buffer.getvalue()
+    _parse(payload, path)  # what could not be read again must not replace what can
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         with partial.open("wb") as file:
@@ -47,7 +51,14 @@ def read(path: str | Path) -> dict[str, Any]:
     digest, payload = raw[len(_MAGIC) : len(_MAGIC) + _DIGEST], raw[len(_MAGIC) + _DIGEST :]
     if hashlib.sha256(payload).digest() != digest:
         raise PgtsError(f"{path} is damaged: its checksum does not fit its content")
+    return _parse(payload, path)
+
+
+def _parse(payload: bytes, path: str | Path) -> dict[str, Any]:
     try:
-        return torch.load(io.BytesIO(payload), weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError) as error:
+        content = torch.load(io.BytesIO(payload), weights_only=True)
+    except Exception as error:  # torch.load raises almost anything for what torch.save did not write
         raise PgtsError(f"{path} holds something other than tensors and plain values") from error
+    if not isinstance(content, dict):
+        raise PgtsError(f"{path} holds a {type(content).__name__}; it must be a dict")
+    return content

@@ -1,5 +1,6 @@
 """How a policy moves, given lookahead values at the states it visited."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, final
@@ -28,8 +29,8 @@ class Update(ABC):
     policies: ClassVar[tuple[type[Policy], ...]]
 
     def __post_init__(self) -> None:
-        if not self.step_size > 0:
-            raise PgtsError(f"step_size is {self.step_size}; it must be above 0")
+        if not 0 < self.step_size < math.inf:
+            raise PgtsError(f"step_size is {self.step_size}; it must be finite and above 0")
         if self.state_weight not in ("occupancy", "visits", "uniform"):
             raise PgtsError(f"state_weight is {self.state_weight!r}; it must be occupancy, visits or uniform")
 

@@ -61,6 +61,7 @@ def tabular_truth(env: gymnasium.Env | gymnasium.vector.VectorEnv, *, gamma: flo
     Raises:
         MissingModel: the environment has neither.
     """
-    single: Any = env.envs[0] if isinstance(env, gymnasium.vector.SyncVectorEnv) else env
+    base: Any = env.unwrapped
+    single: Any = base.envs[0] if isinstance(base, gymnasium.vector.SyncVectorEnv) else base
     mdp = getattr(single.unwrapped, "mdp", None)
     return mdp if isinstance(mdp, TabularMDP) else TabularMDP.from_gymnasium(single, gamma)

@@ -1,5 +1,6 @@
 """Full-width lookahead in which equal states are one node: T^m Q at any number of states, at a cost linear in m."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -7,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.bellman import backup
+from pgts_torch.bellman import backup, sweep
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.search.topology import Topology
@@ -26,7 +27,8 @@ class Lookahead:
     q_BA: lookahead values of all actions, in the dtype of the model; they carry no gradient.
     model_calls: how many (state, action) the model was asked for in this search.
     critic_calls: how often the critic was asked, each time for all leaves together.
-    nodes_per_level: distinct states at each level, from the roots to the leaves.
+    nodes_per_level: how many states are backed up at each level, from the roots to the leaves: the distinct ones that
+        paths lead to, and from the level on that brings no new state, all those met so far.
     """
 
     q_BA: Float[Tensor, "B A"]
@@ -40,6 +42,7 @@ class Lookahead:
         return sum(self.nodes_per_level)
 
 
+@torch.no_grad()
 def expectimax(
     model: EnumeratingModel,
     root_B: Int[Tensor, "B"],
@@ -87,21 +90,25 @@ def expectimax(
     else:
         assert v_leaf is not None
         v_N = _leaf_values(v_leaf, leaves, (len(leaves),), model.dtype)
-    for outcomes in levels.steps(expansions):
+    if sweeps := levels.sweeps(expansions):
+        assert levels.closed is not None
+        v_N = sweep(levels.closed, v_N, sweeps)
+    for outcomes in reversed(levels.outcomes[:expansions]):
         q_NA = backup(outcomes, v_N)
         v_N = q_NA.amax(-1)
-    return Lookahead(
-        q_NA[levels.root_row_B], topology.model_calls - calls_before, 1, levels.nodes_per_level(expansions)
-    )
+    q_BA = q_NA.index_select(0, levels.root_row_B)
+    return Lookahead(q_BA, topology.model_calls - calls_before, 1, levels.nodes_per_level(expansions))
 
 
-@torch.no_grad()
 def _leaf_values(leaf: Leaf, states: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """What the critic says of the leaves; PgtsError if it says anything that is not one finite number for each."""
-    values = leaf(states)
+    values = leaf(states).to(dtype)
     if values.shape != shape:
         raise PgtsError(f"the critic answered with shape {tuple(values.shape)}; {len(states)} leaves ask for {shape}")
-    if not bool(torch.isfinite(values).all()):
-        row = int(torch.nonzero(~torch.isfinite(values))[0, 0])
+    if math.isfinite(values.sum()):  # one cheap call; only a sum that overflows makes it look closer in vain
+        return values
+    off = torch.nonzero(~torch.isfinite(values))
+    if len(off):
+        row = int(off[0, 0])
         raise PgtsError(f"the critic's value of state {int(states[row])} is {values[row].tolist()}; it must be finite")
-    return values.to(dtype)
+    return values

@@ -1,12 +1,11 @@
 """Which states a lookahead meets at which level. Transitions do not depend on the policy: this outlives a call."""
 
 from collections import OrderedDict
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import final
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
@@ -38,12 +37,9 @@ class Levels:
     def __post_init__(self) -> None:
         self.closed_states = self.frontiers[0]
 
-    def steps(self, expansions: int) -> Iterator[Outcomes]:
-        """The outcomes of `expansions` levels, from the leaves up to the roots."""
-        for _ in range(expansions - len(self.outcomes)):
-            assert self.closed is not None
-            yield self.closed
-        yield from reversed(self.outcomes[:expansions])
+    def sweeps(self, expansions: int) -> int:
+        """How many of `expansions` levels, counted from the leaves, are the closed set."""
+        return max(0, expansions - len(self.outcomes))
 
     def leaves(self, expansions: int) -> Int[Tensor, "N"]:
         """The states at the bottom of `expansions` levels."""
@@ -62,6 +58,46 @@ class Levels:
         return sum(frontiers) + len(self.closed_states) * (expansions + 1 - len(frontiers))
 
 
+class _Rows:
+    """Outcomes to which rows are added. Room doubles when it is full: a row costs the same however many there are."""
+
+    def __init__(self) -> None:
+        self._table: Outcomes | None = None
+        self._count = 0
+
+    def rows(self, row_N: Int[Tensor, "N"]) -> Outcomes:
+        """Some of the rows that were added, in the order asked for."""
+        assert self._table is not None
+        return self._table.rows(row_N)
+
+    def append(self, more: Outcomes) -> Int[Tensor, "N"]:
+        """Add copies of these rows, padded to the largest K so far, and say where they are."""
+        first, last = self._count, self._count + more.num_states
+        row_N = torch.arange(first, last, device=more.device)
+        table = self._table or more.rows(row_N[:0])
+        K = max(table.num_outcomes, more.num_outcomes)
+        if last > table.num_states:
+            table = _padded(table, max(last, 2 * table.num_states), K)
+        elif table.num_outcomes < K:
+            table = _padded(table, table.num_states, K)
+        for mine, given in zip(_tensors(table), _tensors(more), strict=True):
+            mine[first:last, ..., : given.shape[-1]] = given
+        self._table, self._count = table, last
+        return row_N
+
+
+def _padded(outcomes: Outcomes, N: int, K: int) -> Outcomes:
+    """The same outcomes with room for N states and K outcomes."""
+    reward_NA, *of_outcomes = _tensors(outcomes)
+    pad, more_N, more_K = torch.nn.functional.pad, N - outcomes.num_states, K - outcomes.num_outcomes
+    prob_NAK, discount_NAK, child_NAK = (pad(x_NAK, (0, more_K, 0, 0, 0, more_N)) for x_NAK in of_outcomes)
+    return Outcomes(pad(reward_NA, (0, 0, 0, more_N)), prob_NAK, discount_NAK, child_NAK, outcomes.num_children)
+
+
+def _tensors(outcomes: Outcomes) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    return outcomes.reward_NA, outcomes.prob_NAK, outcomes.discount_NAK, outcomes.child_NAK
+
+
 @final
 class Topology:
     """What has been asked of a model so far: each (state, action) is asked once, in however many searches it occurs.
@@ -76,7 +112,7 @@ class Topology:
     def __init__(self, model: EnumeratingModel) -> None:
         self.model = model
         self.model_calls = 0
-        self._known: Outcomes | None = None
+        self._known = _Rows()
         self._row_S = torch.empty(0, dtype=torch.int64, device=model.device)
         self._scratch_S = torch.empty(0, dtype=torch.int64, device=model.device)
         self._levels: OrderedDict[bytes, Levels] = OrderedDict()
@@ -93,14 +129,11 @@ class Topology:
             PgtsError: no roots, or one that is not a state of the model.
             NodeBudgetExceeded: the levels hold more nodes than that; the model has not been asked about them.
         """
+        _check_vector(root_B)
         key = root_B.cpu().numpy().tobytes()
         levels = self._levels.get(key)
         if levels is None:
-            self._check_roots(root_B)
-            self._grow_tables()
-            roots = self._distinct(root_B)
-            levels = Levels([roots], self._position(roots)[root_B])
-            self._levels[key] = levels
+            levels = self._levels[key] = self._start(root_B)
             if len(self._levels) > _REMEMBERED_ROOTS:
                 self._levels.popitem(last=False)
         self._levels.move_to_end(key)
@@ -110,24 +143,36 @@ class Topology:
         _check_budget(levels, expansions, max_nodes)
         return levels
 
+    # What these two make outlives the call: it must be ordinary tensors even if the caller is in inference mode.
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def _start(self, root_B: Int[Tensor, "B"]) -> Levels:
+        """Level 0: the distinct roots."""
+        self._check_states(root_B)
+        self._grow_tables()
+        roots = self._distinct(root_B)
+        return Levels([roots], self._position(roots)[root_B])
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def _expand(self, levels: Levels) -> None:
         """One more level: ask about the states of the last frontier that are new, and find their children."""
         frontier = levels.frontiers[-1]
         outcomes = self._outcomes(frontier)
-        # What has weight 0 (a terminal outcome, or padding) counts for nothing and needs no node.
-        counts_NAK = outcomes.prob_NAK * outcomes.discount_NAK > 0
-        children = self._distinct(outcomes.child_NAK[counts_NAK])
-        seen_S = self._position(levels.closed_states, default=-1)
-        new = children[seen_S[children] < 0]
-        if len(new) == 0:
-            levels.outcomes.append(self._renumbered(outcomes, counts_NAK, levels.closed_states))
+        counts_NAK = _counts(outcomes)
+        children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
+        new = self._missing(children, levels.closed_states)
+        step = self._renumbered(outcomes, counts_NAK, children if len(new) else levels.closed_states)
+        # Nothing is changed before the last thing that may fail for want of memory.
+        if len(new):
+            levels.closed_states = torch.cat([levels.closed_states, new])
+            levels.frontiers.append(children)
+        elif len(levels.frontiers) == 1:  # the roots are closed by themselves
+            levels.closed = step
+        else:
             inside = self._outcomes(levels.closed_states)
-            inside_counts_NAK = inside.prob_NAK * inside.discount_NAK > 0
-            levels.closed = self._renumbered(inside, inside_counts_NAK, levels.closed_states)
-            return
-        levels.outcomes.append(self._renumbered(outcomes, counts_NAK, children))
-        levels.frontiers.append(children)
-        levels.closed_states = torch.cat([levels.closed_states, new])
+            levels.closed = self._renumbered(inside, _counts(inside), levels.closed_states)
+        levels.outcomes.append(step)
 
     def _outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
         """Outcomes in terms of states; the model is asked about those only that it has never been asked about."""
@@ -135,14 +180,12 @@ class Topology:
         if len(missing):
             answer = self.model.outcomes(missing)
             self.model_calls += len(missing) * self.model.num_actions
-            known = 0 if self._known is None else self._known.num_states
-            self._known = answer if self._known is None else _concatenate(self._known, answer)
             self._grow_tables()
-            self._row_S[missing] = torch.arange(known, known + len(missing), device=self.model.device)
-        assert self._known is not None
+            self._check_answer(missing, answer)
+            self._row_S[missing] = self._known.append(answer)
         return self._known.rows(self._row_S[state_N])
 
-    def _renumbered(self, outcomes: Outcomes, counts_NAK: Tensor, states: Int[Tensor, "C"]) -> Outcomes:
+    def _renumbered(self, outcomes: Outcomes, counts_NAK: Bool[Tensor, "N A K"], states: Int[Tensor, "C"]) -> Outcomes:
         """The same outcomes with children given by their position among `states`; those that do not count get 0."""
         position_NAK = self._position(states)[outcomes.child_NAK]
         return Outcomes(
@@ -153,37 +196,64 @@ class Topology:
             len(states),
         )
 
-    def _distinct(self, state_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+    def _distinct(self, state_N: Int[Tensor, "N"]) -> Int[Tensor, "distinct"]:
         """The states without repetition, ascending: one write and one read a state instead of sorting them all."""
         order_N = torch.arange(len(state_N), device=self.model.device)
         self._scratch_S[state_N] = order_N
         return state_N[self._scratch_S[state_N] == order_N].sort().values
 
-    def _position(self, states: Int[Tensor, "N"], default: int | None = None) -> Int[Tensor, "S"]:
-        """A table that holds, at each of `states`, its position among them; elsewhere `default`, or anything."""
-        if default is not None:
-            self._scratch_S.fill_(default)
+    def _missing(self, state_N: Int[Tensor, "N"], among: Int[Tensor, "C"]) -> Int[Tensor, "missing"]:
+        """Those of the states that are not `among` others."""
+        self._scratch_S[state_N] = -1
+        return state_N[self._position(among)[state_N] < 0]
+
+    def _position(self, states: Int[Tensor, "N"]) -> Int[Tensor, "S"]:
+        """A table that holds, at each of `states`, its position among them, and elsewhere what it held before; valid
+        until the next call."""
         self._scratch_S[states] = torch.arange(len(states), device=self.model.device)
         return self._scratch_S
 
     def _grow_tables(self) -> None:
-        """Room for the states that the model has numbered since."""
-        missing = self.model.num_states - len(self._row_S)
-        if missing > 0:
+        """Room for the states that the model has numbered since, and for as many again: growing is rare."""
+        room = len(self._row_S)
+        if self.model.num_states > room:
+            missing = max(self.model.num_states, 2 * room) - room
             unknown = torch.full((missing,), -1, dtype=torch.int64, device=self.model.device)
             self._row_S = torch.cat([self._row_S, unknown])
             self._scratch_S = torch.cat([self._scratch_S, unknown])
 
-    def _check_roots(self, root_B: Int[Tensor, "B"]) -> None:
-        if root_B.ndim != 1 or len(root_B) == 0:
-            raise PgtsError(f"root_B has shape {tuple(root_B.shape)}; it must be a vector of at least one state")
-        if root_B.dtype != torch.int64:
-            raise PgtsError(f"root_B is {root_B.dtype}; states are int64")
+    def _check_states(self, root_B: Int[Tensor, "B"]) -> None:
         off = torch.nonzero((root_B < 0) | (root_B >= self.model.num_states)).flatten()
         if len(off):
             raise PgtsError(
                 f"root_B[{int(off[0])}] is {int(root_B[off[0]])}; states are 0 to {self.model.num_states - 1}"
             )
+
+    def _check_answer(self, state_N: Int[Tensor, "N"], answer: Outcomes) -> None:
+        asked, given = (len(state_N), self.model.num_actions), tuple(answer.reward_NA.shape)
+        if given != asked:
+            raise PgtsError(f"the model answered for {given} states and actions; it was asked for {asked}")
+        child_NAK = answer.child_NAK
+        off_NAK = (child_NAK < 0) | (child_NAK >= self.model.num_states)
+        if off_NAK.any():
+            n, a, k = torch.nonzero(off_NAK)[0].tolist()
+            raise PgtsError(
+                f"the model leads from state {int(state_N[n])} by action {a} to {int(child_NAK[n, a, k])}; "
+                f"states are 0 to {self.model.num_states - 1}"
+            )
+
+
+def _check_vector(root_B: Tensor) -> None:
+    """PgtsError unless these are one or more integers; what they are is checked where they are first met."""
+    if root_B.ndim != 1 or len(root_B) == 0:
+        raise PgtsError(f"root_B has shape {tuple(root_B.shape)}; it must be a vector of at least one state")
+    if root_B.dtype != torch.int64:
+        raise PgtsError(f"root_B is {root_B.dtype}; states are int64")
+
+
+def _counts(outcomes: Outcomes) -> Bool[Tensor, "N A K"]:
+    """Where an outcome has weight. A terminal outcome and padding have none, and what follows them needs no node."""
+    return (outcomes.prob_NAK > 0) & (outcomes.discount_NAK > 0)
 
 
 def _check_budget(levels: Levels, expansions: int, max_nodes: int) -> None:
@@ -193,20 +263,3 @@ def _check_budget(levels: Levels, expansions: int, max_nodes: int) -> None:
             f"the lookahead has {nodes} nodes on levels 0 to {expansions}; max_nodes is {max_nodes}: "
             "lower the depth, ask for fewer roots or raise the budget"
         )
-
-
-def _concatenate(first: Outcomes, second: Outcomes) -> Outcomes:
-    """The rows of both, padded to the larger K."""
-    K = max(first.num_outcomes, second.num_outcomes)
-
-    def joined(x: Tensor, y: Tensor) -> Tensor:
-        pad = torch.nn.functional.pad
-        return torch.cat([pad(x, (0, K - x.shape[-1])), pad(y, (0, K - y.shape[-1]))])
-
-    return Outcomes(
-        torch.cat([first.reward_NA, second.reward_NA]),
-        joined(first.prob_NAK, second.prob_NAK),
-        joined(first.discount_NAK, second.discount_NAK),
-        joined(first.child_NAK, second.child_NAK),
-        second.num_children,
-    )

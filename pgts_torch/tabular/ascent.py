@@ -35,7 +35,7 @@ def ascend(
     Args:
         mdp: the MDP.
         pi_SA: the initial policy pi_0.
-        depth: m, how often T is applied to Q^pi. 0 is plain policy gradient.
+        depth: m, how often T is applied to Q^pi. 0 is plain policy gradient [PGTS Eq. (2)].
         step_size: eta, finite and at least 0; the same in every iteration.
         iterations: how many updates.
         step: `projected_step` (the paper's, default), `softmax_step` or `mirror_step`.

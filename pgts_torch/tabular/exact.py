@@ -29,6 +29,8 @@ class Evaluation:
 
     v_S: v^pi = (I - gamma P^pi)^-1 R^pi.   q_SA: Q^pi = R + gamma P v^pi.
     d_S: occupancy mu^T (I - gamma P^pi)^-1, unnormalised.   J: return mu^T v^pi.        [PGTS Sec. 2]
+
+        dJ / dpi(a|s) = d^pi(s) Q^pi(s, a)        [PGTS Eq. (1)]
     """
 
     v_S: Float[Tensor, "S"]
@@ -147,13 +149,14 @@ def check_depth(depth: int) -> int:
 
 
 def _policy_matrix(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> scipy.sparse.csr_array:
-    """gamma P^pi as a sparse [S, S] matrix that shares the column indices of the outcomes."""
+    """gamma P^pi as a sparse [S, S] matrix, without the entries of actions that pi never takes."""
     S, A, K = mdp.outcomes.child_NAK.shape
     weight = mdp.outcomes.weight
-    values = (pi_SA[:, :, None] * weight.values().view(S, A, K)).reshape(-1)
-    children = weight.col_indices().numpy()
-    rows = np.arange(S + 1, dtype=children.dtype) * (A * K)
-    return scipy.sparse.csr_array((values.numpy(), children, rows), shape=(S, S), copy=False)
+    values = (pi_SA[:, :, None] * weight.values().view(S, A, K)).view(S, A * K).numpy()
+    children, kept = weight.col_indices().numpy(), values != 0
+    rows = np.zeros(S + 1, dtype=children.dtype)
+    np.cumsum(kept.sum(axis=1), out=rows[1:])
+    return scipy.sparse.csr_array((values[kept], children[kept.reshape(-1)], rows), shape=(S, S), copy=False)
 
 
 def _solve(mdp: TabularMDP, pi_SA: Tensor, b_S: Float[Tensor, "S"], *, transpose: bool) -> Float[Tensor, "S"]:
@@ -198,7 +201,9 @@ def _check_ends(outcomes: Outcomes, pi_SA: Tensor, matrix: scipy.sparse.csr_arra
 
 
 def _solve_dense(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array, b: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(np.eye(len(b)) - matrix.toarray(), b)
+    # By torch, which keeps to the threads it was given: on busy cores those of numpy made it hundreds of times slower.
+    identity = torch.eye(len(b), dtype=torch.float64)
+    return torch.linalg.solve(identity - torch.from_numpy(matrix.toarray()), torch.from_numpy(b)).numpy()
 
 
 def _solve_iterative(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array, b: np.ndarray) -> np.ndarray:

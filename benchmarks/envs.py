@@ -1,0 +1,97 @@
+"""How many transitions a second do many copies of an environment make, against Gymnasium's loop over single ones?
+
+    python benchmarks/envs.py [--json PATH]
+
+One thread. Every figure is the median of several repeats; all forms take turns within each repeat, and the ratio is the
+median of theirs, so that a busy machine slows both sides alike. Uniformly random actions are drawn beforehand; copies
+start over by `AutoresetMode.SAME_STEP` at the registered time limits.
+"""
+
+import argparse
+import json
+import platform
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+import pgts_torch
+
+NAMES = ("Ladder", "Tightrope", "Random", "Grid", "DeepSea")
+COPIES = (1, 64, 1024, 4096)
+SYNC_COPIES = 64
+REPEATS = 9
+SECONDS = 0.1
+"""How long one repeat lasts, about."""
+
+
+class Runner:
+    """One vector environment under random actions, with a number of steps that takes about SECONDS."""
+
+    def __init__(self, envs: VectorEnv) -> None:
+        action_space = envs.single_action_space
+        assert isinstance(action_space, gymnasium.spaces.Discrete)
+        self.envs = envs
+        self.actions = np.random.default_rng(0).integers(action_space.n, size=(64, envs.num_envs))
+        envs.reset(seed=0)
+        self.steps = 50
+        self.transitions_per_second()
+        self.steps = max(50, int(SECONDS * self.transitions_per_second() / envs.num_envs))
+
+    def transitions_per_second(self) -> float:
+        begin = time.perf_counter()
+        for step in range(self.steps):
+            self.envs.step(self.actions[step % 64])
+        return self.envs.num_envs * self.steps / (time.perf_counter() - begin)
+
+
+def measure(name: str) -> dict[str, Any]:
+    """Transitions a second of one environment: the fast form at each number of copies, Gymnasium's loop at one."""
+    id, mode = f"pgts/{name}-v0", AutoresetMode.SAME_STEP
+    fast = {copies: Runner(gymnasium.make_vec(id, num_envs=copies, autoreset_mode=mode)) for copies in COPIES}
+    sync = Runner(
+        gymnasium.make_vec(id, num_envs=SYNC_COPIES, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode})
+    )
+    rounds = [
+        ({copies: runner.transitions_per_second() for copies, runner in fast.items()}, sync.transitions_per_second())
+        for _ in range(REPEATS)
+    ]
+    return {
+        "environment": id,
+        "transitions_per_second": {
+            copies: statistics.median(rates[copies] for rates, _ in rounds) for copies in COPIES
+        },
+        "sync_transitions_per_second": statistics.median(loop for _, loop in rounds),
+        "ratio_to_sync": statistics.median(rates[SYNC_COPIES] / loop for rates, loop in rounds),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="where to write the figures")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    columns = [f"{copies} copies" for copies in COPIES]
+    print(f"{'transitions / s':<18}" + "".join(f"{column:>14}" for column in columns), end="")
+    print(f"{f'sync, {SYNC_COPIES}':>14}{f'ratio at {SYNC_COPIES}':>14}")
+    results = []
+    for name in NAMES:
+        result = measure(name)
+        results.append(result)
+        rates = [*result["transitions_per_second"].values(), result["sync_transitions_per_second"]]
+        print(f"{result['environment']:<18}" + "".join(f"{rate:>14,.0f}" for rate in rates), end="")
+        print(f"{result['ratio_to_sync']:>14.1f}")
+    if args.json:
+        versions = {"python": platform.python_version(), "numpy": np.__version__, "gymnasium": gymnasium.__version__}
+        versions["pgts_torch"] = pgts_torch.__version__
+        report = {"threads": 1, "repeats": REPEATS, "versions": versions, "results": results}
+        args.json.write_text(json.dumps(report, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

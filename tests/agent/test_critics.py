@@ -1,0 +1,283 @@
+"""Estimates of values, each held to the exact ones."""
+
+import math
+
+import pytest
+import torch
+
+from pgts_torch.agent.critics import (
+    Critic,
+    ExactCritic,
+    MonteCarlo,
+    RolloutCritic,
+    TabularCritic,
+    TDLambda,
+    lambda_returns,
+)
+from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Rollout
+from pgts_torch.errors import PgtsError
+from pgts_torch.models import TabularModel
+from pgts_torch.seeding import stream
+from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder, random_mdp
+from tests.agent.helpers import experience, following, log_slope, z_scores
+from tests.support import random_policy, right_with, uniform_policy, zoo
+
+METHODS = [MonteCarlo(), TDLambda(0.9)]
+FAR = 5.0
+"""Standard errors; a normal mean lies farther off with probability 6e-7, and no test compares more than 40."""
+
+
+def fit(critic: Critic, mdp: TabularMDP, pi_SA, horizon, *, episodes: int, seed: int = 0) -> dict[str, float]:
+    made = experience(mdp, pi_SA, horizon, episodes=episodes, seed=seed)
+    return critic.fit(following(pi_SA), made, generator=stream(seed, "critic"))
+
+
+def error(critic: Critic, mdp: TabularMDP, pi_SA) -> float:
+    """Root mean square error over all states, or all states and actions."""
+    truth, states = exact.evaluate(mdp, pi_SA), torch.arange(mdp.num_states)
+    if critic.target == "q":
+        return float((critic.q(states) - truth.q_SA).square().mean().sqrt())
+    return float((critic.v(states) - truth.v_S).square().mean().sqrt())
+
+
+def mean_square(errors: list[float]) -> float:
+    return math.sqrt(sum(error**2 for error in errors) / len(errors))
+
+
+def truncated_values(mdp: TabularMDP, pi_SA, length: int):
+    """The expected discounted reward of the first `length` steps."""
+    v_S = torch.zeros(mdp.num_states, dtype=torch.float64)
+    for _ in range(length):
+        outcomes = mdp.outcomes
+        later_SA = (outcomes.prob_NAK * outcomes.discount_NAK * v_S[outcomes.child_NAK]).sum(-1)
+        v_S = (pi_SA * (outcomes.reward_NA + later_SA)).sum(-1)
+    return v_S
+
+
+def by_hand() -> Rollout:
+    """Three episodes of rewards 1, 2, 4 with discounts 0.5: the first is cut after three steps, the second terminates
+    in its third, the third is cut after two."""
+    column = torch.tensor([[1.0], [2.0], [4.0]], dtype=torch.float64).expand(3, 3)
+    discount_TB = torch.full((3, 3), 0.5, dtype=torch.float64)
+    discount_TB[2, 1] = 0.0
+    alive_TB = torch.tensor([[1, 1, 1], [1, 1, 1], [1, 1, 0]], dtype=torch.bool)
+    states_TB = torch.arange(3)[:, None].expand(3, 3)
+    return Rollout(states_TB, states_TB * 0, column, discount_TB, states_TB + 1, alive_TB, column, discount_TB)
+
+
+@pytest.mark.parametrize(
+    ("lambda_", "expected"),
+    [
+        # V(s_{t+1}) is 10 everywhere.  lambda = 0: r + 0.5 * 10, and r alone where the episode terminated.
+        (0.0, [[6.0, 7.0, 9.0], [6.0, 7.0, 4.0], [6.0, 7.0]]),
+        # lambda = 1: all rewards, and 10 only where the episode was cut.
+        (1.0, [[1 + 0.5 * (2 + 0.5 * 9), 2 + 0.5 * 9, 9.0], [1 + 0.5 * (2 + 0.5 * 4), 2 + 0.5 * 4, 4.0], [4.5, 7.0]]),
+        # lambda = 1/2: G = r + 0.5 (5 + G' / 2).
+        (
+            0.5,
+            [[1 + 0.5 * (5 + 6.75 / 2), 2 + 0.5 * (5 + 9 / 2), 9.0], [1 + 0.5 * (5 + 5.5 / 2), 5.5, 4.0], [5.25, 7.0]],
+        ),
+    ],
+)
+def test_lambda_returns_are_those_computed_by_hand(lambda_, expected):
+    made = by_hand()
+    returns_TB = lambda_returns(made, torch.full((3, 3), 10.0, dtype=torch.float64), made.discount_TB, lambda_)
+    for b, column in enumerate(expected):
+        torch.testing.assert_close(returns_TB[: len(column), b], torch.tensor(column, dtype=torch.float64))
+
+
+def test_the_exact_critic_is_the_exact_evaluation():
+    mdp = zoo("garnet")
+    pi_SA = random_policy(mdp, seed=3)
+    critic, truth, states = ExactCritic(mdp), exact.evaluate(mdp, pi_SA), torch.tensor([4, 0, 4])
+    assert critic.fit(following(pi_SA), by_hand(), generator=stream(0, "critic")) == {}
+    torch.testing.assert_close(critic.v(states), truth.v_S[states], rtol=0, atol=0)
+    torch.testing.assert_close(critic.q(states), truth.q_SA[states], rtol=0, atol=0)
+    assert critic.model_calls == 0
+
+
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_the_error_of_monte_carlo_means_falls_with_the_square_root_of_the_episodes(target):
+    # 15 repeats of 6 or 12 values: the slope of four such points has a standard error of about 0.03.
+    mdp = random_mdp(6, 2, gamma=0.5, start=None)
+    pi_SA = uniform_policy(mdp)
+    counts = [60, 240, 960, 3840]
+    errors = []
+    for episodes in counts:
+        repeats = []
+        for seed in range(15):
+            critic = TabularCritic(6, 2, target=target, method=MonteCarlo(), step_size="mean")
+            fit(critic, mdp, pi_SA, GeometricHorizon(), episodes=episodes, seed=seed)
+            repeats.append(error(critic, mdp, pi_SA))
+        errors.append(mean_square(repeats))
+    assert -0.6 < log_slope(counts, errors) < -0.4
+    assert errors[-1] < 0.06
+
+
+@pytest.mark.parametrize("horizon", [FixedHorizon(2), GeometricHorizon()])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_tabular_critics_converge_to_the_values_of_a_policy_that_stands_still(target, method, horizon):
+    # Where an episode is cut at its second step at the latest, a fit leaves at most 1 - 0.2 (1 - 0.5) of the error in
+    # its bootstrapped targets: 0.02 of the start after 40. The rest is the spread of about 1000 targets.
+    mdp = random_mdp(6, 2, gamma=0.5, start=None)
+    pi_SA = uniform_policy(mdp)
+    critic = TabularCritic(6, 2, target=target, method=method, step_size=0.2)
+    start = error(critic, mdp, pi_SA)
+    losses = [fit(critic, mdp, pi_SA, horizon, episodes=400, seed=seed)["value"] for seed in range(40)]
+    assert error(critic, mdp, pi_SA) < 0.05 < 0.06 * start
+    assert losses[-1] < losses[0]
+    # What two steps earn without the rest would be far off: the cut end of an episode is estimated, not left out.
+    assert (truncated_values(mdp, pi_SA, 2) - exact.evaluate(mdp, pi_SA).v_S).abs().min() > 0.2
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_terminal_outcome_is_not_bootstrapped(method):
+    mdp = deep_sea(3, gamma=0.9, stochastic=True)
+    pi_SA = right_with(*[0.9] * 9)
+    critic = TabularCritic(9, 2, method=method, step_size="mean")
+    critic.load_state_dict({"value_C": torch.full((9,), 100.0), "count_C": torch.zeros(9)})
+    for seed in range(5):
+        fit(critic, mdp, pi_SA, FixedHorizon(3), episodes=2000, seed=seed)
+    last_row = torch.tensor([6, 7, 8])
+    truth_S = exact.evaluate(mdp, pi_SA).v_S
+    torch.testing.assert_close(critic.v(last_row), truth_S[last_row], atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_what_was_never_visited_keeps_the_value_0(target):
+    mdp = ladder(5)
+    pi_SA = right_with(0.5, 0.0, 0.5, 0.5, 0.5)
+    critic = TabularCritic(5, 2, target=target, step_size=1.0)
+    critic.load_state_dict(
+        {name: value + 1 for name, value in critic.state_dict().items()}
+        | {"count_C": torch.zeros(5 if target == "v" else 10)}
+    )
+    fit(critic, mdp, pi_SA, FixedHorizon(30), episodes=20)
+    ones = torch.ones(3, dtype=torch.float64) if target == "v" else torch.ones(3, 2, dtype=torch.float64)
+    asked = critic.v if target == "v" else critic.q
+    assert torch.equal(asked(torch.tensor([2, 3, 4])), ones)
+    assert not (asked(torch.tensor([0])) == 1).any()
+
+    fresh = TabularCritic(5, 2, target=target)
+    fit(fresh, mdp, pi_SA, FixedHorizon(30), episodes=20)
+    asked = fresh.v if target == "v" else fresh.q
+    assert (asked(torch.tensor([2, 3, 4])) == 0).all()
+
+
+def test_a_step_moves_each_value_by_its_share_toward_the_mean_of_its_targets():
+    made = by_hand()
+    critic = TabularCritic(4, 1, method=TDLambda(0.0), step_size=0.25)
+    value_S = torch.tensor([8.0, 10.0, 10.0, 10.0], dtype=torch.float64)
+    critic.load_state_dict({"value_C": value_S, "count_C": torch.zeros(4)})
+    loss = critic.fit(following(torch.ones(4, 1, dtype=torch.float64)), made, generator=stream(0, "critic"))
+    # Targets: 6 at state 0, 7 at state 1, 9 and 4 at state 2 (the third episode was over by then).
+    expected_S = torch.tensor([8 - 0.25 * 2, 10 - 0.25 * 3, 10 - 0.25 * 3.5, 10.0], dtype=torch.float64)
+    torch.testing.assert_close(critic.v(torch.arange(4)), expected_S)
+    assert loss["value"] == pytest.approx((3 * 2**2 + 3 * 3**2 + 1**2 + 6**2) / 8)
+
+
+def test_a_q_critic_answers_v_as_the_mean_over_the_policy():
+    mdp = ladder(3)
+    pi_SA = right_with(0.2, 0.5, 0.9)
+    critic = TabularCritic(3, 2, target="q")
+    fit(critic, mdp, pi_SA, FixedHorizon(20), episodes=30)
+    states = torch.arange(3)
+    torch.testing.assert_close(critic.v(states), (pi_SA * critic.q(states)).sum(-1))
+    with pytest.raises(PgtsError, match="learns v"):
+        TabularCritic(3, 2).q(states)
+
+
+def test_the_rollout_critic_is_unbiased_also_where_the_policy_never_goes():
+    mdp = ladder(5, gamma=0.8)
+    pi_SA = right_with(0.0, 0.6, 0.6, 0.6, 0.6)
+    truth, repeats = exact.evaluate(mdp, pi_SA), 500
+    assert (truth.d_S[1:] == 0).all()
+    critic = RolloutCritic(TabularModel(mdp), samples=4)
+    critic.fit(following(pi_SA), by_hand(), generator=stream(0, "critic"))
+    states = torch.arange(5).repeat(repeats)
+    assert z_scores(critic.v(states).view(repeats, 5), truth.v_S).abs().max() < FAR
+    q_BX = critic.q(states).view(repeats, 10)
+    assert z_scores(q_BX, truth.q_SA.reshape(-1)).abs().max() < FAR
+    assert z_scores(q_BX, exact.bellman(mdp, truth.q_SA).reshape(-1)).abs().max() > 2 * FAR
+
+
+def test_the_error_of_the_rollout_critic_falls_with_the_square_root_of_its_samples():
+    # 100 repeats of 6 values: the slope has a standard error of about 0.015.
+    mdp = random_mdp(6, 2, gamma=0.5, start=None)
+    pi_SA = random_policy(mdp, seed=1)
+    counts, errors, states = [4, 16, 64], [], torch.arange(6).repeat(100)
+    for samples in counts:
+        critic = RolloutCritic(TabularModel(mdp), samples=samples)
+        critic.fit(following(pi_SA), by_hand(), generator=stream(samples, "critic"))
+        errors.append(float((critic.v(states).view(100, 6) - exact.evaluate(mdp, pi_SA).v_S).square().mean().sqrt()))
+    assert -0.55 < log_slope(counts, errors) < -0.45
+
+
+def test_a_short_fixed_horizon_leaves_out_what_comes_after_it():
+    mdp = random_mdp(6, 2, gamma=0.7)
+    pi_SA = random_policy(mdp, seed=1)
+    critic = RolloutCritic(TabularModel(mdp), samples=4, horizon=FixedHorizon(3))
+    critic.fit(following(pi_SA), by_hand(), generator=stream(0, "critic"))
+    v_BS = critic.v(torch.arange(6).repeat(1000)).view(1000, 6)
+    assert z_scores(v_BS, truncated_values(mdp, pi_SA, 3)).abs().max() < FAR
+    assert z_scores(v_BS, exact.evaluate(mdp, pi_SA).v_S).abs().min() > 2 * FAR
+
+
+def test_the_rollout_critic_counts_what_it_asks_of_its_model():
+    mdp = grid(4, traps=(5,))
+    critic = RolloutCritic(TabularModel(mdp), samples=3, horizon=FixedHorizon(7))
+    critic.fit(following(uniform_policy(mdp)), by_hand(), generator=stream(0, "critic"))
+    assert critic.model_calls == 0
+    critic.v(torch.arange(5))
+    assert critic.model_calls == 5 * 3 * 7
+    critic.q(torch.arange(5))
+    assert critic.model_calls == 5 * 3 * 7 + 5 * 4 * 3 * 7
+
+    ending = RolloutCritic(TabularModel(deep_sea(4)), samples=2, horizon=FixedHorizon(50))
+    ending.fit(following(uniform_policy(deep_sea(4))), by_hand(), generator=stream(0, "critic"))
+    ending.v(torch.tensor([0, 15]))
+    assert ending.model_calls == 2 * 4 + 2 * 1
+
+
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_what_a_tabular_critic_learned_survives_the_round_trip(target):
+    mdp = ladder(4)
+    pi_SA = uniform_policy(mdp)
+    critic, other = (TabularCritic(4, 2, target=target, step_size="mean") for _ in range(2))
+    fit(critic, mdp, pi_SA, FixedHorizon(20), episodes=5)
+    state = critic.state_dict()
+    other.load_state_dict(state)
+    for seed in (1, 2):
+        for each in (critic, other):
+            fit(each, mdp, pi_SA, FixedHorizon(20), episodes=5, seed=seed)
+    assert all(torch.equal(value, other.state_dict()[name]) for name, value in critic.state_dict().items())
+    assert not torch.equal(state["value_C"], critic.state_dict()["value_C"])
+
+
+def test_what_does_not_fit_a_critic_is_refused():
+    critic = TabularCritic(4, 2)
+    state = critic.state_dict()
+    for wrong in [
+        {},
+        {"value_C": state["value_C"]},
+        state | {"count_C": torch.zeros(8)},
+        state | {"value_C": [0.0] * 4},
+    ]:
+        with pytest.raises(PgtsError, match="_C is"):
+            critic.load_state_dict(wrong)
+    for forgetful in (ExactCritic(ladder()), RolloutCritic(TabularModel(ladder()))):
+        forgetful.load_state_dict(forgetful.state_dict())
+        with pytest.raises(PgtsError, match="value_C"):
+            forgetful.load_state_dict(state)
+
+
+def test_a_critic_that_knows_no_policy_yet_says_so():
+    states = torch.arange(3)
+    for critic in (
+        ExactCritic(ladder()),
+        RolloutCritic(TabularModel(ladder())),
+        TabularCritic(5, 2, target="q"),
+    ):
+        with pytest.raises(PgtsError, match="no policy yet"):
+            critic.v(states)

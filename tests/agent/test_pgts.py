@@ -1,0 +1,289 @@
+"""Algorithm 1 from rollouts: what one iteration does, and what a training leaves untouched."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from pgts_torch import PGTS
+from pgts_torch.agent.critics import TabularCritic
+from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
+from pgts_torch.agent.updates import SoftmaxUpdate
+from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.seeding import stream
+from pgts_torch.tabular import exact, grid, ladder
+from pgts_torch.tabular.ascent import projected_step
+from tests.agent.helpers import copies, same_bits
+from tests.support import right_with
+
+
+def make(env: str = "pgts/Ladder-v0", **kwargs) -> PGTS:
+    return PGTS(env, **{"depth": 2, "num_envs": 4, "horizon": {"type": "fixed", "length": 12}, "seed": 7} | kwargs)
+
+
+def bits(model: PGTS) -> list[torch.Tensor]:
+    """Everything that training goes on from."""
+    state = model.state_dict()
+    return [*state["policy"].values(), *state["critic"].values(), torch.tensor(state["num_env_steps"])]
+
+
+def same(first: list[torch.Tensor], second: list[torch.Tensor]) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(first, second, strict=True))
+
+
+def test_the_short_form_works():
+    model = PGTS("pgts/Ladder-v0", depth=4, seed=0).learn(2_000)
+    assert model.num_env_steps >= 2_000
+    assert model.predict(0) in (0, 1)
+    assert model.gamma == 0.9
+
+
+def test_one_iteration_is_algorithm_1():
+    mdp = ladder(4, gamma=0.8)
+    policy = SimplexPolicy(4, 2)
+    pi_SA = right_with(0.3, 0.6, 0.2, 0.9)
+    policy.load_state_dict({"probs_SA": pi_SA})
+    model = PGTS(
+        copies(mdp, 3),
+        depth=2,
+        policy=policy,
+        critic="exact",
+        update={"type": "projected", "step_size": 0.05},
+        horizon={"type": "fixed", "length": 4},
+    )
+    seen = model.iterate()
+
+    d_S = torch.zeros(4, dtype=torch.float64)
+    for episode in seen.experience.state_TB.T.tolist():
+        for t, s in enumerate(episode):
+            d_S[s] += 0.8**t / 3
+    visited = torch.nonzero(d_S).flatten()
+    truth = exact.evaluate(mdp, pi_SA)
+    look_SA = exact.lookahead(mdp, truth.q_SA, 2)
+    expected_SA = pi_SA.clone()
+    expected_SA[visited] = projected_step(pi_SA[visited], look_SA[visited], d_S[visited], 0.05)
+
+    assert torch.equal(seen.state_N, visited)
+    torch.testing.assert_close(seen.weight_N, d_S[visited])
+    torch.testing.assert_close(seen.pi_NA, pi_SA[visited])
+    torch.testing.assert_close(seen.look.q_BA, look_SA[visited])
+    torch.testing.assert_close(seen.gap_N, look_SA[visited].amax(-1) - truth.v_S[visited])
+    torch.testing.assert_close(policy.table(), expected_SA)
+    assert not torch.allclose(expected_SA, pi_SA)
+    wrong_SA = exact.lookahead(mdp, truth.q_SA, 1)
+    assert not torch.allclose(seen.look.q_BA, wrong_SA[visited])
+
+
+@pytest.mark.parametrize(
+    "critic", ["tabular", {"type": "tabular", "target": "q"}, "exact", {"type": "exact", "target": "q"}]
+)
+def test_the_critic_stands_at_the_leaves_whether_it_learns_v_or_q(critic):
+    model = make(critic=critic, depth=3)
+    model.iterate()
+    states = torch.arange(5)
+    if model.critic.target == "q":
+        q_SA = model.critic.q(states)
+    else:
+        q_SA = model.mdp.outcomes.reward_NA + (
+            model.mdp.outcomes.prob_NAK
+            * model.mdp.outcomes.discount_NAK
+            * model.critic.v(model.mdp.outcomes.child_NAK.reshape(-1)).view(5, 2, 1)
+        ).sum(-1)
+    torch.testing.assert_close(model.lookahead(states).q_BA, exact.lookahead(model.mdp, q_SA, 3))
+
+
+def test_learn_counts_the_steps_of_all_calls():
+    model = make()
+    model.learn(4 * 12 * 3)
+    assert (model.num_env_steps, model.num_iterations) == (144, 3)
+    model.learn(145)
+    assert (model.num_env_steps, model.num_iterations) == (192, 4)
+    model.learn(100)
+    assert model.num_iterations == 4
+
+
+def test_a_callback_sees_every_iteration_and_ends_the_training_by_returning_false():
+    seen = []
+
+    def callback(model, iteration):
+        seen.append((model.num_iterations, iteration.experience.num_steps))
+        return len(seen) < 3
+
+    model = make().learn(10_000, callback=callback)
+    assert seen == [(1, 48), (2, 48), (3, 48)]
+    assert model.num_iterations == 3
+    model.learn(48 * 5, callback=lambda model, iteration: None)
+    assert model.num_iterations == 5
+
+
+def test_predict_answers_in_the_shape_it_is_asked():
+    policy = SimplexPolicy(5, 2)
+    policy.load_state_dict({"probs_SA": right_with(0.9, 0.1, 0.5, 0.0, 1.0)})
+    model = PGTS(copies(ladder(), 2), policy=policy)
+    assert model.predict(0) == 1
+    assert isinstance(model.predict(np.int64(0)), np.integer)
+    assert model.predict([3, 4, 1]).tolist() == [0, 1, 0]
+    assert model.predict(np.array([[0, 1], [3, 4]], dtype=np.int32)).tolist() == [[1, 0], [0, 1]]
+    assert model.predict(np.zeros((0,), dtype=np.int64)).shape == (0,)
+    env = gymnasium.make("FrozenLake-v1")
+    observation, _ = env.reset(seed=0)
+    env.step(PGTS("FrozenLake-v1").predict(observation))
+
+
+def test_predict_draws_from_the_policy_where_it_is_asked_to():
+    # 5 standard errors of 4,000 draws: fails by chance with probability 6e-7.
+    policy = SimplexPolicy(5, 2)
+    policy.load_state_dict({"probs_SA": right_with(0.7, 0.0, 0.0, 0.0, 1.0)})
+    model = PGTS(copies(ladder(), 2), policy=policy)
+    drawn = model.predict(np.zeros(4000, dtype=np.int64), deterministic=False)
+    assert abs(drawn.mean() - 0.7) < 5 * (0.21 / 4000) ** 0.5
+    assert np.array_equal(drawn, model.predict(np.zeros(4000, dtype=np.int64), deterministic=False))
+    given = model.predict(np.zeros(4000, dtype=np.int64), deterministic=False, generator=stream(1, "mine"))
+    assert not np.array_equal(drawn, given)
+    assert model.predict([1, 4], deterministic=False).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        (5, "state 5 does not exist; states are 0 to 4"),
+        ([0, -1], "state -1"),
+        (0.5, "float64"),
+        ([0.0], "float64"),
+        (True, "bool"),
+        ("0", "states are integers"),
+    ],
+)
+def test_an_observation_that_is_no_state_is_refused(observation, message):
+    with pytest.raises(PgtsError, match=message):
+        make().predict(observation)
+
+
+@pytest.mark.parametrize("env", ["pgts/Random-v0", "FrozenLake-v1"])
+def test_the_same_seed_gives_the_same_bits_and_another_seed_others(env):
+    first, second, other = make(env), make(env), make(env, seed=8)
+    for model in (first, second, other):
+        model.learn(150)
+    assert same(bits(first), bits(second))
+    assert not same(bits(first), bits(other))
+
+
+@pytest.mark.parametrize(
+    "critic", ["tabular", {"type": "tabular", "target": "q"}, {"type": "rollout", "samples": 2}, "exact"]
+)
+def test_asking_for_lookaheads_and_actions_does_not_move_the_training(critic):
+    quiet, asked = make(critic=critic), make(critic=critic)
+    for _ in range(4):
+        first, second = quiet.iterate(), asked.iterate()
+        assert same_bits(first.experience, second.experience)
+        asked.lookahead(torch.arange(5))
+        asked.predict(np.arange(5), deterministic=False)
+        asked.critic.v(torch.arange(5))
+        asked.policy.table()
+    assert same(bits(quiet), bits(asked))
+
+
+def test_no_global_generator_is_drawn_from_and_none_matters():
+    first, second = make("FrozenLake-v1"), make("FrozenLake-v1")
+    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    first.learn(100)
+    assert torch.equal(torch.get_rng_state(), torch_state)
+    assert np.array_equal(np.random.get_state()[1], numpy_state)  # noqa: NPY002
+    torch.rand(3)
+    np.random.random(3)  # noqa: NPY002
+    second.learn(100)
+    assert same(bits(first), bits(second))
+
+
+@pytest.mark.parametrize("env", ["FrozenLake-v1", "CliffWalking-v1", "Taxi-v4"])
+def test_gymnasiums_tabular_environments_can_be_learned_from(env):
+    model = make(env, depth=3).learn(200)
+    assert model.num_env_steps >= 200
+    assert (model.mdp.num_states, model.mdp.num_actions) == (
+        model.env.single_observation_space.n,
+        model.env.single_action_space.n,
+    )
+    assert model.gamma == 0.99
+    assert make(env, gamma=0.5).gamma == 0.5
+
+
+@pytest.mark.parametrize("env", ["pgts/Ladder-v0", "pgts/Grid-v0", "FrozenLake-v1"])
+def test_a_whole_training_asks_the_model_at_most_once_for_each_state_and_action(env):
+    total = 0
+
+    def count(model, iteration):
+        nonlocal total
+        total += iteration.model_calls
+
+    model = make(env, depth=6).learn(1_000, callback=count)
+    assert 0 < model.num_model_calls == total <= model.mdp.num_states * model.mdp.num_actions
+
+
+def test_what_the_rollout_critic_asks_is_counted_too():
+    model = make(critic={"type": "rollout", "samples": 2, "horizon": {"type": "fixed", "length": 3}})
+    seen = model.iterate()
+    assert seen.model_calls == model.topology.model_calls + model.critic.model_calls == model.num_model_calls
+    assert model.critic.model_calls > 0
+
+
+def test_an_environment_without_a_tabular_model_is_one_clear_line():
+    class Unpublished(gymnasium.Env):
+        observation_space = gymnasium.spaces.Discrete(3)
+        action_space = gymnasium.spaces.Discrete(2)
+
+    with pytest.raises(PgtsError, match=r"Box.*tabular policies need Discrete") as caught:
+        PGTS("CartPole-v1")
+    assert "\n" not in str(caught.value)
+    env = gymnasium.vector.SyncVectorEnv([Unpublished], autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED)
+    with pytest.raises(MissingModel, match="no transition table"):
+        PGTS(env)
+    with pytest.raises(PgtsError, match="must be a Gymnasium id or a VectorEnv"):
+        PGTS(gymnasium.make("FrozenLake-v1"))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"depth": -1}, "depth is -1"),
+        ({"depth": 1.5}, "depth is 1.5"),
+        ({"policy": "simplex", "update": "softmax"}, "SoftmaxUpdate moves a SoftmaxPolicy"),
+        ({"policy": SoftmaxPolicy(4, 2)}, r"\(4, 2\); the environment has \(5, 2\)"),
+        ({"gamma": 1.5}, "gamma is 1.5"),
+        ({"seed": -1}, "seed is -1"),
+        ({"num_envs": 0}, "num_envs is 0"),
+        ({"env_kwargs": {"length": 3}}, "no argument 'length'"),
+        ({"env": "pgts/Nowhere-v0"}, "pgts/Nowhere-v0 cannot be made"),
+        ({"horizon": 3}, "horizon is 3"),
+        ({"critic": None}, "critic is None"),
+        ({"env": copies(ladder(), 2), "gamma": 0.5}, "gamma is 0.5; the given environment has its own, 0.9"),
+        ({"env": copies(ladder(), 2), "env_kwargs": {"n": 3}}, "takes none"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make(**kwargs)
+
+
+def test_parts_may_be_given_as_objects():
+    model = PGTS(
+        copies(grid(4, traps=(5,)), 3),
+        policy=SoftmaxPolicy(16, 4),
+        critic=TabularCritic(16, 4, target="q"),
+        update=SoftmaxUpdate(0.2),
+    )
+    model.iterate()
+    assert model.depth == 4
+    assert model.update == SoftmaxUpdate(0.2)
+    with pytest.raises(PgtsError, match="only one given by its id"):
+        model.make_copies(2)
+
+
+def test_the_defaults_update_every_kind_of_policy():
+    assert type(make().update).__name__ == "SoftmaxUpdate"
+    assert type(make(policy="simplex").update).__name__ == "ProjectedUpdate"
+
+
+def test_the_device_and_the_node_budget_reach_their_places():
+    assert make(device="cpu").model.device == torch.device("cpu")
+    with pytest.raises(PgtsError, match="max_nodes is 3"):
+        make(max_nodes=3).iterate()

@@ -1,0 +1,111 @@
+"""How policies move: as the exact formulas say, and only where they are told to."""
+
+import pytest
+import torch
+
+from pgts_torch.agent.policies import Random, SimplexPolicy, SoftmaxPolicy
+from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate
+from pgts_torch.errors import PgtsError
+from pgts_torch.seeding import stream
+from pgts_torch.tabular.ascent import mirror_step, projected_step, softmax_step
+
+CASES = [
+    (ProjectedUpdate, SimplexPolicy, projected_step),
+    (SoftmaxUpdate, SoftmaxPolicy, softmax_step),
+    (MirrorUpdate, SimplexPolicy, mirror_step),
+    (MirrorUpdate, SoftmaxPolicy, mirror_step),
+]
+STATES = torch.tensor([5, 0, 3])
+
+
+def question(seed: int = 0):
+    """Lookahead values and weights at three states."""
+    generator = stream(seed, "updates")
+    q_NA = torch.randn(3, 4, generator=generator, dtype=torch.float64)
+    return q_NA, torch.rand(3, generator=generator, dtype=torch.float64) * 3
+
+
+@pytest.mark.parametrize(("update", "kind", "step"), CASES)
+@pytest.mark.parametrize("step_size", [0.01, 0.1, 0.3])
+def test_an_update_is_the_exact_formula_at_the_visited_states(update, kind, step, step_size):
+    policy = kind(7, 4, init=Random(), seed=3)
+    before_SA, (q_NA, weight_N) = policy.table(), question()
+    update(step_size=step_size)(policy, STATES, q_NA, weight_N)
+    expected_NA = step(before_SA[STATES], q_NA, weight_N, step_size)
+    torch.testing.assert_close(policy.probs(STATES), expected_NA)
+    assert not torch.allclose(expected_NA, step(before_SA[STATES], q_NA, weight_N, 2 * step_size))
+    assert not torch.allclose(expected_NA, step(before_SA[STATES], q_NA, weight_N.roll(1), step_size))
+
+
+@pytest.mark.parametrize(("update", "kind", "step"), CASES)
+def test_states_that_were_not_visited_stay_bit_for_bit(update, kind, step):
+    policy = kind(7, 4, init=Random(), seed=3)
+    before = {name: value.clone() for name, value in policy.state_dict().items()}
+    update(step_size=5.0)(policy, STATES, *question())
+    others = torch.tensor([1, 2, 4, 6])
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value[others], before[name][others])
+        assert not torch.isclose(value[STATES], before[name][STATES]).all(-1).any()
+
+
+@pytest.mark.parametrize(("update", "kind", "step"), CASES)
+def test_after_many_large_steps_a_policy_is_still_one(update, kind, step):
+    policy = kind(7, 4, init=Random(), seed=3)
+    for seed in range(200):
+        update(step_size=50.0)(policy, STATES, *question(seed))
+    pi_SA = policy.table()
+    assert (pi_SA >= 0).all()
+    torch.testing.assert_close(pi_SA.sum(-1), torch.ones(7, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("update", "kind", "step"), CASES)
+def test_an_update_moves_toward_the_better_action(update, kind, step):
+    policy = kind(2, 3)
+    q_NA = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64)
+    update(step_size=0.1)(policy, torch.tensor([1]), q_NA, torch.ones(1, dtype=torch.float64))
+    assert policy.table()[1, 1] > 1 / 3 > policy.table()[1, 0]
+
+
+def test_mirror_steps_on_logits_and_on_probabilities_are_the_same():
+    on_probs = SimplexPolicy(7, 4, init=Random(), seed=3)
+    on_logits = SoftmaxPolicy(7, 4, init=Random(), seed=3)
+    for seed in range(20):
+        for policy in (on_probs, on_logits):
+            MirrorUpdate(step_size=0.3)(policy, STATES, *question(seed))
+    torch.testing.assert_close(on_probs.table(), on_logits.table())
+
+
+def test_the_softmax_update_is_the_gradient_of_the_weighted_mean_value():
+    policy = SoftmaxPolicy(7, 4, init=Random(), seed=3)
+    q_NA, weight_N = question()
+    logits_SA = policy.logits_SA.clone().requires_grad_()
+    (weight_N * (logits_SA[STATES].softmax(-1) * q_NA).sum(-1)).sum().backward()
+    before_SA = policy.logits_SA.clone()
+    SoftmaxUpdate(step_size=0.7)(policy, STATES, q_NA, weight_N)
+    torch.testing.assert_close(policy.logits_SA - before_SA, 0.7 * logits_SA.grad)
+
+
+@pytest.mark.parametrize(
+    ("update", "kind", "fits"),
+    [
+        (ProjectedUpdate, SoftmaxPolicy, "SimplexPolicy"),
+        (SoftmaxUpdate, SimplexPolicy, "SoftmaxPolicy"),
+    ],
+)
+def test_a_policy_that_an_update_cannot_move_is_refused(update, kind, fits):
+    with pytest.raises(PgtsError, match=f"{update.__name__} moves a {fits}, not a {kind.__name__}"):
+        update().check(kind(3, 2))
+
+
+@pytest.mark.parametrize(("update", "kind", "step"), CASES)
+def test_a_policy_that_an_update_can_move_is_taken(update, kind, step):
+    update().check(kind(3, 2))
+
+
+@pytest.mark.parametrize("update", [ProjectedUpdate, SoftmaxUpdate, MirrorUpdate])
+def test_steps_and_weights_that_make_no_sense_are_refused(update):
+    for step_size in (0, -0.1, float("nan"), float("inf")):
+        with pytest.raises(PgtsError, match=f"step_size is {step_size}"):
+            update(step_size=step_size)
+    with pytest.raises(PgtsError, match="state_weight is 'all'"):
+        update(state_weight="all")

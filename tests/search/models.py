@@ -1,0 +1,116 @@
+"""Models and critics that keep a record of what they are asked, and the slow oracle of the search."""
+
+from collections.abc import Callable, Hashable, Sequence
+
+import torch
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.models import EnumeratingModel, TabularModel
+from pgts_torch.seeding import stream
+from pgts_torch.tabular import TabularMDP
+
+Step = Callable[[Hashable, int], tuple[float, Sequence[tuple[float, float, Hashable]]]]
+"""(state, action) to the expected reward and the outcomes (probability, discount, next state)."""
+
+
+class WatchedModel(EnumeratingModel):
+    """Another model, with the states that it was asked about, call by call."""
+
+    def __init__(self, model: EnumeratingModel) -> None:
+        self.model = model
+        self.num_actions, self.device, self.dtype = model.num_actions, model.device, model.dtype
+        self.calls: list[list[int]] = []
+
+    @property
+    def num_states(self) -> int:
+        return self.model.num_states
+
+    @property
+    def asked(self) -> list[int]:
+        """All states that it was asked about, in order, with repetition."""
+        return [state for call in self.calls for state in call]
+
+    def outcomes(self, state_N: Tensor) -> Outcomes:
+        self.calls.append(state_N.tolist())
+        return self.model.outcomes(state_N)
+
+
+class InterningModel(EnumeratingModel):
+    """States that are anything hashable, numbered as they are met; K is the most outcomes among those asked about."""
+
+    def __init__(self, step: Step, starts: Sequence[Hashable], *, num_actions: int) -> None:
+        self.step = step
+        self.states = list(starts)
+        self.number = {state: n for n, state in enumerate(starts)}
+        self.num_actions = num_actions
+        self.device, self.dtype = torch.device("cpu"), torch.float64
+
+    @property
+    def num_states(self) -> int:
+        return len(self.states)
+
+    def intern(self, state: Hashable) -> int:
+        if state not in self.number:
+            self.number[state] = len(self.states)
+            self.states.append(state)
+        return self.number[state]
+
+    def outcomes(self, state_N: Tensor) -> Outcomes:
+        asked = [self.states[s] for s in state_N.tolist()]
+        rows = [[self.step(state, a) for a in range(self.num_actions)] for state in asked]
+        K = max(len(followers) for row in rows for _, followers in row)
+        prob, discount = torch.zeros(2, len(asked), self.num_actions, K, dtype=torch.float64)
+        child = torch.zeros(len(asked), self.num_actions, K, dtype=torch.int64)
+        for n, row in enumerate(rows):
+            for a, (_, followers) in enumerate(row):
+                for k, (p, gamma, state) in enumerate(followers):
+                    prob[n, a, k], discount[n, a, k], child[n, a, k] = p, gamma, self.intern(state)
+        reward = torch.tensor([[r for r, _ in row] for row in rows], dtype=torch.float64)
+        return Outcomes(reward, prob, discount, child, self.num_states)
+
+
+class Critic:
+    """The rows of a table, with the leaves that were asked about, call by call."""
+
+    def __init__(self, table: Tensor) -> None:
+        self.table = table
+        self.calls: list[list[int]] = []
+
+    def __call__(self, state_N: Tensor) -> Tensor:
+        self.calls.append(state_N.tolist())
+        return self.table[state_N]
+
+
+def watched(mdp: TabularMDP) -> WatchedModel:
+    return WatchedModel(TabularModel(mdp))
+
+
+def some_q(mdp: TabularMDP, seed: int = 0) -> Tensor:
+    """Leaf values that are nobody's Q."""
+    generator = stream(seed, "some_q")
+    return 10 * torch.randn(mdp.num_states, mdp.num_actions, dtype=torch.float64, generator=generator)
+
+
+def some_v(mdp: TabularMDP, seed: int = 0) -> Tensor:
+    return 10 * torch.randn(mdp.num_states, dtype=torch.float64, generator=stream(seed, "some_v"))
+
+
+def zeros(state_N: Tensor) -> Tensor:
+    """The critic that knows nothing of v."""
+    return torch.zeros(len(state_N), dtype=torch.float64)
+
+
+def walk_the_tree(
+    step: Step, state: Hashable, depth: int, v: Callable[[Hashable], float], num_actions: int
+) -> list[float]:
+    """(T^m Q)(s, .) for Q = r + gamma P v by walking every path."""
+
+    def q(state: Hashable, a: int, m: int) -> float:
+        reward, followers = step(state, a)
+        return reward + sum(p * gamma * (value(child, m) if gamma else 0.0) for p, gamma, child in followers)
+
+    def value(state: Hashable, m: int) -> float:
+        return v(state) if m == 0 else max(q(state, a, m - 1) for a in range(num_actions))
+
+    return [q(state, a, depth) for a in range(num_actions)]

@@ -1,0 +1,302 @@
+"""What a search asks of its model, how many nodes it makes of the answers, and what it remembers."""
+
+import time
+import weakref
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.errors import NodeBudgetExceeded, PgtsError
+from pgts_torch.models import EnumeratingModel, TabularModel
+from pgts_torch.search import Topology, expectimax
+from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder
+from tests.search.models import Critic, InterningModel, WatchedModel, some_q, some_v, watched, zeros
+from tests.support import mdps, zoo
+
+
+def nodes_per_level(mdp: TabularMDP, root: int, expansions: int) -> list[int]:
+    look = expectimax(
+        TabularModel(mdp), torch.tensor([root]), depth=expansions, q_leaf=lambda s: zeros(s)[:, None] + zeros_of(mdp)
+    )
+    assert look.nodes == sum(look.nodes_per_level)
+    return list(look.nodes_per_level)
+
+
+def zeros_of(mdp: TabularMDP) -> Tensor:
+    return torch.zeros(mdp.num_actions, dtype=torch.float64)
+
+
+def paths(state: tuple[int, ...], action: int) -> tuple[float, list[tuple[float, float, tuple[int, ...]]]]:
+    """Two actions with two outcomes each; a state is the path that led there, so that no two paths meet."""
+    return float(sum(state)), [(0.5, 0.9, (*state, 2 * action)), (0.5, 0.9, (*state, 2 * action + 1))]
+
+
+# Merging, by counts against closed forms
+
+
+def test_a_tree_whose_paths_never_meet_has_A_times_K_to_the_level_nodes():
+    model = InterningModel(paths, [()], num_actions=2)
+    look = expectimax(model, torch.tensor([0]), depth=5, v_leaf=zeros)
+    assert look.nodes_per_level == tuple(4**level for level in range(7))
+    assert look.model_calls == 2 * sum(4**level for level in range(6))
+
+
+def test_a_ladder_has_one_node_more_at_each_level_until_it_ends():
+    assert nodes_per_level(ladder(6), 0, 10) == [min(level + 1, 6) for level in range(11)]
+
+
+def test_a_grid_has_a_triangle_of_nodes_below_its_corner():
+    triangle = [sum(row + column <= level for row in range(7) for column in range(7)) for level in range(20)]
+    assert nodes_per_level(grid(7, traps=()), 0, 19) == triangle
+
+
+def test_a_deep_sea_has_as_many_nodes_at_each_level_as_its_row_has_cells_within_reach():
+    n = 7
+    rows = [row + 1 for row in range(n)]
+    assert nodes_per_level(deep_sea(n), 0, 9) == [*rows, *[sum(rows)] * 3]
+
+
+def test_a_deep_sea_of_50_asks_for_each_cell_within_reach_once():
+    m, model = 50, watched(deep_sea(50))
+    look = expectimax(model, torch.tensor([0]), depth=m, v_leaf=zeros)
+    assert look.model_calls == m * (m + 1)
+    assert sorted(model.asked) == [50 * row + column for row in range(m) for column in range(row + 1)]
+
+
+# Asking
+
+
+@given(mdps(max_states=8), st.data())
+def test_in_however_many_searches_no_state_is_asked_about_twice_and_each_sees_T_to_the_m(mdp, data):
+    model = watched(mdp)
+    topology, q_SA = Topology(model), some_q(mdp)
+    roots = st.lists(st.integers(0, mdp.num_states - 1), min_size=1, max_size=3)
+    reported = 0
+    for root_list, depth in data.draw(st.lists(st.tuples(roots, st.integers(0, 7)), min_size=1, max_size=14)):
+        root_B = torch.tensor(root_list)
+        look = expectimax(model, root_B, depth=depth, q_leaf=Critic(q_SA), topology=topology)
+        fresh = expectimax(TabularModel(mdp), root_B, depth=depth, q_leaf=Critic(q_SA))
+        assert torch.equal(look.q_BA, fresh.q_BA)
+        assert look.nodes_per_level == fresh.nodes_per_level
+        torch.testing.assert_close(look.q_BA, exact.lookahead(mdp, q_SA, depth)[root_B], rtol=1e-11, atol=1e-11)
+        reported += look.model_calls
+    assert len(model.asked) == len(set(model.asked))
+    assert reported == topology.model_calls == mdp.num_actions * len(model.asked)
+
+
+def test_without_a_topology_each_search_asks_anew():
+    model = watched(ladder(4))
+    first, second = (expectimax(model, torch.tensor([0]), depth=9, v_leaf=zeros) for _ in range(2))
+    assert first.model_calls == second.model_calls == 8
+    assert sorted(model.asked) == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_the_same_roots_again_and_other_roots_in_known_territory_ask_nothing():
+    model = watched(zoo("grid"))
+    topology = Topology(model)
+    first = expectimax(model, torch.tensor([0, 99]), depth=9, v_leaf=zeros, topology=topology)
+    assert first.model_calls == 4 * 100
+    calls = len(model.calls)
+    for roots in ([0, 99], [99, 0], [50], [7, 31, 31]):
+        assert expectimax(model, torch.tensor(roots), depth=7, v_leaf=zeros, topology=topology).model_calls == 0
+    assert len(model.calls) == calls
+
+
+def test_a_deeper_look_asks_only_about_what_is_new():
+    model = watched(ladder(9))
+    topology, root = Topology(model), torch.tensor([0])
+    calls = [expectimax(model, root, depth=m, v_leaf=zeros, topology=topology).model_calls for m in (2, 1, 4, 2, 20)]
+    assert calls == [2 * 3, 0, 2 * 2, 0, 2 * 4]
+
+
+def test_doubling_the_depth_on_a_closed_set_asks_nothing():
+    model = watched(grid())
+    topology = Topology(model)
+    looks = [
+        expectimax(model, torch.tensor([0]), depth=m, v_leaf=zeros, topology=topology).model_calls for m in (32, 64)
+    ]
+    assert looks == [4 * 100, 0]
+
+
+def test_depth_0_asks_nothing_for_a_q_and_about_the_roots_alone_for_a_v():
+    mdp = zoo("garnet")
+    for leaf, asked in [({"q_leaf": Critic(some_q(mdp))}, []), ({"v_leaf": Critic(some_v(mdp))}, [4, 21])]:
+        model = watched(mdp)
+        expectimax(model, torch.tensor([21, 4, 21]), depth=0, **leaf)
+        assert model.asked == asked
+
+
+@pytest.mark.parametrize("depth", [0, 1, 5, 40])
+def test_the_critic_is_asked_once_about_distinct_states(depth):
+    mdp = zoo("garnet")
+    for critic, name in [(Critic(some_q(mdp)), "q_leaf"), (Critic(some_v(mdp)), "v_leaf")]:
+        look = expectimax(TabularModel(mdp), torch.tensor([0, 5, 0]), depth=depth, **{name: critic})
+        assert len(critic.calls) == look.critic_calls == 1
+        assert len(critic.calls[0]) == len(set(critic.calls[0])) == look.nodes_per_level[-1]
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_what_follows_a_terminal_outcome_alone_is_no_node(ends):
+    mdp = TabularMDP.from_transitions(
+        [
+            [[(0.5, 1, 1.0, False), (0.5, 2, 5.0, ends)]],
+            [[(1.0, 0, 2.0, False)]],
+            [[(1.0, 2, 0.0, True)]],
+        ],
+        0.9,
+    )
+    seen = set[int]()
+    for depth in range(6):
+        model, critic = watched(mdp), Critic(some_v(mdp))
+        expectimax(model, torch.tensor([0]), depth=depth, v_leaf=critic)
+        seen.update(critic.calls[0], model.asked)
+    assert (2 in seen) == (not ends)
+
+
+# Memory
+
+
+def test_a_topology_serves_one_model():
+    mdp = ladder()
+    with pytest.raises(PgtsError, match="topology belongs to another model"):
+        expectimax(TabularModel(mdp), torch.tensor([0]), depth=1, v_leaf=zeros, topology=Topology(TabularModel(mdp)))
+
+
+def test_two_batches_of_roots_that_take_turns_do_not_disturb_each_other():
+    mdp = zoo("grid")
+    model, q_SA = TabularModel(mdp), some_q(mdp)
+    topology = Topology(model)
+    expected = [exact.lookahead(mdp, q_SA, depth) for depth in range(25)]
+    for depth in [1, 4, 2, 20, 3, 24, 0]:
+        for roots in ([0], [45, 54]):
+            look = expectimax(model, torch.tensor(roots), depth=depth, q_leaf=Critic(q_SA), topology=topology)
+            torch.testing.assert_close(look.q_BA, expected[depth][roots], rtol=1e-11, atol=1e-11)
+
+
+def test_more_batches_of_roots_than_are_remembered_are_answered_and_the_oldest_is_forgotten():
+    mdp = zoo("garnet")
+    model, q_SA = watched(mdp), some_q(mdp)
+    topology = Topology(model)
+    expected = exact.lookahead(mdp, q_SA, 4)
+    oldest = weakref.ref(topology.levels(torch.tensor([0]), 4, max_nodes=1000))
+    assert oldest() is not None
+    for root in [*range(30), *range(30)]:
+        look = expectimax(model, torch.tensor([root]), depth=4, q_leaf=Critic(q_SA), topology=topology)
+        torch.testing.assert_close(look.q_BA[0], expected[root], rtol=1e-11, atol=1e-11)
+    assert oldest() is None
+    assert len(model.asked) == len(set(model.asked))
+
+
+def test_a_batch_of_roots_that_is_used_again_is_not_forgotten():
+    model = TabularModel(zoo("garnet"))
+    topology, root = Topology(model), torch.tensor([0])
+    levels = topology.levels(root, 3, max_nodes=1000)
+    for other in range(1, 30):
+        topology.levels(torch.tensor([other]), 3, max_nodes=1000)
+        assert topology.levels(root, 3, max_nodes=1000) is levels
+
+
+# The budget
+
+
+def test_a_lookahead_beyond_its_budget_is_refused_before_the_model_is_asked_about_the_level_that_breaks_it():
+    model = WatchedModel(InterningModel(paths, [()], num_actions=2))
+    topology, root = Topology(model), torch.tensor([0])
+
+    def look(max_nodes: int) -> int:
+        return expectimax(model, root, depth=3, v_leaf=zeros, topology=topology, max_nodes=max_nodes).model_calls
+
+    with pytest.raises(NodeBudgetExceeded, match=r"has 21 nodes on levels 0 to 2; max_nodes is 20"):
+        look(20)
+    assert len(model.asked) == 1 + 4
+    with pytest.raises(NodeBudgetExceeded, match=r"has 85 nodes on levels 0 to 3; max_nodes is 84"):
+        look(84)
+    assert len(model.asked) == 1 + 4 + 16
+    # The leaves count as well, and nobody asks the model about them.
+    with pytest.raises(NodeBudgetExceeded, match=r"has 341 nodes on levels 0 to 4; max_nodes is 340"):
+        look(340)
+    assert len(model.asked) == 1 + 4 + 16 + 64
+    assert look(341) == 0
+    assert len(model.asked) == len(set(model.asked)) == 1 + 4 + 16 + 64
+
+
+def test_the_budget_of_a_closed_set_is_one_node_for_each_state_and_level():
+    model, root = TabularModel(ladder(5)), torch.tensor([0])
+    nodes = 1 + 2 + 3 + 4 + 5 * 7
+    assert expectimax(model, root, depth=9, v_leaf=zeros, max_nodes=nodes).nodes == nodes
+    with pytest.raises(NodeBudgetExceeded, match=f"has {nodes} nodes on levels 0 to 10; max_nodes is {nodes - 1}"):
+        expectimax(model, root, depth=9, v_leaf=zeros, max_nodes=nodes - 1)
+
+
+def test_an_absurd_depth_on_a_closed_set_is_refused_at_once():
+    model, started = watched(ladder(5)), time.perf_counter()
+    for depth in (10**9, 10**30):
+        with pytest.raises(NodeBudgetExceeded, match=f"has {5 * (depth - 3) + 15} nodes"):
+            expectimax(model, torch.arange(1), depth=depth, v_leaf=zeros, topology=Topology(model))
+    assert time.perf_counter() - started < 5  # the sweeps alone would take an hour
+    assert len(model.asked) == 2 * 5
+
+
+def test_more_distinct_roots_than_the_budget_are_refused_unasked():
+    model = watched(ladder(5))
+    with pytest.raises(NodeBudgetExceeded, match="has 5 nodes on levels 0 to 0; max_nodes is 4"):
+        expectimax(model, torch.arange(5), depth=3, v_leaf=zeros, max_nodes=4)
+    assert model.asked == []
+
+
+# Models that break their word
+
+
+class Liar(EnumeratingModel):
+    """A ladder with its answer changed."""
+
+    def __init__(self, change: str) -> None:
+        self.model, self.change = TabularModel(ladder(5)), change
+        self.num_states, self.num_actions = 5, 2
+        self.device, self.dtype = self.model.device, self.model.dtype
+
+    def outcomes(self, state_N: Tensor) -> Outcomes:
+        answer = self.model.outcomes(state_N)
+        if self.change == "rows":
+            return answer.rows(torch.tensor([0]))
+        answer.child_NAK[-1, 1, 0] = {"far": 5, "negative": -1, "none": 4}[self.change]
+        return answer
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("rows", r"model answered for \(1, 2\) states and actions; it was asked for \(3, 2\)"),
+        ("far", "model leads from state 4 by action 1 to 5; states are 0 to 4"),
+        ("negative", "model leads from state 4 by action 1 to -1; states are 0 to 4"),
+    ],
+)
+def test_an_answer_that_cannot_be_true_is_refused_and_named(change, message):
+    with pytest.raises(PgtsError, match=message):
+        expectimax(Liar(change), torch.tensor([0, 2, 4]), depth=2, v_leaf=zeros)
+    expectimax(Liar("none"), torch.tensor([0, 2, 4]), depth=2, v_leaf=zeros)
+
+
+class Fainting(WatchedModel):
+    """A model that fails once."""
+
+    def outcomes(self, state_N: Tensor) -> Outcomes:
+        if len(self.calls) == 2:
+            self.calls.append([])
+            raise ConnectionError("the model is out of reach")
+        return super().outcomes(state_N)
+
+
+def test_a_search_that_failed_in_its_model_can_be_repeated():
+    mdp = zoo("grid")
+    model, q_SA, root = Fainting(TabularModel(mdp)), some_q(mdp), torch.tensor([44])
+    topology = Topology(model)
+    with pytest.raises(ConnectionError):
+        expectimax(model, root, depth=6, q_leaf=Critic(q_SA), topology=topology)
+    look = expectimax(model, root, depth=6, q_leaf=Critic(q_SA), topology=topology)
+    torch.testing.assert_close(look.q_BA[0], exact.lookahead(mdp, q_SA, 6)[44], rtol=1e-11, atol=1e-11)
+    assert len(model.asked) == len(set(model.asked))

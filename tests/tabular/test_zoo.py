@@ -1,0 +1,250 @@
+"""Each MDP of the zoo against a description written by hand."""
+
+# ruff: noqa: SIM300  (J is a return, not a constant)
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder, random_mdp, tightrope
+from tests.support import ZOO, always, outcomes_of, uniform_policy, zoo
+
+LEFT, RIGHT, UP, DOWN = range(4)
+
+
+def follows(mdp: TabularMDP) -> dict[tuple[int, int], int]:
+    """The one successor of each (state, action) of a deterministic MDP."""
+    table = {}
+    for s in range(mdp.num_states):
+        for a in range(mdp.num_actions):
+            ((table[s, a], _),) = outcomes_of(mdp, s, a)
+    return table
+
+
+def rewards(mdp: TabularMDP) -> dict[tuple[int, int], float]:
+    """The rewards that are not 0."""
+    return {(s, a): float(mdp.outcomes.reward_NA[s, a]) for s, a in torch.nonzero(mdp.outcomes.reward_NA).tolist()}
+
+
+@pytest.mark.parametrize("name", ZOO)
+def test_every_mdp_of_the_zoo_gives_each_state_and_action_a_distribution(name):
+    mdp = zoo(name)
+    for s in range(0, mdp.num_states, 7):
+        for a in range(mdp.num_actions):
+            assert sum(outcomes_of(mdp, s, a).values()) == pytest.approx(1)
+    assert len(mdp.action_names) == mdp.num_actions
+
+
+# Ladder
+
+
+def test_the_ladder_is_the_one_of_the_paper():
+    mdp = ladder(5, gamma=0.8)
+    assert follows(mdp) == {
+        (0, 0): 0, (1, 0): 0, (2, 0): 1, (3, 0): 2, (4, 0): 3,
+        (0, 1): 1, (1, 1): 2, (2, 1): 3, (3, 1): 4, (4, 1): 4,
+    }  # fmt: skip
+    assert rewards(mdp) == {(4, 1): 1}
+    assert mdp.action_names == ("left", "right")
+    assert torch.all(mdp.outcomes.discount_NAK == 0.8)
+    assert mdp.start_S.tolist() == [1, 0, 0, 0, 0]
+
+
+def test_the_ladder_of_one_state_is_all_top():
+    assert rewards(ladder(1)) == {(0, 1): 1}
+
+
+# Tightrope
+
+
+def test_the_tightrope_is_the_one_of_the_paper():
+    mdp = tightrope()
+    assert follows(mdp) == {(0, 0): 0, (0, 1): 1, (1, 0): 3, (1, 1): 2, (2, 0): 2, (2, 1): 2, (3, 0): 3, (3, 1): 3}
+    assert rewards(mdp) == {(2, 0): 1, (2, 1): 1, (3, 0): -10, (3, 1): -10}
+    assert mdp.start_S.tolist() == [1, 0, 0, 0]
+    assert tightrope(start=None).start_S.tolist() == [0.25] * 4
+
+
+# Random
+
+
+def test_the_same_seed_gives_the_same_mdp_and_neighbouring_seeds_share_nothing():
+    one, again, next_one = (random_mdp(20, 3, branching=4, seed=seed).outcomes for seed in (5, 5, 6))
+    for field in ("reward_NA", "prob_NAK", "child_NAK"):
+        assert torch.equal(getattr(one, field), getattr(again, field))
+        assert not torch.equal(getattr(one, field), getattr(next_one, field))
+    assert not set(one.reward_NA.flatten().tolist()) & set(next_one.reward_NA.flatten().tolist())
+
+
+@pytest.mark.parametrize("branching", [1, 2, 5, 19, 20, None])
+def test_a_garnet_leads_to_as_many_distinct_states_as_it_branches(branching):
+    mdp = random_mdp(20, 3, branching=branching)
+    counts = {len({child for child, _ in outcomes_of(mdp, s, a)}) for s in range(20) for a in range(3)}
+    assert counts == {branching or 20}
+
+
+def test_the_successors_of_a_garnet_are_uniform_over_all_sets():
+    # 6 sets of 2 out of 4 states, each 20,000/6 times: chi-squared with 5 degrees exceeds 37 with probability 6e-7.
+    child = random_mdp(5000, 4, branching=2).outcomes.child_NAK.flatten(0, 1)
+    small = random_mdp(4, 5000, branching=2, seed=3).outcomes.child_NAK.flatten(0, 1).sort(-1).values
+    _, counts = small.unique(dim=0, return_counts=True)
+    expected = len(small) / 6
+    assert len(counts) == 6
+    assert float(((counts - expected) ** 2 / expected).sum()) < 37
+    assert child.min() == 0
+    assert child.max() == 4999
+
+
+def test_rewards_and_probabilities_of_a_random_mdp_are_uniform():
+    # Means of 5,000 numbers, within 5 standard errors: wrong with probability 6e-7 each.
+    outcomes = random_mdp(50, 100, branching=3, seed=2).outcomes
+    assert 0 <= outcomes.reward_NA.min() <= outcomes.reward_NA.max() <= 1
+    assert abs(outcomes.reward_NA.mean() - 0.5) < 5 * math.sqrt(1 / 12 / 5000)
+    # p_1 of a uniform distribution on the simplex of 3 has mean 1/3, variance 1/18 and P(p_1 > 1/2) = 1/4.
+    p = outcomes.prob_NAK[..., 0]
+    assert abs(p.mean() - 1 / 3) < 5 * math.sqrt(1 / 18 / 5000)
+    assert abs((p > 0.5).double().mean() - 0.25) < 5 * math.sqrt(3 / 16 / 5000)
+
+
+# Grid
+
+
+def test_an_inner_cell_of_the_grid_moves_as_intended_with_probability_0_9925():
+    mdp = grid()
+    s = 55
+    for action, intended in [(LEFT, 54), (RIGHT, 56), (UP, 45), (DOWN, 65)]:
+        expected = {(t, 0.9): 0.0025 for t in (54, 56, 45, 65)} | {(intended, 0.9): 0.99 + 0.0025}
+        assert outcomes_of(mdp, s, action) == pytest.approx(expected, abs=1e-15)
+
+
+def test_a_move_into_the_wall_of_the_grid_stays():
+    mdp = grid()
+    corner = {(0, 0.9): 0.99 + 2 * 0.0025, (1, 0.9): 0.0025, (10, 0.9): 0.0025}
+    assert outcomes_of(mdp, 0, LEFT) == pytest.approx(corner, abs=1e-15)
+    assert outcomes_of(mdp, 0, UP) == pytest.approx(corner, abs=1e-15)
+    assert outcomes_of(mdp, 99, RIGHT)[99, 0.9] == pytest.approx(0.995)
+    # The grid has edges: it does not wrap from the end of a row to the next.
+    assert set(outcomes_of(mdp, 19, RIGHT)) == {(19, 0.9), (18, 0.9), (9, 0.9), (29, 0.9)}
+
+
+def test_goal_and_traps_of_the_grid_pay_every_action():
+    expected = {(99, a): 10.0 for a in range(4)} | {(s, a): -10.0 for s in (12, 32) for a in range(4)}
+    assert rewards(grid()) == pytest.approx(expected, rel=1e-15)
+    drawn = grid(traps=(11, 32), goal=98, goal_reward=1.0, trap_reward=-2.0)
+    assert {s: r for (s, _), r in rewards(drawn).items()} == pytest.approx({98: 1.0, 11: -2.0, 32: -2.0}, rel=1e-15)
+
+
+def test_the_plain_grid_goes_on_after_goal_and_traps():
+    assert torch.all(grid().outcomes.discount_NAK[grid().outcomes.prob_NAK > 0] == 0.9)
+
+
+def test_the_absorbing_grid_ends_when_goal_or_trap_is_left():
+    mdp = grid(absorbing=True)
+    assert rewards(mdp) == rewards(grid())
+    for s in range(100):
+        discounts = {discount for a in range(4) for _, discount in outcomes_of(mdp, s, a)}
+        assert discounts == ({0.0} if s in (12, 32, 99) else {0.9})
+    v_S = exact.evaluate(mdp, uniform_policy(mdp)).v_S
+    assert v_S[[99, 12, 32]].tolist() == pytest.approx([10, -10, -10], rel=1e-14)
+    assert exact.evaluate(grid(), uniform_policy(mdp)).v_S[99] > 10.5
+
+
+def test_a_grid_without_slip_is_worth_the_shortest_path():
+    mdp = grid(4, slip=0.0, traps=(), absorbing=True)
+    assert exact.optimal(mdp).J == pytest.approx(10 * 0.9**6)
+    assert (mdp.shape, mdp.action_names) == ((4, 4), ("left", "right", "up", "down"))
+
+
+# Deep sea
+
+
+class DeepSea:
+    """The game by the rules of bsuite: reward, then column, then row; it ends below the last row."""
+
+    def __init__(self, n: int, right_action: np.ndarray, row: int = 0, column: int = 0) -> None:
+        self.n, self.right_action, self.row, self.column = n, right_action, row, column
+
+    def step(self, action: int, wind: bool = False) -> tuple[float, bool]:
+        goes_right = action == self.right_action[self.row, self.column]
+        reward = 1.0 if goes_right and self.column == self.n - 1 else 0.0
+        if goes_right:
+            reward -= 0.01 / self.n
+            self.column = self.column if wind else min(self.column + 1, self.n - 1)
+        else:
+            self.column = max(self.column - 1, 0)
+        self.row += 1
+        return reward, self.row == self.n
+
+
+def right_actions(mdp: TabularMDP, n: int) -> np.ndarray:
+    """Which action costs something, for each cell."""
+    cost = mdp.outcomes.reward_NA != 0
+    assert torch.all(cost.sum(-1) == 1)
+    return cost.int().argmax(-1).view(n, n).numpy()
+
+
+@pytest.mark.parametrize("stochastic", [False, True])
+@pytest.mark.parametrize("mapping_seed", [None, 0, 1])
+@pytest.mark.parametrize("n", [2, 5])
+def test_deep_sea_follows_the_rules_of_bsuite(n, mapping_seed, stochastic):
+    mdp = deep_sea(n, gamma=0.9, mapping_seed=mapping_seed, stochastic=stochastic)
+    right_action = right_actions(mdp, n) if mapping_seed is not None else np.ones((n, n), dtype=int)
+    for s in range(n * n):
+        for a in range(2):
+            expected, reward = {}, 0.0
+            for wind, p in [(False, 1 - 1 / n), (True, 1 / n)] if stochastic else [(False, 1.0)]:
+                game = DeepSea(n, right_action, *divmod(s, n))
+                reward, ended = game.step(a, wind)
+                key = (min(game.row, n - 1) * n + game.column, 0.0 if ended else 0.9)
+                expected[key] = expected.get(key, 0.0) + p
+            assert outcomes_of(mdp, s, a) == pytest.approx(expected)
+            assert mdp.outcomes.reward_NA[s, a].item() == pytest.approx(reward, abs=1e-15)
+
+
+def test_the_treasure_of_deep_sea_is_worth_its_discount_minus_the_way():
+    n, gamma = 6, 0.95
+    J = gamma ** (n - 1) - 0.01 / n * sum(gamma**k for k in range(n))
+    assert exact.optimal(deep_sea(n, gamma=gamma)).J == pytest.approx(J, rel=1e-12)
+    assert exact.optimal(deep_sea(n, gamma=gamma, mapping_seed=4)).J == pytest.approx(J, rel=1e-12)
+    windy = deep_sea(n, gamma=1.0, stochastic=True)
+    # bsuite: only the last of n moves needs no luck.
+    assert exact.evaluate(windy, always(windy, RIGHT)).J == pytest.approx((1 - 1 / n) ** (n - 1) - 0.01, rel=1e-12)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_the_mapping_seed_of_deep_sea_draws_which_action_is_right():
+    maps = [right_actions(deep_sea(10, mapping_seed=seed), 10) for seed in (0, 0, 1)]
+    assert np.array_equal(maps[0], maps[1])
+    assert not np.array_equal(maps[0], maps[2])
+    assert 25 < maps[0].sum() < 75  # 100 fair coins: wrong with probability 6e-7
+    assert np.all(right_actions(deep_sea(10), 10) == 1)
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ladder(0), "n is 0; it must be at least 1"),
+        (lambda: ladder(gamma=1.5), "gamma is 1.5"),
+        (lambda: ladder(3, start=3), "start state 3 does not exist"),
+        (lambda: random_mdp(0), "num_states is 0"),
+        (lambda: random_mdp(3, 0), "num_actions is 0"),
+        (lambda: random_mdp(3, branching=0), "branching is 0; it must be between 1 and num_states = 3"),
+        (lambda: random_mdp(3, branching=4), "branching is 4"),
+        (lambda: random_mdp(gamma=-0.1), "gamma is -0.1"),
+        (lambda: grid(0), "size is 0"),
+        (lambda: grid(5), "trap 32 is not on the grid; states are 0 to 24"),
+        (lambda: grid(goal=100), "goal 100 is not on the grid"),
+        (lambda: grid(goal=12), "state 12 is both goal and trap"),
+        (lambda: grid(slip=1.5), "slip is 1.5"),
+        (lambda: deep_sea(0), "n is 0"),
+    ],
+)
+def test_a_zoo_mdp_that_cannot_exist_is_refused_with_the_value(make, message):
+    with pytest.raises(PgtsError, match=message):
+        make()

@@ -1,0 +1,118 @@
+"""Outcomes and the one Bellman kernel."""
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes, backup
+from pgts_torch.seeding import stream
+from tests.support import ZOO, mdps, weights, zoo
+
+
+def outcomes_with(*, prob: list[float], discount: list[float], child: list[int], reward: float = 0.0) -> Outcomes:
+    """One state with one action."""
+    return Outcomes(
+        torch.tensor([[reward]], dtype=torch.float64),
+        torch.tensor([[prob]], dtype=torch.float64),
+        torch.tensor([[discount]], dtype=torch.float64),
+        torch.tensor([[child]]),
+        max(child) + 1,
+    )
+
+
+def backup_by_loop(outcomes: Outcomes, v_C: Tensor) -> Tensor:
+    q_NA = outcomes.reward_NA.clone()
+    for n, a, k in itertools.product(*map(range, outcomes.child_NAK.shape)):
+        child = outcomes.child_NAK[n, a, k]
+        q_NA[n, a] += outcomes.prob_NAK[n, a, k] * outcomes.discount_NAK[n, a, k] * v_C[child]
+    return q_NA
+
+
+@given(mdps(), st.integers(0, 1000))
+def test_backup_is_reward_plus_the_discounted_mean_of_the_children(mdp, seed):
+    v_S = torch.randn(mdp.num_states, dtype=torch.float64, generator=stream(seed, "v"))
+    torch.testing.assert_close(backup(mdp.outcomes, v_S), backup_by_loop(mdp.outcomes, v_S), rtol=1e-13, atol=1e-13)
+
+
+def test_backup_of_a_hand_made_row_is_the_sum_on_paper():
+    outcomes = outcomes_with(reward=2.0, prob=[0.5, 0.25, 0.25], discount=[0.9, 0.5, 0.0], child=[1, 0, 2])
+    q = backup(outcomes, torch.tensor([8.0, 10.0, 1e9], dtype=torch.float64))
+    assert q.item() == pytest.approx(2 + 0.5 * 0.9 * 10 + 0.25 * 0.5 * 8, rel=1e-15)
+
+
+def test_nothing_after_a_terminal_outcome_counts():
+    v_C = torch.tensor([1e9, -1e9], dtype=torch.float64)
+    ends = outcomes_with(reward=1.0, prob=[0.5, 0.5], discount=[0.0, 0.0], child=[0, 1])
+    goes_on = outcomes_with(reward=1.0, prob=[1.0, 0.0], discount=[0.9, 0.9], child=[0, 1])
+    assert backup(ends, v_C).item() == 1.0
+    assert backup(goes_on, v_C).item() > 1e8
+
+
+def test_a_successor_that_stands_twice_in_a_row_counts_twice():
+    twice = outcomes_with(prob=[1 / 3, 1 / 3, 1 / 3], discount=[1.0, 1.0, 1.0], child=[0, 0, 1])
+    assert backup(twice, torch.tensor([3.0, 0.0], dtype=torch.float64)).item() == pytest.approx(2.0)
+
+
+def test_backup_leaves_the_rewards_as_they_are():
+    outcomes = zoo("garnet").outcomes
+    before, v_S = outcomes.reward_NA.clone(), torch.ones(30, dtype=torch.float64)
+    first = backup(outcomes, v_S)
+    assert torch.equal(backup(outcomes, v_S), first)
+    assert torch.equal(outcomes.reward_NA, before)
+
+
+def test_backup_carries_no_gradient():
+    v_S = torch.ones(5, dtype=torch.float64, requires_grad=True)
+    assert not backup(zoo("ladder").outcomes, v_S).requires_grad
+
+
+def test_backup_refuses_values_of_another_length():
+    with pytest.raises(RuntimeError, match="size"):
+        backup(zoo("ladder").outcomes, torch.ones(6, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_backup_answers_in_the_dtype_of_the_outcomes(dtype):
+    outcomes = zoo("garnet").outcomes.to(dtype=dtype)
+    q_SA = backup(outcomes, torch.ones(30, dtype=dtype))
+    assert outcomes.dtype == q_SA.dtype == dtype
+    tolerance = 1e-6 if dtype == torch.float32 else 1e-15
+    torch.testing.assert_close(q_SA.double(), zoo("garnet").outcomes.reward_NA + 0.9, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", [name for name in ZOO if name != "Taxi"])
+def test_the_weight_matrix_holds_p_times_gamma(name):
+    mdp = zoo(name)
+    dense = torch.from_numpy(weights(mdp)).flatten(0, 1)
+    torch.testing.assert_close(mdp.outcomes.weight.to_dense(), dense, rtol=1e-15, atol=1e-15)
+
+
+def test_the_weight_matrix_has_narrow_indices():
+    weight = zoo("garnet").outcomes.weight
+    assert weight.crow_indices().dtype == weight.col_indices().dtype == torch.int32
+
+
+def test_rows_are_the_asked_for_states_in_the_order_asked_for():
+    outcomes, v_S = zoo("garnet").outcomes, torch.arange(30, dtype=torch.float64)
+    row_N = torch.tensor([7, 3, 7, 0])
+    picked = outcomes.rows(row_N)
+    assert (picked.num_states, picked.num_actions, picked.num_outcomes, picked.num_children) == (4, 3, 4, 30)
+    assert torch.equal(backup(picked, v_S), backup(outcomes, v_S)[row_N])
+    assert not torch.equal(backup(outcomes.rows(row_N.sort().values), v_S), backup(picked, v_S))
+
+
+def test_one_discount_for_all_outcomes_takes_no_memory():
+    assert zoo("garnet").outcomes.discount_NAK.untyped_storage().nbytes() == 8
+
+
+def test_the_tests_check_the_shapes_that_signatures_promise():
+    row = outcomes_with(prob=[1.0], discount=[1.0], child=[0])
+    with pytest.raises(TypeCheckError):
+        Outcomes(row.reward_NA, row.prob_NAK.repeat(2, 1, 1), row.discount_NAK, row.child_NAK, 1)
+    with pytest.raises(TypeCheckError):
+        backup(row, torch.ones(1, 1, dtype=torch.float64))
