@@ -10,6 +10,8 @@ import jaxtyping
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function`, its array shapes checked by beartype. All other types are mypy's to check, and stay free here."""
     hints = getattr(function, "__annotations__", {})
+    if not any(map(_has_shape, hints.values())):
+        return function
     function.__annotations__ = {name: hint if _has_shape(hint) else Any for name, hint in hints.items()}
     return beartype.beartype(function)
 

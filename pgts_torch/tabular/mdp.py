@@ -1,7 +1,10 @@
 """Finite Markov decision processes, validated when they are made."""
 
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import gymnasium
@@ -164,6 +167,57 @@ class TabularMDP:
         shape = getattr(unwrapped, "shape", (int(rows), int(columns)))
         return cls.from_transitions(table, gamma, start=start, shape=shape)
 
+    def save_npz(self, path: str | Path) -> None:
+        """Write the MDP as `load_npz` reads it, without names and shape of the picture.
+
+        Raises:
+            PgtsError: the outcomes have several discounts (some end an episode, for instance), or the file cannot be
+                written.
+        """
+        outcomes = self.outcomes
+        happens_SAK = outcomes.prob_NAK > 0
+        gamma = float(outcomes.discount_NAK[happens_SAK][0])
+        other = happens_SAK & (outcomes.discount_NAK != gamma)
+        _refuse(
+            other.any(-1),
+            lambda s, a: (
+                f"outcomes of ({s}, {a}) have discounts {outcomes.discount_NAK[s, a].tolist()}, others {gamma}; an npz "
+                f"file holds one gamma: let an end lead to a state that earns 0 for ever"
+            ),
+        )
+        P_SAS = torch.zeros(self.num_states, self.num_actions, self.num_states, dtype=torch.float64)
+        P_SAS.scatter_add_(-1, outcomes.child_NAK, outcomes.prob_NAK)
+        try:
+            with open(path, "wb") as file:  # numpy would append .npz to a path without it
+                np.savez_compressed(
+                    file, P=P_SAS.numpy(), R=outcomes.reward_NA.numpy(), gamma=gamma, start=self.start_S.numpy()
+                )
+        except OSError as error:
+            raise PgtsError(f"{path}: cannot be written: {error.strerror}") from error
+
+    @classmethod
+    def load_npz(cls, path: str | Path) -> Self:
+        """An MDP from the arrays in a file that `numpy.savez` wrote.
+
+        P: [S, A, S], P[s, a] the distribution over next states.   R: [S, A], expected rewards.
+        gamma: one number in [0, 1].   start (may be missing: uniform): a state, or a distribution [S].
+
+        An end is written as a state that leads to itself and earns 0.
+
+        Raises:
+            PgtsError: the file cannot be read, holds pickled objects, lacks an array or holds an unknown one, or the
+                arrays make no MDP; the message names the file, the array, the index and the value.
+        """
+        arrays = _read_npz(path)
+        try:
+            gamma = _single_number("gamma", arrays["gamma"])
+            start = arrays.get("start")
+            if start is not None and start.ndim == 0:
+                start = _single_state(start)
+            return cls.from_dense(arrays["P"], arrays["R"], gamma, start=start)
+        except PgtsError as error:
+            raise PgtsError(f"{path}: {_in_words_of_the_file(str(error))}") from error
+
 
 def start_distribution(start: int | ArrayLike | None, num_states: int) -> Float[Tensor, "S"]:
     """mu as a vector: one state, a given distribution, or None for the uniform one."""
@@ -176,6 +230,61 @@ def start_distribution(start: int | ArrayLike | None, num_states: int) -> Float[
     return torch.from_numpy(np.array(start, dtype=np.float64))
 
 
+_NPZ_ARRAYS = ("P", "R", "gamma", "start")
+
+
+def _read_npz(path: str | Path) -> dict[str, np.ndarray]:
+    """The arrays of an MDP in a file, known by name and numbers; anything else is refused."""
+    try:
+        if Path(path).stat() and not zipfile.is_zipfile(path):
+            raise PgtsError(f"{path}: is not an npz file (numpy.savez writes one)")
+        with np.load(path, allow_pickle=False) as file:
+            _check_names(path, file.files)
+            arrays = {name: _read_array(path, file, name) for name in file.files}
+    except OSError as error:
+        raise PgtsError(f"{path}: cannot be read: {error.strerror or error}") from error
+    for name, array in arrays.items():
+        if array.dtype.kind not in "biuf":
+            raise PgtsError(f"{path}: {name} is of type {array.dtype}; it must hold real numbers")
+    return arrays
+
+
+def _check_names(path: str | Path, names: Sequence[str]) -> None:
+    for name in names:
+        if name not in _NPZ_ARRAYS:
+            raise PgtsError(f"{path}: array {name!r} is unknown; the arrays are P, R, gamma and start")
+    for name in _NPZ_ARRAYS[:3]:
+        if name not in names:
+            raise PgtsError(f"{path}: array {name!r} is missing; it holds {', '.join(names) or 'none'}")
+
+
+def _read_array(path: str | Path, file: Any, name: str) -> np.ndarray:
+    # A damaged member is found by the zip, by its compression or by numpy, each with errors of its own.
+    try:
+        return np.asarray(file[name])
+    except (ValueError, KeyError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+        raise PgtsError(f"{path}: array {name!r} cannot be read: {str(error).splitlines()[0]}") from error
+
+
+def _single_number(name: str, array: np.ndarray) -> float:
+    if array.ndim != 0:
+        raise PgtsError(f"{name} has shape {array.shape}; it must be a single number")
+    return float(array)
+
+
+def _single_state(array: np.ndarray) -> int:
+    if array.dtype.kind not in "iu":
+        raise PgtsError(f"start is {array}; a single state must be a whole number")
+    return int(array)
+
+
+def _in_words_of_the_file(message: str) -> str:
+    """A message about an MDP with the names that the arrays have in a file."""
+    for name, in_file in [("P_SAS", "P"), ("R_SA", "R"), ("start_S", "start")]:
+        message = message.replace(name, in_file)
+    return message
+
+
 def check_gamma(gamma: float) -> None:
     """Raise PgtsError unless gamma is in [0, 1]."""
     if not 0 <= gamma <= 1:
@@ -186,16 +295,21 @@ def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> tuple[float, di
     """Expected reward and the probability of each (next state, terminated) that (s, a) may lead to."""
     if len(P[s]) != A:
         raise PgtsError(f"P[{s}] has {len(P[s])} actions; P[0] has {A}")
-    expected_reward, successors = 0.0, dict[tuple[int, bool], float]()
+    successors = dict[tuple[int, bool], float]()
+    # Counted from the first reward, so that equal rewards have exactly this mean.
+    first_reward = float(P[s][a][0][2]) if len(P[s][a]) else 0.0
+    expected_reward = first_reward
     for p, next_state, reward, terminated in P[s][a]:
         if not 0 <= next_state < S:
             raise PgtsError(f"P[{s}][{a}] leads to state {next_state}; states are 0 to {S - 1}")
         if p < 0 or not np.isfinite(p):
             raise PgtsError(f"P[{s}][{a}] has probability {p}; probabilities are finite and at least 0")
+        if not np.isfinite(reward):
+            raise PgtsError(f"P[{s}][{a}] has reward {reward}; rewards must be finite")
         if p > 0:
             key = (int(next_state), bool(terminated))
             successors[key] = successors.get(key, 0.0) + float(p)
-            expected_reward += float(p) * float(reward)
+            expected_reward += float(p) * (float(reward) - first_reward)
     if not successors:
         raise PgtsError(f"P[{s}][{a}] has no outcome with positive probability")
     return expected_reward, successors

@@ -119,14 +119,16 @@ def grid(
         raise PgtsError(f"slip is {slip}; it must be in [0, 1]")
     reward = {goal: goal_reward} | dict.fromkeys(traps, trap_reward)
 
-    def transitions(s: int, intended: int) -> list[Transition]:
-        r, ends = reward.get(s, 0.0), absorbing and s in reward
-        return [
-            (slip / 4 + (1 - slip) * (a == intended), next_state, r, ends)
-            for a, next_state in enumerate(_neighbours(s, size))
+    P = [
+        [
+            [
+                (slip / 4 + (1 - slip) * (a == intended), next_state, reward.get(s, 0.0), absorbing and s in reward)
+                for a, next_state in enumerate(_neighbours(s, size))
+            ]
+            for intended in range(4)
         ]
-
-    P = [[transitions(s, a) for a in range(4)] for s in range(size * size)]
+        for s in range(size * size)
+    ]
     return TabularMDP.from_transitions(
         P, gamma, start=start, action_names=("left", "right", "up", "down"), shape=(size, size)
     )
@@ -144,7 +146,9 @@ def deep_sea(
     """An n x n sea; each step sinks one row, left or right; the treasure (1) lies at the bottom right.
     [Osband et al., bsuite, 2020]
 
-    Going right costs move_cost / n, so only the one path that goes right n times pays. The episode ends after n steps.
+    Going right costs move_cost / n, so from state 0 only the one path that goes right n times pays. The episode ends
+    after n steps. As in bsuite the treasure is paid for going right in the last column, of which a start in state 0
+    reaches the lowest cell only.
 
     Args:
         mapping_seed: which of the two actions is 'right' is drawn for each cell; None: action 1 everywhere.
@@ -155,26 +159,24 @@ def deep_sea(
     if mapping_seed is not None:
         right_action = numpy_stream(mapping_seed, "deep_sea").integers(0, 2, size=(n, n))
 
-    def transitions(row: int, column: int, goes_right: bool) -> list[Transition]:
-        ends = row == n - 1
-        next_row = row if ends else row + 1
-
-        def to(next_column: int) -> int:
-            return n * next_row + min(max(next_column, 0), n - 1)
-
-        if not goes_right:
-            return [(1.0, to(column - 1), 0.0, ends)]
-        reward = float(column == n - 1) - move_cost / n
-        fails = 1 / n if stochastic else 0.0
-        return [(1 - fails, to(column + 1), reward, ends), (fails, to(column), reward, ends)]
-
+    fails = 1 / n if stochastic else 0.0
     P = [
-        [transitions(row, column, a == right_action[row, column]) for a in range(2)]
+        [_sink(n, row, column, a == right_action[row, column], move_cost / n, fails) for a in range(2)]
         for row in range(n)
         for column in range(n)
     ]
     names = ("left", "right") if mapping_seed is None else ("0", "1")
     return TabularMDP.from_transitions(P, gamma, start=start, action_names=names, shape=(n, n))
+
+
+def _sink(n: int, row: int, column: int, goes_right: bool, cost: float, fails: float) -> list[Transition]:
+    """What may follow in one cell of the deep sea."""
+    ends = row == n - 1
+    first = n * (row if ends else row + 1)
+    if not goes_right:
+        return [(1.0, first + max(column - 1, 0), 0.0, ends)]
+    reward = float(column == n - 1) - cost
+    return [(1 - fails, first + min(column + 1, n - 1), reward, ends), (fails, first + column, reward, ends)]
 
 
 def _neighbours(s: int, size: int) -> tuple[int, int, int, int]:

@@ -348,7 +348,7 @@ def test_dense_arrays_of_wrong_shape_are_refused(P_shape, R_shape, message):
         ([], r"P\[1\]\[0\] has no outcome"),
         ([(0.0, 0, 0.0, False)], r"P\[1\]\[0\] has no outcome"),
         ([(0.9, 0, 0.0, False)], r"P_SAS\[1, 0\] is not a distribution: it sums to 0.9"),
-        ([(1.0, 0, float("inf"), False)], r"R_SA\[1, 0\] is inf"),
+        ([(1.0, 0, float("inf"), False)], r"P\[1\]\[0\] has reward inf"),
     ],
 )
 def test_bad_transitions_are_refused_with_their_state_and_action(row, message):
