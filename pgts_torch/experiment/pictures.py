@@ -35,7 +35,7 @@ def policy_picture(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], *, title: str =
 
 def _draw_values(axes: Axes, mdp: TabularMDP, v_S: Tensor, visited_S: Tensor) -> None:
     rows, columns = mdp.shape
-    image = axes.imshow(v_S.view(rows, columns), cmap="viridis", aspect="auto" if columns > 3 * rows else "equal")
+    image = axes.imshow(v_S.view(rows, columns).numpy(), cmap="viridis", aspect="auto" if columns > 3 * rows else "equal")
     axes.figure.colorbar(image, ax=axes, label="reward units")
     _draw_marks(axes, mdp)
     if mdp.num_states <= 100:
@@ -84,7 +84,7 @@ def _draw_arrows(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, visited_S: Tensor) 
 
 
 def _draw_columns(axes: Axes, mdp: TabularMDP, pi_SA: Tensor) -> None:
-    image = axes.imshow(pi_SA.T, cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+    image = axes.imshow(pi_SA.T.numpy(), cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     axes.figure.colorbar(image, ax=axes, label="probability")
     axes.set_yticks(range(mdp.num_actions), mdp.action_names)
     axes.set_xlabel("state")

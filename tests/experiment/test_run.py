@@ -1,0 +1,191 @@
+"""The run loop, the folder it leaves, and the numbers in it."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment import diagnostics, evaluate, run
+from pgts_torch.experiment.config import Config
+from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.tracking import RunFolder, read_metrics
+from pgts_torch.tabular import exact, stationary
+from pgts_torch.tabular.ascent import mirror_step
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+TAGS = {
+    "charts/episodic_return",
+    "charts/discounted_return",
+    "charts/episodic_length",
+    "charts/SPS",
+    "losses/entropy",
+    "losses/value",
+    "search/depth",
+    "search/nodes",
+    "search/model_calls",
+    "search/stationarity_gap",
+    "exact/J",
+    "exact/optimality_gap",
+    "exact/lookahead_error",
+}
+
+
+def few_iterations(folder: Path, *arguments: str, config: Path = ROOT / "configs" / "ladder.yaml") -> Config:
+    """A shipped configuration, cut down to about three iterations of four episodes."""
+    steps = ["--total_steps", "150", "--rollout.num_envs", "4", "--rollout.horizon.length", "15"]
+    return load(str(config), [*steps, "--run.dir", str(folder / "run"), *arguments])
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
+def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(config, tmp_path):
+    summary = run.train(few_iterations(tmp_path, config=config))
+    folder = tmp_path / "run"
+    lines = read_metrics(folder)
+    assert len(lines) == summary.iterations >= 2
+    for line in lines:
+        assert set(line) >= TAGS | {"step"}
+        assert all(math.isfinite(value) for value in line.values())
+    assert lines[-1]["step"] == summary.env_steps >= 150
+    assert load(str(folder / "config.yaml")) == few_iterations(tmp_path, config=config)
+    assert json.loads((folder / "versions.json").read_text())["torch"] == torch.__version__
+    assert json.loads((folder / "summary.json").read_text())["J"] == summary.J
+    assert (folder / "policy.png").read_bytes().startswith(b"\x89PNG")
+    events = EventAccumulator(str(folder)).Reload()
+    assert set(events.Tags()["scalars"]) >= TAGS
+    assert [event.step for event in events.Scalars("exact/J")] == [line["step"] for line in lines]
+    assert events.Tags()["images"] == ["policy"]
+
+
+def test_the_metrics_of_a_line_are_those_of_the_policy_that_made_its_episodes(tmp_path):
+    config = few_iterations(tmp_path)
+    algorithm = run.build(config)
+    truth = diagnostics.Truth(algorithm)
+    algorithm.iterate()  # so that the critic knows something
+    pi_SA = algorithm.policy.table()
+    iteration = algorithm.iterate()
+    tags = diagnostics.metrics(algorithm, iteration) | truth.metrics(pi_SA, iteration)
+    evaluation = exact.evaluate(algorithm.mdp, pi_SA)
+    look_SA = exact.lookahead(algorithm.mdp, evaluation.q_SA, 4)
+    assert tags["exact/J"] == evaluation.J
+    assert tags["exact/optimality_gap"] == pytest.approx(6.561 - evaluation.J)
+    error = (iteration.look.q_BA - look_SA[iteration.state_N]).abs().max()
+    assert tags["exact/lookahead_error"] == float(error) > 0
+    assert tags["charts/discounted_return"] == float(iteration.experience.returns().mean())
+    assert tags["exact/J"] != exact.evaluate(algorithm.mdp, algorithm.policy.table()).J
+
+
+@pytest.mark.parametrize("update", ["softmax", "mirror"])
+def test_with_the_exact_critic_the_lookahead_has_no_error_and_the_direction_is_nearly_exact(update, tmp_path):
+    config = few_iterations(tmp_path, "--critic", "{type: exact}", "--update.type", update, "--rollout.num_envs", "400")
+    algorithm = run.build(config)
+    truth = diagnostics.Truth(algorithm)
+    pi_SA = algorithm.policy.table()
+    tags = truth.metrics(pi_SA, algorithm.iterate())
+    assert tags["exact/lookahead_error"] < 1e-12
+    assert 0.99 < tags["exact/gradient_cosine"] <= 1 + 1e-12
+
+
+def test_a_direction_of_zero_has_no_cosine():
+    left = {"type": "softmax", "init": {"type": "biased", "action": 0, "probability": 0.9999}}
+    algorithm = PGTS("pgts/Ladder-v0", depth=0, policy=left, num_envs=2, seed=0)
+    truth = diagnostics.Truth(algorithm)
+    pi_SA = algorithm.policy.table()
+    assert "exact/gradient_cosine" not in truth.metrics(pi_SA, algorithm.iterate())
+
+
+def test_what_is_logged_and_evaluated_does_not_change_what_is_learned(tmp_path):
+    quiet = few_iterations(tmp_path, "--log.every", "1000", "--run.tensorboard", "false")
+    loud = few_iterations(tmp_path, "--eval.every", "1", "--log.checkpoint_every", "1", "--run.overwrite")
+    run.train(quiet)
+    silent = PGTS.load(run.last_checkpoint(tmp_path / "run")).policy.table()
+    run.train(loud)
+    watched = PGTS.load(run.last_checkpoint(tmp_path / "run")).policy.table()
+    assert torch.equal(silent, watched)
+    assert len(list((tmp_path / "run" / "checkpoints").iterdir())) >= 2
+    assert any("eval/deterministic_return" in line for line in read_metrics(tmp_path / "run"))
+
+
+def test_nothing_shipped_learns_from_exact_values(tmp_path):
+    for path in CONFIGS:
+        assert load(str(path)).critic.type == "tabular"
+
+
+def test_the_exact_critic_says_that_it_is_for_validation(tmp_path, capsys):
+    run.train(few_iterations(tmp_path, "--critic", "{type: exact}"))
+    assert "for validation" in capsys.readouterr().err
+
+
+def test_a_folder_that_holds_something_is_left_as_it_is(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "thesis.txt").write_text("mine")
+    for arguments in ([], ["--run.overwrite"]):
+        with pytest.raises(PgtsError, match="holds files that no run has left"):
+            run.train(few_iterations(tmp_path, *arguments))
+    assert [path.name for path in folder.iterdir()] == ["thesis.txt"]
+
+
+def test_an_earlier_run_is_replaced_only_when_asked(tmp_path):
+    run.train(few_iterations(tmp_path))
+    before = (tmp_path / "run" / "metrics.jsonl").read_bytes()
+    with pytest.raises(PgtsError, match=r"set run\.overwrite"):
+        run.train(few_iterations(tmp_path, "--seed", "1"))
+    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == before
+    run.train(few_iterations(tmp_path, "--seed", "1", "--run.overwrite"))
+    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() != before
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--env.id", "pgts/Nowhere-v0"], ["--env.id", "CartPole-v1", "--env.kwargs", "{}"]]
+)
+def test_what_cannot_be_built_leaves_nothing_behind(arguments, tmp_path):
+    with pytest.raises(PgtsError):
+        run.train(few_iterations(tmp_path, *arguments))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_summary_states_exact_numbers(tmp_path):
+    summary = run.train(few_iterations(tmp_path))
+    algorithm = PGTS.load(run.last_checkpoint(tmp_path / "run"))
+    pi_SA = algorithm.policy.table()
+    assert summary.J == exact.evaluate(algorithm.mdp, pi_SA).J
+    assert summary.stationarity_gap == float(stationary.gap(algorithm.mdp, pi_SA, 4).max())
+    assert all(len(line) <= 80 for line in run.describe(summary).splitlines()[:-1])
+
+
+def test_evaluation_runs_the_greedy_and_the_sampled_policy_to_the_time_limit():
+    algorithm = PGTS("pgts/Ladder-v0", depth=4, policy={"type": "softmax", "init": {"type": "uniform"}}, seed=0)
+    algorithm.policy.load_state_dict({"logits_SA": mirror_step(*always_right(), 1.0).log()})
+    greedy = evaluate.evaluate(algorithm, episodes=3, deterministic=True, seed=0)
+    assert (greedy.episodic_return.mean, greedy.episodic_length.mean) == (96.0, 100.0)
+    assert greedy.discounted_return.mean == pytest.approx((0.9**4 - 0.9**100) / 0.1)
+    assert greedy.episodic_return.half_width == 0
+    sampled = evaluate.evaluate(algorithm, episodes=200, deterministic=False, seed=0)
+    truth = exact.evaluate(algorithm.mdp, algorithm.policy.table()).J
+    # 95 % interval, twice as wide: error probability below 1e-3. J beyond step 100 is below 1e-4.
+    assert abs(sampled.discounted_return.mean - truth) < 2 * sampled.discounted_return.half_width + 1e-4
+    assert sampled.discounted_return.mean < greedy.discounted_return.mean
+
+
+def test_one_episode_has_no_confidence_interval():
+    algorithm = PGTS("pgts/Ladder-v0", seed=0)
+    assert evaluate.evaluate(algorithm, episodes=1, deterministic=True, seed=0).episodic_return.half_width is None
+
+
+def test_a_value_that_is_not_finite_is_written_as_null(tmp_path):
+    with RunFolder(tmp_path / "run", tensorboard=False) as folder:
+        folder.log(3, {"losses/value": math.nan})
+    assert read_metrics(tmp_path / "run") == [{"step": 3, "losses/value": None}]
+
+
+def always_right() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Arguments of a mirror step from the uniform policy that end at 95 % right in every state."""
+    pi_SA = torch.full((5, 2), 0.5, dtype=torch.float64)
+    q_SA = torch.tensor([0.0, math.log(19)], dtype=torch.float64).expand(5, 2)
+    return pi_SA, q_SA, torch.ones(5, dtype=torch.float64)
