@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.policies import Policy, fitting
-from pgts_torch.agent.rollout import GeometricHorizon, Horizon, Rollout, simulate
+from pgts_torch.agent.rollout import GeometricHorizon, Horizon, Rollout, simulated_returns
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.tabular import exact
@@ -231,7 +231,7 @@ class RolloutCritic(Critic):
 
     def _mean_return(self, state_N: Tensor, action_N: Tensor | None) -> Tensor:
         policy, generator = _fitted(self._following)
-        episodes = simulate(
+        returns_B, num_steps = simulated_returns(
             self.model,
             policy,
             state_N.repeat(self.samples),
@@ -239,8 +239,8 @@ class RolloutCritic(Critic):
             first_action_B=None if action_N is None else action_N.repeat(self.samples),
             generator=generator,
         )
-        self._model_calls += episodes.num_steps
-        return episodes.returns().view(self.samples, -1).mean(0)
+        self._model_calls += num_steps
+        return returns_B.view(self.samples, -1).mean(0)
 
 
 def lambda_returns(

@@ -1,9 +1,10 @@
 """Policy gradient with tree search, from rollouts.        [PGTS Alg. 1]"""
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, final
+from typing import Any, Literal, Self, final
 
 import numpy as np
 import torch
@@ -21,13 +22,16 @@ from pgts_torch.agent.rollout import Horizon, Rollout, check_vector_env, make_ve
 from pgts_torch.agent.updates import Update
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.tabular import TabularModel, tabular_truth
-from pgts_torch.search.expectimax import MAX_NODES, Lookahead, expectimax
+from pgts_torch.search.expectimax import MAX_NODES, Leaf, Lookahead, expectimax
 from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import stream
 from pgts_torch.tabular.exact import check_depth
 
 DEFAULT_GAMMA = 0.99
 """Discount of an environment that carries none."""
+
+DEFAULT_MAX_DEPTH = 64
+DEFAULT_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +41,11 @@ class Iteration:
     experience: the episodes of pi_k.
     state_N, weight_N: the states it visited, and what each counted for in the update.
     pi_NA: pi_k at these states, before the update.
+    depth: m.
     look: (T^m Q)(s, .) at these states.
-    gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, as far as the critic knows v.
+    gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, with v(s) = <pi(.|s), Q(s, .)> of the same critic.
+    certificate: an upper bound on J* - J^pi; true if the critic is exact, else as far as its v is right at the start
+        states. Infinite where the model knows no largest value.
     losses: the critic's, by name.
     model_calls: (state, action) asked of the model in this pass, by the lookahead and by the critic.
     """
@@ -47,8 +54,10 @@ class Iteration:
     state_N: Int[Tensor, "N"]
     weight_N: Float[Tensor, "N"]
     pi_NA: Float[Tensor, "N A"]
+    depth: int
     look: Lookahead
     gap_N: Float[Tensor, "N"]
+    certificate: float
     losses: dict[str, float]
     model_calls: int
 
@@ -69,7 +78,12 @@ class PGTS:
     Args:
         env: a Gymnasium id with a tabular model behind it (pgts/*, or an environment with a P table), or copies of one
             as a VectorEnv that resets by mask.
-        depth: m. 0 is plain policy gradient.
+        depth: m. 0 is plain policy gradient. "adaptive": in each iteration the smallest m at which the policy is far
+            from stationary, because then it deserves no deeper look: sum_s d(s) g_m(s) > tolerance * certificate.
+        max_depth: the largest m of an adaptive depth (default 64).
+        tolerance: which share of what may be missing to J* a lookahead must see to be deep enough (default 0.1).
+        stop_at: `learn` ends, with the policy in question, once the certificate proves J* - J^pi <= stop_at.
+            Default: never.
         policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax",
             {"type": "tabular", "target": "q"}, ...
         num_envs: episodes in each iteration.
@@ -88,7 +102,10 @@ class PGTS:
         self,
         env: str | VectorEnv,
         *,
-        depth: int = 4,
+        depth: int | Literal["adaptive"] = 4,
+        max_depth: int | None = None,
+        tolerance: float | None = None,
+        stop_at: float | None = None,
         policy: Description | Policy = "softmax",
         critic: Description | Critic = "tabular",
         update: Description | Update | None = None,
@@ -101,7 +118,11 @@ class PGTS:
         env_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
         self._arguments = {name: value for name, value in locals().items() if name != "self"}
-        self.depth = check_depth(depth)
+        self.depths = _depths(depth, max_depth, tolerance)
+        self.tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
+        if stop_at is not None and not 0 <= stop_at < math.inf:
+            raise PgtsError(f"stop_at is {stop_at}; it must be finite and at least 0")
+        self.stop_at = stop_at
         self.seed = seed
         self.max_nodes = max_nodes
         self.device = torch.device(device)
@@ -155,18 +176,30 @@ class PGTS:
 
         # Look m steps ahead from the states with d(s) > 0.
         states, weight_N = experience.visits(self.update.state_weight)
-        look = self.lookahead(states)
-
-        # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3).
         pi_NA = self.policy.probs(states)
-        gap_N = (look.q_BA.amax(-1) - self.critic.v(states)).clamp(min=0)
-        self.update(self.policy, states, look.q_BA, weight_N)
+        depth, look, gap_N, certificate = self._look(experience, states, pi_NA)
+
+        # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is proved good enough.
+        if not self._proved(certificate):
+            self.update(self.policy, states, look.q_BA, weight_N)
 
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
         model_calls = self.topology.model_calls + self.critic.model_calls - calls_before
         self.num_model_calls += model_calls
-        return Iteration(experience, states, weight_N, pi_NA, look, gap_N, losses, model_calls)
+        return Iteration(experience, states, weight_N, pi_NA, depth, look, gap_N, certificate, losses, model_calls)
+
+    def _look(self, experience: Rollout, state_N: Tensor, pi_NA: Tensor) -> tuple[int, Lookahead, Tensor, float]:
+        """The lookahead at the given depth, or at the first that sees enough, with its gap and certificate."""
+        v_N = (pi_NA * self.lookahead(state_N, depth=0).q_BA).sum(-1)
+        _, occupancy_N = experience.visits("occupancy")
+        for depth in self.depths:
+            look = self.lookahead(state_N, depth=depth)
+            gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
+            certificate = self._certificate(experience, state_N, v_N, depth)
+            if float(gap_N @ occupancy_N) > self.tolerance * certificate or self._proved(certificate):
+                break
+        return depth, look, gap_N, certificate
 
     @property
     def env_id(self) -> str:
@@ -181,19 +214,33 @@ class PGTS:
         kwargs = self._arguments["env_kwargs"] or {}
         return make_vector_env(self.env_id, num_envs, gamma=self._arguments["gamma"], **kwargs)
 
-    def lookahead(self, state_N: Int[Tensor, "N"]) -> Lookahead:
-        """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves."""
-        v_leaf = self.critic.v if self.critic.target == "v" else None
-        q_leaf = self.critic.q if self.critic.target == "q" else None
-        return expectimax(
-            self.model,
-            state_N,
-            depth=self.depth,
-            q_leaf=q_leaf,
-            v_leaf=v_leaf,
-            topology=self.topology,
-            max_nodes=self.max_nodes,
-        )
+    def lookahead(self, state_N: Int[Tensor, "N"], *, depth: int | None = None) -> Lookahead:
+        """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves.
+
+        Args:
+            depth: m; default the depth of the training, or its largest if it is adaptive.
+        """
+        depth = self.depths[-1] if depth is None else depth
+        leaf = {"v_leaf": self.critic.v} if self.critic.target == "v" else {"q_leaf": self.critic.q}
+        return self._search(state_N, depth, **leaf)
+
+    def _search(self, state_N: Int[Tensor, "N"], depth: int, **leaf: Leaf) -> Lookahead:
+        return expectimax(self.model, state_N, depth=depth, topology=self.topology, max_nodes=self.max_nodes, **leaf)
+
+    def _certificate(self, experience: Rollout, state_N: Tensor, v_N: Tensor, depth: int) -> float:
+        """J* - J^pi <= mean over starts of (T^n w)(s) - v(s), for w the highest value there can be; n is the number of
+        levels that the lookahead has itself, so the model is asked nothing new.        [docs/theory.md, Prop. 5]"""
+        starts, count_N = experience.state_TB[0].unique(return_counts=True)
+        highest = torch.tensor(self.model.highest_value, dtype=torch.float64, device=self.device)
+        upper_N = highest.expand(len(starts))
+        expansions = depth + (self.critic.target == "v")
+        if expansions and bool(highest.isfinite()):
+            upper_N = self._search(starts, expansions - 1, v_leaf=lambda s: highest.expand(len(s))).q_BA.amax(-1)
+        missing_N = upper_N - v_N[torch.searchsorted(state_N, starts)]
+        return max(0.0, float(missing_N @ count_N.double() / experience.num_episodes))
+
+    def _proved(self, certificate: float) -> bool:
+        return self.stop_at is not None and certificate <= self.stop_at
 
     def learn(self, total_steps: int, *, callback: Callback | None = None, progress: bool = False) -> Self:
         """Iterate until `total_steps` environment steps have been made in all, counting those before this call.
@@ -206,7 +253,7 @@ class PGTS:
             while self.num_env_steps < total_steps:
                 iteration = self.iterate()
                 bar.update(iteration.experience.num_steps)
-                if callback is not None and callback(self, iteration) is False:
+                if (callback is not None and callback(self, iteration) is False) or self._proved(iteration.certificate):
                     break
         return self
 
@@ -284,3 +331,15 @@ class PGTS:
         self.num_iterations = state["num_iterations"]
         self.num_env_steps = state["num_env_steps"]
         self.num_model_calls = state["num_model_calls"]
+
+
+def _depths(depth: int | Literal["adaptive"], max_depth: int | None, tolerance: float | None) -> Sequence[int]:
+    """The depths that an iteration tries, in order; PgtsError where an argument is out of range or has no effect."""
+    if depth != "adaptive":
+        for name, value in (("max_depth", max_depth), ("tolerance", tolerance)):
+            if value is not None:
+                raise PgtsError(f"{name} is {value}, which only depth='adaptive' heeds; depth is {depth}")
+        return (check_depth(depth),)
+    if tolerance is not None and not 0 <= tolerance < math.inf:
+        raise PgtsError(f"tolerance is {tolerance}; it must be finite and at least 0")
+    return range(check_depth(DEFAULT_MAX_DEPTH if max_depth is None else max_depth) + 1)

@@ -1,8 +1,7 @@
 """Experience: what a policy does in an environment, or in a model of it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, final
+from typing import Any, Literal, final
 
 import gymnasium
 import numpy as np
@@ -30,6 +29,18 @@ class FixedHorizon:
         if self.length < 1:
             raise PgtsError(f"horizon length is {self.length}; it must be at least 1")
 
+    @property
+    def limit(self) -> int:
+        """The most steps of an episode."""
+        return self.length
+
+    def survival(self, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
+        """What one unit of weight is worth after a step of this discount: the discount."""
+        return discount_B.double()
+
+    def check_end(self, num_alive: int) -> None:
+        """Episodes may be alive at the limit."""
+
 
 @final
 @dataclass(frozen=True)
@@ -45,6 +56,23 @@ class GeometricHorizon:
     def __post_init__(self) -> None:
         if self.max_length < 1:
             raise PgtsError(f"max_length is {self.max_length}; it must be at least 1")
+
+    @property
+    def limit(self) -> int:
+        """The most steps of an episode."""
+        return self.max_length
+
+    def survival(self, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
+        """What one unit of weight is worth after a step of this discount: 1 with that probability, else 0."""
+        uniform_B = torch.rand(discount_B.shape, generator=generator, dtype=torch.float64, device=discount_B.device)
+        return (uniform_B < discount_B).double()
+
+    def check_end(self, num_alive: int) -> None:
+        """PgtsError if episodes are alive at the limit."""
+        if num_alive:
+            raise PgtsError(
+                f"an episode outlived max_length = {self.max_length} steps of the geometric horizon; is gamma 1?"
+            )
 
 
 Horizon = FixedHorizon | GeometricHorizon
@@ -105,52 +133,6 @@ class Rollout:
         return states, weight_N.index_add_(0, row_V, count_V)
 
 
-class Step(Protocol):
-    """One step of all B copies. Copies that are not alive may be stepped or not: their answers are not read."""
-
-    def __call__(self, state_B: Tensor, action_B: Tensor, alive_B: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Rewards, discounts, next states, and whether the copy was truncated."""
-
-
-def unroll(
-    state_B: Int[Tensor, "B"],
-    act: Callable[[Tensor], Tensor],
-    step: Step,
-    horizon: Horizon,
-    *,
-    generator: torch.Generator,
-) -> Rollout:
-    """B episodes from `state_B`, all acting and stepping together.
-
-    Args:
-        act: actions for states [B].
-        step: the environment or model.
-        generator: draws the geometric horizon; unused by the fixed one.
-
-    Raises:
-        PgtsError: an episode outlived `max_length` of the geometric horizon.
-    """
-    rows: list[tuple[Tensor, ...]] = []
-    alive_B = torch.ones(len(state_B), dtype=torch.bool, device=state_B.device)
-    weight_B = torch.ones(len(state_B), dtype=torch.float64, device=state_B.device)
-    limit = horizon.length if isinstance(horizon, FixedHorizon) else horizon.max_length
-    while len(rows) < limit and bool(alive_B.any()):
-        action_B = act(state_B)
-        reward_B, discount_B, next_B, truncated_B = step(state_B, action_B, alive_B)
-        if isinstance(horizon, FixedHorizon):
-            survival_B = discount_B
-        else:
-            uniform_B = torch.rand(len(state_B), generator=generator, dtype=torch.float64, device=state_B.device)
-            survival_B = (uniform_B < discount_B).double()
-        rows.append((state_B, action_B, reward_B, discount_B, next_B, alive_B, weight_B * alive_B, survival_B))
-        weight_B = weight_B * survival_B
-        alive_B = alive_B & (survival_B > 0) & ~truncated_B
-        state_B = next_B
-    if isinstance(horizon, GeometricHorizon) and bool(alive_B.any()):
-        raise PgtsError(f"an episode outlived max_length = {limit} steps of the geometric horizon; is gamma 1?")
-    return Rollout(*(torch.stack(column) for column in zip(*rows, strict=True)))
-
-
 def rollout(
     env: gymnasium.vector.VectorEnv,
     policy: Policy,
@@ -170,34 +152,47 @@ def rollout(
         gamma: discount of a step whose `info` names none.
         seed, names: the environment's own stream.
         generator: draws actions and the geometric horizon.
+
+    Raises:
+        PgtsError: an episode outlived `max_length` of the geometric horizon.
     """
-    device = generator.device
     words = seed_sequence(seed, *names, "env").generate_state(env.num_envs)
     observation, _ = env.reset(seed=words.tolist())
+    state_B = torch.from_numpy(np.array(observation, dtype=np.int64)).to(generator.device)
+    alive_B = torch.ones_like(state_B, dtype=torch.bool)
+    weight_B = torch.ones_like(state_B, dtype=torch.float64)
+    rows: list[tuple[Tensor, ...]] = []
+    while len(rows) < horizon.limit and bool(alive_B.any()):
+        action_B = policy.sample(state_B, generator=generator)
+        reward_B, discount_B, next_B, truncated_B = _step(env, action_B, gamma)
+        survival_B = horizon.survival(discount_B, generator)
+        rows.append((state_B, action_B, reward_B, discount_B, next_B, alive_B, weight_B * alive_B, survival_B))
+        weight_B = weight_B * survival_B
+        alive_B = alive_B & (survival_B > 0) & ~truncated_B
+        state_B = next_B
+    horizon.check_end(int(alive_B.sum()))
+    return Rollout(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
-    def step(state_B: Tensor, action_B: Tensor, alive_B: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        observation, reward, terminated, truncated, info = env.step(action_B.cpu().numpy())
-        discount = np.where(terminated, 0.0, info.get("discount", gamma))
-        over = terminated | truncated
-        if over.any():
-            env.reset(options={"reset_mask": over})
-        return (
-            torch.from_numpy(np.asarray(reward, dtype=np.float64)).to(device),
-            torch.from_numpy(discount).to(device),
-            torch.from_numpy(np.array(observation, dtype=np.int64)).to(device),
-            torch.from_numpy(np.asarray(truncated & ~terminated)).to(device),
-        )
 
-    return unroll(
+def _step(
+    env: gymnasium.vector.VectorEnv, action_B: Int[Tensor, "B"], gamma: float
+) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"], Int[Tensor, "B"], Bool[Tensor, "B"]]:
+    """Rewards, discounts, next states, and whether a copy was truncated; copies that are over start again."""
+    device = action_B.device
+    observation, reward, terminated, truncated, info = env.step(action_B.cpu().numpy())
+    discount = np.where(terminated, 0.0, info.get("discount", gamma))
+    over = terminated | truncated
+    if over.any():
+        env.reset(options={"reset_mask": over})
+    return (
+        torch.from_numpy(np.asarray(reward, dtype=np.float64)).to(device),
+        torch.from_numpy(discount).to(device),
         torch.from_numpy(np.array(observation, dtype=np.int64)).to(device),
-        lambda state_B: policy.sample(state_B, generator=generator),
-        step,
-        horizon,
-        generator=generator,
+        torch.from_numpy(truncated).to(device),
     )
 
 
-def simulate(
+def simulated_returns(
     model: SamplingModel,
     policy: Policy,
     state_B: Int[Tensor, "B"],
@@ -205,19 +200,30 @@ def simulate(
     *,
     first_action_B: Int[Tensor, "B"] | None = None,
     generator: torch.Generator,
-) -> Rollout:
-    """One episode in the model from each given state, with the first action given or the policy's own."""
-    given = [] if first_action_B is None else [first_action_B]
+) -> tuple[Float[Tensor, "B"], int]:
+    """The weighted reward of one episode in the model from each given state, and how many steps they took together.
 
-    def act(state_B: Tensor) -> Tensor:
-        return given.pop() if given else policy.sample(state_B, generator=generator)
+    The first action is given or the policy's own. Episodes that are over cost nothing more.
 
-    def step(state_B: Tensor, action_B: Tensor, alive_B: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        drawn = model.sample(state_B, action_B, generator=generator)
-        never_B = torch.zeros_like(alive_B)
-        return drawn.reward_N.double(), drawn.discount_N.double(), drawn.next_state_N, never_B
-
-    return unroll(state_B, act, step, horizon, generator=generator)
+    Raises:
+        PgtsError: an episode outlived `max_length` of the geometric horizon.
+    """
+    returns_B = torch.zeros(len(state_B), dtype=torch.float64, device=state_B.device)
+    row_N, state_N, weight_N = torch.arange(len(state_B), device=state_B.device), state_B, torch.ones_like(returns_B)
+    action_N = policy.sample(state_B, generator=generator) if first_action_B is None else first_action_B
+    num_steps = 0
+    for _ in range(horizon.limit):
+        drawn = model.sample(state_N, action_N, generator=generator)
+        returns_B[row_N] += weight_N * drawn.reward_N
+        num_steps += len(row_N)
+        weight_N = weight_N * horizon.survival(drawn.discount_N, generator)
+        alive_N = weight_N > 0
+        row_N, state_N, weight_N = row_N[alive_N], drawn.next_state_N[alive_N], weight_N[alive_N]
+        if len(row_N) == 0:
+            break
+        action_N = policy.sample(state_N, generator=generator)
+    horizon.check_end(len(row_N))
+    return returns_B, num_steps
 
 
 def make_vector_env(env_id: str, num_envs: int, *, gamma: float | None, **kwargs: Any) -> gymnasium.vector.VectorEnv:

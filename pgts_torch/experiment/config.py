@@ -18,6 +18,7 @@ INT64_MAX = 2**63 - 1
 Count = Annotated[int, Field(ge=1, le=INT64_MAX)]
 Natural = Annotated[int, Field(ge=0, le=INT64_MAX)]
 Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
 UnitInterval = Annotated[float, Field(ge=0, le=1)]
 Share = Annotated[float, Field(gt=0, le=1)]
 
@@ -237,11 +238,36 @@ class RolloutCriticConfig(_Section):
 class SearchConfig(_Section):
     """The lookahead T^m Q at the visited states."""
 
-    depth: Natural = 4
-    """m, how often the Bellman optimality operator is applied; 0 is plain policy gradient."""
+    depth: Natural | Literal["adaptive"] = 4
+    """m, how often the Bellman optimality operator is applied; 0 is plain policy gradient. adaptive: in each iteration
+    the smallest m at which the policy is not stationary."""
+
+    max_depth: Natural | None = None
+    """The largest adaptive depth; null: 64. Only with search.depth adaptive."""
+
+    tolerance: NonNegative | None = None
+    """An adaptive depth is enough if the gap that it sees, summed over the occupancy, is more than this share of the
+    certificate; null: 0.1. Only with search.depth adaptive."""
+
+    stop_at: NonNegative | None = None
+    """Training ends once the certificate proves that the policy is this close to the optimal return; null: never."""
 
     max_nodes: Count = 10_000_000
     """A search that would need more nodes is refused."""
+
+    @field_validator("max_depth", "tolerance")
+    @classmethod
+    def _only_adaptive(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None and info.data.get("depth", "adaptive") != "adaptive":
+            raise _conflict(
+                "search.{name} is {value}, which only search.depth adaptive heeds; search.depth is {depth}",
+                f"search.{info.field_name}",
+                "search.depth",
+                name=str(info.field_name),
+                value=str(value),
+                depth=str(info.data["depth"]),
+            )
+        return value
 
 
 class UpdateConfig(_Section):

@@ -20,10 +20,11 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
         "charts/episodic_length": episodes.num_steps / episodes.num_episodes,
         "losses/entropy": float(entropy_N.mean()),
         **{f"losses/{name}": value for name, value in iteration.losses.items()},
-        "search/depth": float(algorithm.depth),
+        "search/depth": float(iteration.depth),
         "search/nodes": float(iteration.look.nodes),
         "search/model_calls": float(algorithm.num_model_calls),
         "search/stationarity_gap": float(iteration.gap_N.max()),
+        "search/certificate": iteration.certificate,
     }
 
 
@@ -36,7 +37,6 @@ class Truth:
 
     def __init__(self, algorithm: PGTS) -> None:
         self.mdp = algorithm.mdp
-        self.depth = algorithm.depth
         self.update = algorithm.update
         self.optimum = exact.optimal(self.mdp)
 
@@ -47,7 +47,7 @@ class Truth:
         the policy moved in and the exact one; the cosine is left out where one of the two is 0.
         """
         evaluation = exact.evaluate(self.mdp, pi_SA)
-        look_SA = exact.lookahead(self.mdp, evaluation.q_SA, self.depth)
+        look_SA = exact.lookahead(self.mdp, evaluation.q_SA, iteration.depth)
         states = iteration.state_N.cpu()
         error_NA = iteration.look.q_BA.cpu() - look_SA[states]
         tags = {

@@ -1,5 +1,7 @@
 """What a tabular policy does and what it is worth, as one picture."""
 
+from typing import Literal
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -35,7 +37,8 @@ def policy_picture(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], *, title: str =
 
 def _draw_values(axes: Axes, mdp: TabularMDP, v_S: Tensor, visited_S: Tensor) -> None:
     rows, columns = mdp.shape
-    image = axes.imshow(v_S.view(rows, columns).numpy(), cmap="viridis", aspect="auto" if columns > 3 * rows else "equal")
+    aspect: Literal["auto", "equal"] = "auto" if columns > 3 * rows else "equal"
+    image = axes.imshow(v_S.view(rows, columns).numpy(), cmap="viridis", aspect=aspect)
     axes.figure.colorbar(image, ax=axes, label="reward units")
     _draw_marks(axes, mdp)
     if mdp.num_states <= 100:

@@ -1,6 +1,7 @@
 """The loop around the algorithm: build it from a configuration, iterate, write down what happened."""
 
 import json
+import math
 import shutil
 import sys
 import time
@@ -12,7 +13,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from pgts_torch.agent.pgts import PGTS
+from pgts_torch.agent.pgts import PGTS, Iteration
 from pgts_torch.experiment import diagnostics
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.evaluate import Evaluation, evaluate, last_checkpoint
@@ -37,7 +38,10 @@ class Summary:
     """What a finished run came to.
 
     J, J_optimal: exact return of the trained policy and of the best one.
+    depth: m, the largest if it was adaptive.
     stationarity_gap: max over visited states of the exact g_m.
+    certificate: what the last iteration bounds J* - J^pi by; None: it knows no bound.
+    certificate_is_proved: whether that is a proof, because the critic is exact, or an estimate.
     """
 
     run: str
@@ -46,6 +50,8 @@ class Summary:
     J: float
     J_optimal: float
     stationarity_gap: float
+    certificate: float | None
+    certificate_is_proved: bool
     iterations: int
     env_steps: int
     model_calls: int
@@ -64,6 +70,9 @@ def build(config: Config) -> PGTS:
     return PGTS(
         config.env.id,
         depth=config.search.depth,
+        max_depth=config.search.max_depth,
+        tolerance=config.search.tolerance,
+        stop_at=config.search.stop_at,
         policy=plain["policy"],
         critic=plain["critic"],
         update=plain["update"],
@@ -110,51 +119,71 @@ def evaluate_run(run: str | Path, *, episodes: int, seed: int) -> dict[str, Eval
 
 
 def _loop(config: Config, algorithm: PGTS, folder: RunFolder) -> Summary:
-    started = time.perf_counter()
-    truth = diagnostics.Truth(algorithm)
-    report = _Reporter(config.total_steps)
-    while algorithm.num_env_steps < config.total_steps:
-        pi_SA = algorithm.policy.table()
-        begun, steps_before = time.perf_counter(), algorithm.num_env_steps
-        iteration = algorithm.iterate()
-        seconds = time.perf_counter() - begun
-        k, step = algorithm.num_iterations, algorithm.num_env_steps
-        if k % config.log.every == 0:
-            tags = diagnostics.metrics(algorithm, iteration) | truth.metrics(pi_SA, iteration)
-            tags["charts/SPS"] = (step - steps_before) / seconds
-            folder.log(step, tags)
-            report.line(step, tags)
-        if config.eval.every and k % config.eval.every == 0:
-            folder.log(step, _evaluation_tags(algorithm, config))
-        if config.log.checkpoint_every and k % config.log.checkpoint_every == 0:
-            _save(algorithm, folder)
-    report.close()
+    recorder = _Recorder(config, algorithm, folder)
+    algorithm.learn(config.total_steps, callback=recorder)
+    recorder.report.close()
     _save(algorithm, folder)
-    return _finish(config, algorithm, truth, folder, time.perf_counter() - started)
+    return recorder.finish()
 
 
-def _finish(config: Config, algorithm: PGTS, truth: diagnostics.Truth, folder: RunFolder, seconds: float) -> Summary:
-    pi_SA = algorithm.policy.table()
-    title = f"{config.env.id}, depth {config.search.depth}, seed {config.seed}"
-    folder.picture("policy", policy_picture(algorithm.mdp, pi_SA, title=title), algorithm.num_env_steps)
-    deterministic, sampled = (
-        evaluate(algorithm, episodes=config.eval.episodes, deterministic=kind, seed=config.seed)
-        for kind in (True, False)
-    )
-    return Summary(
-        run=str(folder.path),
-        seed=config.seed,
-        depth=config.search.depth,
-        J=exact.evaluate(algorithm.mdp, pi_SA).J,
-        J_optimal=truth.optimum.J,
-        stationarity_gap=float(stationary.gap(algorithm.mdp, pi_SA, config.search.depth).max()),
-        iterations=algorithm.num_iterations,
-        env_steps=algorithm.num_env_steps,
-        model_calls=algorithm.num_model_calls,
-        seconds=seconds,
-        deterministic=deterministic,
-        sampled=sampled,
-    )
+class _Recorder:
+    """Called after each iteration: writes down what it was like.
+
+    The tags of an iteration speak of the policy that made its episodes, which is the one before its update.
+    """
+
+    def __init__(self, config: Config, algorithm: PGTS, folder: RunFolder) -> None:
+        self.config = config
+        self.algorithm = algorithm
+        self.folder = folder
+        self.truth = diagnostics.Truth(algorithm)
+        self.report = _Reporter(config.total_steps)
+        self.started = self._clock = time.perf_counter()
+        self._pi_SA = algorithm.policy.table()
+        self._deepest, self._certificate = 0, math.inf
+
+    def __call__(self, algorithm: PGTS, iteration: Iteration) -> None:
+        seconds = time.perf_counter() - self._clock
+        k, step = algorithm.num_iterations, algorithm.num_env_steps
+        self._deepest, self._certificate = max(self._deepest, iteration.depth), iteration.certificate
+        if k % self.config.log.every == 0:
+            tags = diagnostics.metrics(algorithm, iteration) | self.truth.metrics(self._pi_SA, iteration)
+            tags["charts/SPS"] = iteration.experience.num_steps / seconds
+            self.folder.log(step, tags)
+            self.report.line(step, tags)
+        if self.config.eval.every and k % self.config.eval.every == 0:
+            self.folder.log(step, _evaluation_tags(algorithm, self.config))
+        if self.config.log.checkpoint_every and k % self.config.log.checkpoint_every == 0:
+            _save(algorithm, self.folder)
+        self._pi_SA = algorithm.policy.table()
+        self._clock = time.perf_counter()
+
+    def finish(self) -> Summary:
+        """The picture and the summary of the trained policy."""
+        seconds = time.perf_counter() - self.started
+        config, algorithm, pi_SA = self.config, self.algorithm, self.algorithm.policy.table()
+        title = f"{config.env.id}, depth {config.search.depth}, seed {config.seed}"
+        self.folder.picture("policy", policy_picture(algorithm.mdp, pi_SA, title=title), algorithm.num_env_steps)
+        deterministic, sampled = (
+            evaluate(algorithm, episodes=config.eval.episodes, deterministic=kind, seed=config.seed)
+            for kind in (True, False)
+        )
+        return Summary(
+            run=str(self.folder.path),
+            seed=config.seed,
+            depth=self._deepest,
+            J=exact.evaluate(algorithm.mdp, pi_SA).J,
+            J_optimal=self.truth.optimum.J,
+            stationarity_gap=float(stationary.gap(algorithm.mdp, pi_SA, self._deepest).max()),
+            certificate=self._certificate if math.isfinite(self._certificate) else None,
+            certificate_is_proved=config.critic.type == "exact",
+            iterations=algorithm.num_iterations,
+            env_steps=algorithm.num_env_steps,
+            model_calls=algorithm.num_model_calls,
+            seconds=seconds,
+            deterministic=deterministic,
+            sampled=sampled,
+        )
 
 
 def _evaluation_tags(algorithm: PGTS, config: Config) -> dict[str, float]:
@@ -212,6 +241,7 @@ def describe(summary: Summary) -> str:
         "return of the policy, J": f"{summary.J:.4g}{share}",
         "optimal return, J*": f"{summary.J_optimal:.4g}",
         f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
+        "certificate, J* - J <=": _certificate_text(summary),
         "greedy episodes, return": _score_text(summary.deterministic),
         "sampled episodes, return": _score_text(summary.sampled),
         "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",
@@ -220,6 +250,13 @@ def describe(summary: Summary) -> str:
         "run folder": summary.run,
     }
     return "\n".join(f"{name:<28}{value}" for name, value in rows.items())
+
+
+def _certificate_text(summary: Summary) -> str:
+    if summary.certificate is None:
+        return "none"
+    kind = "proved" if summary.certificate_is_proved else "an estimate: the critic is learned"
+    return f"{summary.certificate:.3g} ({kind})"
 
 
 def _score_text(evaluation: Evaluation) -> str:

@@ -4,6 +4,7 @@ A state is an integer below `num_states`. A model whose states are something els
 it meets them, equal states alike, so that a search can merge them.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -27,10 +28,14 @@ class Transitions:
 
 
 class Model(ABC):
-    """A finite action set over numbered states."""
+    """A finite action set over numbered states.
+
+    highest_value: an upper bound of v* in every state; infinite where none is known.
+    """
 
     num_states: int
     num_actions: int
+    highest_value: float = math.inf
     device: torch.device
     dtype: torch.dtype
 

@@ -1,5 +1,6 @@
 """A tabular MDP as a model: it enumerates and it samples."""
 
+import math
 from typing import Any, final
 
 import gymnasium
@@ -30,6 +31,7 @@ class TabularModel(EnumeratingModel, SamplingModel):
         self.num_actions = mdp.num_actions
         self.device = self.table.device
         self.dtype = dtype
+        self.highest_value = _highest_value(mdp.outcomes)
         self._cumulative_NAK = self.table.prob_NAK.cumsum(-1)
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
@@ -65,3 +67,12 @@ def tabular_truth(env: gymnasium.Env | gymnasium.vector.VectorEnv, *, gamma: flo
     single: Any = base.envs[0] if isinstance(base, gymnasium.vector.SyncVectorEnv) else base
     mdp = getattr(single.unwrapped, "mdp", None)
     return mdp if isinstance(mdp, TabularMDP) else TabularMDP.from_gymnasium(single, gamma)
+
+
+def _highest_value(outcomes: Outcomes) -> float:
+    """The largest reward for ever, r_max / (1 - gamma_max); nothing at all if that is less and episodes may end."""
+    gamma = float(outcomes.discount_NAK.max())
+    highest_reward = float(outcomes.reward_NA.max())
+    if gamma == 1:
+        return math.inf if highest_reward > 0 else 0.0
+    return max(0.0, highest_reward) / (1 - gamma)

@@ -61,8 +61,9 @@ def by_hand() -> Rollout:
     discount_TB = torch.full((3, 3), 0.5, dtype=torch.float64)
     discount_TB[2, 1] = 0.0
     alive_TB = torch.tensor([[1, 1, 1], [1, 1, 1], [1, 1, 0]], dtype=torch.bool)
+    survival_TB = torch.tensor([[1, 1, 1], [1, 1, 0], [0, 0, 0]], dtype=torch.float64)
     states_TB = torch.arange(3)[:, None].expand(3, 3)
-    return Rollout(states_TB, states_TB * 0, column, discount_TB, states_TB + 1, alive_TB, column, discount_TB)
+    return Rollout(states_TB, states_TB * 0, column, discount_TB, states_TB + 1, alive_TB, column, survival_TB)
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def sampled_directions(problem: str, depth: int, critic: str) -> Tensor:
         copies(mdp, 150),
         depth=depth,
         policy=policy,
-        critic=critic if critic == "exact" else {"type": critic, "samples": 16},
+        critic=critic if critic == "exact" else {"type": critic, "samples": 64},
         update=SoftmaxUpdate(step_size=1.0),
         horizon="geometric",
     )

@@ -89,7 +89,7 @@ def test_the_critic_stands_at_the_leaves_whether_it_learns_v_or_q(critic):
             * model.mdp.outcomes.discount_NAK
             * model.critic.v(model.mdp.outcomes.child_NAK.reshape(-1)).view(5, 2, 1)
         ).sum(-1)
-    torch.testing.assert_close(model.lookahead(states).q_BA, exact.lookahead(model.mdp, q_SA, 3))
+    torch.testing.assert_close(model.lookahead(states, depth=3).q_BA, exact.lookahead(model.mdp, q_SA, 3))
 
 
 def test_learn_counts_the_steps_of_all_calls():
@@ -176,7 +176,7 @@ def test_asking_for_lookaheads_and_actions_does_not_move_the_training(critic):
     for _ in range(4):
         first, second = quiet.iterate(), asked.iterate()
         assert same_bits(first.experience, second.experience)
-        asked.lookahead(torch.arange(5))
+        asked.lookahead(torch.arange(5), depth=5)
         asked.predict(np.arange(5), deterministic=False)
         asked.critic.v(torch.arange(5))
         asked.policy.table()
@@ -197,8 +197,11 @@ def test_no_global_generator_is_drawn_from_and_none_matters():
 
 @pytest.mark.parametrize("env", ["FrozenLake-v1", "CliffWalking-v1", "Taxi-v4"])
 def test_gymnasiums_tabular_environments_can_be_learned_from(env):
-    model = make(env, depth=3).learn(200)
-    assert model.num_env_steps >= 200
+    steps = []
+    model = make(env, depth=3).learn(
+        200, callback=lambda model, seen: steps.append(int(seen.experience.alive_TB.sum()))
+    )
+    assert model.num_env_steps == sum(steps) >= 200
     assert (model.mdp.num_states, model.mdp.num_actions) == (
         model.env.single_observation_space.n,
         model.env.single_action_space.n,
@@ -271,8 +274,7 @@ def test_parts_may_be_given_as_objects():
         critic=TabularCritic(16, 4, target="q"),
         update=SoftmaxUpdate(0.2),
     )
-    model.iterate()
-    assert model.depth == 4
+    assert model.iterate().depth == 4
     assert model.update == SoftmaxUpdate(0.2)
     with pytest.raises(PgtsError, match="only one given by its id"):
         model.make_copies(2)

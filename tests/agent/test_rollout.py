@@ -12,14 +12,14 @@ from pgts_torch.agent.rollout import (
     check_vector_env,
     make_vector_env,
     rollout,
-    simulate,
+    simulated_returns,
 )
 from pgts_torch.bellman import Outcomes
 from pgts_torch.envs import TabularVectorEnv
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import TabularModel
 from pgts_torch.seeding import stream
-from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder, random_mdp
+from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder
 from tests.agent.helpers import (
     copies,
     experience,
@@ -30,7 +30,7 @@ from tests.agent.helpers import (
     weight_by_episode,
     z_scores,
 )
-from tests.support import outcomes_of, random_policy, uniform_policy, zoo
+from tests.support import always, outcomes_of, random_policy, uniform_policy, zoo
 
 FAR = 5.0
 """Standard errors; a normal mean lies farther off with probability 6e-7, so each test here (at most 100 means) fails by
@@ -257,7 +257,29 @@ def test_a_time_limit_cuts_an_episode_without_terminating_it(name):
     assert cut_B.any()
     assert made.alive_TB[4:].sum() == 0
     assert (made.discount_TB[3, cut_B] == 0.9).all()
+    assert (made.survival_TB[3, cut_B] == 0.9).all()
     assert make_vector_env(name, 2, gamma=0.9).reset(seed=[0, 1])[0].shape == (2,)
+
+
+def test_a_copy_that_is_cut_earlier_than_the_others_counts_no_longer():
+    class FirstCopyIsCut(VectorWrapper):
+        def step(self, actions):
+            *answer, truncated, info = super().step(actions)
+            truncated[0] = True
+            return *answer, truncated, info
+
+    made = rollout(
+        FirstCopyIsCut(copies(ladder(), 3)),
+        following(uniform_policy(ladder())),
+        FixedHorizon(5),
+        gamma=0.9,
+        seed=0,
+        names=("test",),
+        generator=stream(0, "test"),
+    )
+    assert made.alive_TB.sum(0).tolist() == [1, 5, 5]
+    assert (made.weight_TB > 0).sum(0).tolist() == [1, 5, 5]
+    assert made.discount_TB[0].tolist() == [0.9] * 3
 
 
 def test_without_being_asked_an_environment_has_no_time_limit_but_ours():
@@ -372,15 +394,27 @@ def test_a_process_that_never_ends_is_stopped_by_the_guard_of_the_geometric_hori
     assert made.num_steps == 10
 
 
-def test_simulated_episodes_start_as_asked_and_follow_the_model():
-    mdp = random_mdp(6, 3, branching=2)
-    model = TabularModel(mdp)
-    state_B, action_B = torch.arange(6).repeat_interleave(3), torch.arange(3).repeat(6)
-    kwargs = {"first_action_B": action_B, "generator": stream(0, "test")}
-    made = simulate(model, following(random_policy(mdp)), state_B, FixedHorizon(5), **kwargs)
-    assert torch.equal(made.state_TB[0], state_B)
-    assert torch.equal(made.action_TB[0], action_B)
-    assert not torch.equal(made.action_TB[1], action_B)
-    assert made.num_steps == 18 * 5
-    for s, a, _, discount, child in transitions(made):
-        assert (child, discount) in outcomes_of(mdp, s, a)
+def test_simulated_episodes_earn_what_was_computed_by_hand():
+    model, policy = TabularModel(chain()), following(torch.ones(3, 1, dtype=torch.float64))
+    returns_B, num_steps = simulated_returns(
+        model, policy, torch.tensor([0, 1, 2]), FixedHorizon(3), generator=stream(0, "test")
+    )
+    expected_B = torch.tensor([1 + 0.5 * (2 + 0.8 * 3), 2 + 0.8 * (3 + 0.9 * 3), 3 + 0.9 * (3 + 0.9 * 3)])
+    torch.testing.assert_close(returns_B, expected_B.double())
+    assert num_steps == 9
+
+
+def test_simulated_episodes_end_with_a_terminal_outcome_and_cost_nothing_after_it():
+    mdp = deep_sea(4, gamma=1.0, move_cost=0.0)
+    right, state_B = following(always(mdp, 1)), torch.tensor([0, 5, 15])
+    for horizon in (FixedHorizon(30), GeometricHorizon(max_length=4)):
+        kwargs = {"generator": stream(0, "test")}
+        returns_B, num_steps = simulated_returns(TabularModel(mdp), right, state_B, horizon, **kwargs)
+        assert returns_B.tolist() == [1.0, 1.0, 1.0]
+        assert num_steps == 4 + 3 + 1
+        returns_B, _ = simulated_returns(
+            TabularModel(mdp), right, state_B, horizon, first_action_B=torch.tensor([0, 0, 1]), **kwargs
+        )
+        assert returns_B.tolist() == [0.0, 0.0, 1.0]
+    with pytest.raises(PgtsError, match="max_length = 3"):
+        simulated_returns(TabularModel(mdp), right, state_B, GeometricHorizon(max_length=3), **kwargs)

@@ -75,7 +75,7 @@ def test_a_model_is_loaded_with_everything_that_it_was_made_with(tmp_path):
     made.save(path)
     loaded = PGTS.load(path, device="cpu")
     assert torch.equal(loaded.policy.table(), made.policy.table())
-    for name in ("depth", "seed", "max_nodes", "gamma", "update", "horizon", "device"):
+    for name in ("depths", "seed", "max_nodes", "gamma", "update", "horizon", "device"):
         assert getattr(loaded, name) == getattr(made, name)
     assert loaded.env.num_envs == 3
     assert torch.equal(loaded.mdp.outcomes.reward_NA, made.mdp.outcomes.reward_NA)
