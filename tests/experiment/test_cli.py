@@ -71,15 +71,15 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "mistake"),
     [
-        ([], "a command is missing; choose from train, evaluate (see pgts --help)"),
+        ([], f"a command is missing; choose from {', '.join(COMMANDS)} (see pgts --help)"),
         (["trian"], "'trian' is not a command; did you mean train? (see pgts --help)"),
-        (["xyz"], "'xyz' is not a command; choose from train, evaluate (see pgts --help)"),
+        (["xyz"], f"'xyz' is not a command; choose from {', '.join(COMMANDS)} (see pgts --help)"),
         (["--verbose"], "unrecognized arguments: --verbose (see pgts --help)"),
         (["train", "--config"], "argument --config: expected one argument (see pgts train --help)"),
         (["train", "--config", "none.yaml"], "none.yaml: the configuration cannot be read: No such file or directory"),
         (["train", "--conf", "x.yaml"], "--conf is unknown; `pgts train --help` lists all keys"),
         (["train", "--depth", "4"], "--depth is unknown; did you mean --search.depth?"),
-        (["train", "--search.depth", "-1"], "--search.depth is -1; it must be a whole number >= 0"),
+        (["train", "--search.depth", "-1"], "--search.depth is -1; it must be a whole number >= 0 or adaptive"),
         (["train", "--print-config", "--seed", "x"], "--seed is 'x'; it must be a whole number >= 0"),
         (["evaluate"], "the following arguments are required: RUN_DIR (see pgts evaluate --help)"),
         (["evaluate", "none"], "argument RUN_DIR: 'none' is not a folder (see pgts evaluate --help)"),

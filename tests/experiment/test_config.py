@@ -113,8 +113,8 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ("update: {type: adam}", "update.type is 'adam'; it must be projected, softmax or mirror"),
         ("run: {overwrite: yes}", "run.overwrite is 'yes'; it must be true or false"),
         ("run: {dir: 5}", "run.dir is 5; it must be a folder or null (in quotes, to make it text)"),
-        ("search: 4", "search is 4; it must be a mapping with the keys depth, max_nodes"),
-        ("search:", "search is empty; it must be a mapping with the keys depth, max_nodes"),
+        ("search: 4", "search is 4; it must be a mapping with the keys depth, max_depth, tolerance, stop_at, max_nodes"),
+        ("search:", "search is empty; it must be a mapping with the keys depth, max_depth, tolerance, stop_at, max_nodes"),
         ("critic: 4", "critic is 4; it must be a mapping with the key type (exact, rollout or tabular)"),
         ("critic: {type: neural}", "critic.type is 'neural'; it must be exact, rollout or tabular"),
         ("critic: {type: [1]}", "critic.type is a list; it must be exact, rollout or tabular"),
@@ -161,8 +161,8 @@ def test_a_wrong_value_is_named_with_its_line_its_key_and_what_is_required(
 @pytest.mark.parametrize(
     ("arguments", "mistake"),
     [
-        (["--search.depth", "-1"], "--search.depth is -1; it must be a whole number >= 0"),
-        (["--search.depth=-1"], "--search.depth is -1; it must be a whole number >= 0"),
+        (["--search.depth", "-1"], "--search.depth is -1; it must be a whole number >= 0 or adaptive"),
+        (["--search.depth=-1"], "--search.depth is -1; it must be a whole number >= 0 or adaptive"),
         (
             ["--search.depth", "[1"],
             "--search.depth: '[1': this is not YAML: expected ',' or ']', but got '<stream end>'",
@@ -173,8 +173,8 @@ def test_a_wrong_value_is_named_with_its_line_its_key_and_what_is_required(
         ),
         (["--seed="], "--seed is empty; it must be a whole number >= 0"),
         (["--name="], "--name is empty; it must be letters, digits, '.', '_', '-', at most 100"),
-        (["--search.depth"], "--search.depth needs a value: a whole number >= 0"),
-        (["--search.depth", "--run.overwrite"], "--search.depth needs a value: a whole number >= 0"),
+        (["--search.depth"], "--search.depth needs a value: a whole number >= 0 or adaptive"),
+        (["--search.depth", "--run.overwrite"], "--search.depth needs a value: a whole number >= 0 or adaptive"),
         (["--run.overwrite", "no"], "--run.overwrite is 'no'; it must be true or false"),
         (["--run.dir", "a\udcff"], "--run.dir is 'a\\udcff'; it must be a folder or null"),
         (["--search.depht", "4"], "--search.depht is unknown; did you mean --search.depth?"),
@@ -212,7 +212,7 @@ def test_all_mistakes_are_reported_at_once_in_the_order_of_lines_then_flags(
     assert mistakes(content, "--sed", "3", "--threads", "0", "stray") == [
         "c.yaml:1: update.type is projected, which needs policy.type simplex; policy.type is softmax",
         "c.yaml:2: nam is unknown; did you mean name?",
-        "c.yaml:3: search.depth is -1; it must be a whole number >= 0",
+        "c.yaml:3: search.depth is -1; it must be a whole number >= 0 or adaptive",
         "c.yaml:5: the key seed is given twice",
         "c.yaml:6: critic.type is 'x'; it must be exact, rollout or tabular",
         "--sed is unknown; did you mean --seed?",
@@ -315,6 +315,9 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a whole number >= 1": st.integers(1, 2**63 - 1),
     "a whole number in [1, 1024]": st.integers(1, 1024),
     "a number > 0": st.floats(0, exclude_min=True, allow_infinity=False),
+    "a whole number >= 0 or adaptive": st.just("adaptive") | st.integers(0, 2**63 - 1),
+    "a whole number >= 0 or null": st.none() | st.integers(0, 2**63 - 1),
+    "a number >= 0 or null": st.none() | st.floats(0, allow_infinity=False),
     "a number in [0, 1]": st.floats(0, 1),
     "a number in (0, 1]": st.floats(0, 0.5, exclude_min=True),
     "a number in [0, 1] or null": st.none() | st.floats(0, 1),
@@ -334,7 +337,7 @@ OPTIONS = Schema(Config).options()
 
 @st.composite
 def configurations(draw: st.DrawFn) -> Config:
-    """Every key with any valid value; the policy and its update fit each other."""
+    """Every key with any valid value; the policy and its update, and the keys of the depth, fit each other."""
     data: dict[str, Any] = {}
     for option in OPTIONS:
         *sections, name = option.key.split(".")
@@ -347,6 +350,8 @@ def configurations(draw: st.DrawFn) -> Config:
         choices = option.requirement.replace(" or ", ", ").split(", ")
         section[name] = draw(SAMPLES.get(option.requirement, st.sampled_from(choices)))
     data["update"]["type"] = {"simplex": "projected", "softmax": "softmax"}[data["policy"]["type"]]
+    if data["search"]["depth"] != "adaptive":
+        data["search"]["max_depth"] = data["search"]["tolerance"] = None
     _drop_parts_of_other_choices(data)
     return Config.model_validate(data)
 
@@ -365,6 +370,13 @@ def _drop_parts_of_other_choices(data: dict[str, Any]) -> None:
 def test_any_configuration_survives_printing_and_loading(config: Config) -> None:
     assert Config.model_validate(strict_yaml.parse(dump(config)).value) == config
     assert dump(config).isascii()
+
+
+@pytest.mark.parametrize("key", ["max_depth", "tolerance"])
+def test_what_only_an_adaptive_depth_heeds_is_refused_beside_a_number(key: str) -> None:
+    assert load(None, ["--search.depth", "adaptive", f"--search.{key}", "1"]).search.depth == "adaptive"
+    with pytest.raises(ConfigError, match=f"search.{key} is 1.*, which only search.depth adaptive heeds"):
+        load(None, ["--search.depth", "4", f"--search.{key}", "1"])
 
 
 def test_every_default_is_the_one_that_the_help_names() -> None:

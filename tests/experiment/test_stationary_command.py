@@ -1,0 +1,255 @@
+"""The command `pgts stationary`, and the study of random families."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment import stationary
+from pgts_torch.experiment.cli import STATIONARY_OPTIONS, main
+from pgts_torch.tabular import deep_sea, exact, grid, ladder, random_mdp, tightrope
+from pgts_torch.tabular import stationary as theory
+
+LADDER = """\
+5 states, 2 actions, 32 deterministic policies
+J* = 6.561
+sufficient depth M = 4: all policies in Pi^4 are optimal
+
+depth     |Pi^m|        b^m   J* - b^m   by values    by reach  closed form
+    0         27          0      6.561       6.561           9            9
+    1         23          0      6.561       6.561         8.1          8.1
+    2         17          0      6.561       6.561        7.29         7.29
+    3          9          0      6.561       6.561       6.561        6.561
+    4          1      6.561          0      5.9049      5.9049       5.9049
+
+b^m is the least return of a policy in Pi^m. What bounds J* - b^m:
+  by values    Prop. 3, with the worst values of any policy
+  by reach     gamma and the rewards that m + 1 steps do not pass by
+  closed form  gamma and all rewards
+
+escapes at   policies
+         0          5  #########################
+         1          4  ####################
+         2          6  ##############################
+         3          8  ########################################
+         4          8  ########################################
+     never          1  #####
+"""
+
+
+def answer(capsys: pytest.CaptureFixture[str], *arguments: str) -> Any:
+    assert main(["stationary", *arguments, "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    return json.loads(out)
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(["stationary", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    return err.removeprefix("error: ").rstrip("\n")
+
+
+@pytest.fixture
+def npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The ladder of four states in a file of the working directory."""
+    monkeypatch.chdir(tmp_path)
+    ladder(4, gamma=0.8, start=0).save_npz("four.npz")
+    return Path("four.npz")
+
+
+def test_the_ladder_is_answered_in_tables(capsys):
+    assert main(["stationary", "ladder"]) == 0
+    assert capsys.readouterr() == (LADDER, "")
+
+
+def test_the_json_holds_the_same_numbers(capsys):
+    told = answer(capsys, "ladder")
+    assert (told["num_states"], told["num_actions"], told["num_policies"]) == (5, 2, 32)
+    assert (told["J_optimal"], told["sufficient_depth"]) == (pytest.approx(6.561), 4)
+    assert told["escape_depths"] == {"never": 1, "0": 5, "1": 4, "2": 6, "3": 8, "4": 8}
+    assert [row["depth"] for row in told["depths"]] == [0, 1, 2, 3, 4]
+    assert [row["count"] for row in told["depths"]] == [27, 23, 17, 9, 1]
+    assert told["depths"][3] == pytest.approx(
+        {
+            "depth": 3,
+            "count": 9,
+            "worst_return": 0,
+            "lack": 6.561,
+            "value_bound": 6.561,
+            "reachable_bound": 6.561,
+            "closed_form_bound": 6.561,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "mdp"),
+    [
+        (["ladder", "--n", "4", "--gamma", "0.5", "--start", "1"], lambda: ladder(4, gamma=0.5, start=1)),
+        (["ladder", "--start", "uniform"], lambda: ladder(5, start=None)),
+        (["tightrope"], tightrope),
+        (["tightrope", "--gamma", "0.5"], lambda: tightrope(gamma=0.5)),
+        (["random"], random_mdp),
+        (
+            ["random", "--states", "5", "--actions", "3", "--branching", "1", "--mdp-seed", "7"],
+            lambda: random_mdp(5, 3, branching=1, seed=7),
+        ),
+        (["grid", "--n", "2"], lambda: grid(2, traps=())),
+        (["grid", "--n", "2", "--traps", "1,2", "--gamma", "0.8"], lambda: grid(2, traps=(1, 2), gamma=0.8)),
+        (["deep_sea"], lambda: deep_sea(3)),
+        (["deep_sea", "--n", "2", "--gamma", "1"], lambda: deep_sea(2, gamma=1.0)),
+        (["four.npz"], lambda: ladder(4, gamma=0.8)),
+        (["four.npz", "--start", "2"], lambda: ladder(4, gamma=0.8, start=2)),
+        (["four.npz", "--start", "uniform"], lambda: ladder(4, gamma=0.8, start=None)),
+    ],
+)
+def test_each_mdp_is_the_one_that_was_asked_for(arguments, mdp, npz, capsys):
+    told, sets = answer(capsys, *arguments), theory.enumerate_sets(mdp())
+    assert told["J_optimal"] == pytest.approx(exact.optimal(mdp()).J)
+    assert told["num_policies"] == len(sets.J_P)
+    assert told["sufficient_depth"] == sets.sufficient_depth
+    assert [row["count"] for row in told["depths"]] == [sets.count(m) for m in range(sets.sufficient_depth + 1)]
+    assert told["depths"][0]["worst_return"] == pytest.approx(sets.worst_return(0))
+    assert told["depths"][-1]["lack"] == 0
+
+
+def test_a_bound_that_says_nothing_is_null_for_programs_and_none_for_people(capsys):
+    rows = answer(capsys, "deep_sea", "--gamma", "1")["depths"]
+    assert [row["reachable_bound"] for row in rows] == [None, None, 0]
+    assert [row["closed_form_bound"] for row in rows] == [None] * 3
+    assert main(["stationary", "deep_sea", "--gamma", "1"]) == 0
+    assert " none" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("what", ["ladder --n 12", "tightrope", "grid --n 2", "deep_sea", "random --branching 1"])
+def test_the_tables_stay_within_80_columns(what, capsys):
+    assert main(["stationary", *what.split()]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) < 80
+
+
+def test_a_long_table_shows_the_depths_at_which_something_changes(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    there, here = [0.0, 1.0], [1.0, 0.0]
+    P, R = [[here, there], [there, here]], [[0.0, -8.99], [1.0, 0.0]]
+    np.savez("toll.npz", P=P, R=R, gamma=0.9, start=0)
+    assert len(answer(capsys, "toll.npz")["depths"]) == 66
+    main(["stationary", "toll.npz"])
+    out = capsys.readouterr().out
+    assert [line.split()[0] for line in out.splitlines()[5:8]] == ["0", "65", "Depths"]
+
+
+HELP = "(see pgts stationary --help)"
+MOST = "at most 1048576 are enumerated: take at most"
+MISTAKES = {
+    "": f"the following arguments are required: WHAT {HELP}",
+    "laddr": f"argument WHAT: 'laddr' is not an MDP; did you mean ladder? {HELP}",
+    "xyz": f"argument WHAT: 'xyz' is not an MDP; choose from {', '.join(STATIONARY_OPTIONS)} {HELP}",
+    "none.npz": f"argument WHAT: 'none.npz' is not a file {HELP}",
+    "tightrope --n 3": f"--n does not apply to tightrope, which takes --gamma, --start {HELP}",
+    "ladder --mdp-seed 3": f"--mdp-seed does not apply to ladder, which takes --n, --gamma, --start {HELP}",
+    "four.npz --gamma 0.5": f"--gamma does not apply to four.npz, which takes --start {HELP}",
+    "ladder --n 0": f"argument --n: '0' is not a whole number >= 1 and below 2**63 {HELP}",
+    "ladder --gamma nan": f"argument --gamma: 'nan' is not a number in [0, 1] {HELP}",
+    "ladder --gamma 1.5": f"argument --gamma: '1.5' is not a number in [0, 1] {HELP}",
+    "ladder --start first": f"argument --start: 'first' is neither a state nor uniform {HELP}",
+    "grid --traps 1,x": f"argument --traps: 'x' is not a whole number >= 0 and below 2**63 {HELP}",
+    "ladder --start 5": "start state 5 does not exist; states are 0 to 4",
+    "ladder --gamma 1": "gamma is 1 and from state 0 some policy never ends: it has no finite value; "
+    "take a gamma below 1",
+    "random --branching 11": "branching is 11; it must be between 1 and num_states = 10",
+    "grid --traps 8": "state 8 is both goal and trap",
+    "grid --n 4": f"--n 4 gives 4,294,967,296 = 4^16 deterministic policies; {MOST} 10 states with 4 actions, "
+    "as --n 3 does",
+    "deep_sea --n 5": f"--n 5 gives 33,554,432 = 2^25 deterministic policies; {MOST} 20 states with 2 actions, "
+    "as --n 4 does",
+    "ladder --n 1000000000000": "--n 1000000000000 gives about 10^301029995664 = 2^1000000000000 deterministic "
+    f"policies; {MOST} 20 states with 2 actions, as --n 20 does",
+    "random --states 13 --actions 3": f"1,594,323 = 3^13 deterministic policies; {MOST} 12 states with 3 actions",
+    "broken.npz": "broken.npz: array 'gamma' is missing; it holds P, R",
+    "large.npz": f"2,097,152 = 2^21 deterministic policies; {MOST} 20 states with 2 actions",
+}
+
+
+@pytest.mark.parametrize("arguments", MISTAKES)
+def test_a_mistake_is_one_line_with_exit_code_2(arguments, npz, capsys):
+    np.savez("broken.npz", P=np.eye(2)[:, None], R=np.zeros((2, 1)))
+    np.savez("large.npz", P=np.full((21, 2, 21), 1 / 21), R=np.zeros((21, 2)), gamma=0.9)
+    assert refusal(capsys, *arguments.split()) == MISTAKES[arguments]
+
+
+TORCH_FREE = """
+import sys
+from pgts_torch.experiment.cli import main
+codes = [main(["stationary", *arguments.split()]) for arguments in
+         ("--help", "laddr", "none.npz", "ladder --n x", "tightrope --n 3", "ladder --gamma 2")]
+assert codes == [0, 2, 2, 2, 2, 2], codes
+sys.exit(3 if "torch" in sys.modules else 0)
+"""
+
+
+def test_help_and_mistakes_do_not_wait_for_torch(tmp_path):
+    done = subprocess.run([sys.executable, "-c", TORCH_FREE], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_help_tells_the_names_and_the_arrays_of_a_file(capsys):
+    assert main(["stationary", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) < 80
+    for word in [*STATIONARY_OPTIONS, 'numpy.savez("mdp.npz", P=P, R=R, gamma=0.9)', "[S, A, S]", "[S, A]", "start"]:
+        assert word in out
+
+
+# The study of random families
+
+
+def test_a_family_has_a_row_for_each_mdp_and_the_rows_are_true():
+    rows = stationary.family_study(branchings=(1, 3), reward_shares=(0.1, 1.0), gammas=(0.9,), sizes=(4,), seeds=(0, 5))
+    drawn = [(row.seed, row.branching, row.num_states, row.reward_share, row.gamma) for row in rows]
+    assert drawn == [
+        (seed, branching, 4, share, 0.9) for seed in (0, 5) for branching in (1, 3) for share in (0.1, 1.0)
+    ]
+    for row in rows:
+        mdp = stationary.sparse_random_mdp(
+            4, branching=row.branching, reward_share=row.reward_share, gamma=0.9, seed=row.seed
+        )
+        sets = theory.enumerate_sets(mdp)
+        assert (row.sufficient_depth, row.worst_return) == (sets.sufficient_depth, sets.worst_return(0))
+        assert row.J_optimal == pytest.approx(exact.optimal(mdp).J)
+        assert row.worst_return <= row.J_optimal + 1e-12
+
+
+def test_the_same_seed_gives_the_same_family():
+    few = {"branchings": (2,), "reward_shares": (0.2,), "gammas": (0.5, 0.99), "sizes": (5,)}
+    assert stationary.family_study(seeds=(3,), **few) == stationary.family_study(seeds=(3, 4), **few)[:2]
+    assert stationary.family_study(seeds=(3,), **few) != stationary.family_study(seeds=(4,), **few)
+
+
+def test_a_sparse_random_mdp_keeps_the_share_of_the_rewards_and_the_transitions():
+    dense = random_mdp(9, 2, branching=2, seed=4)
+    for share, kept in [(0.0, 1), (0.05, 1), (0.2, 4), (0.5, 9), (1.0, 18)]:
+        mdp = stationary.sparse_random_mdp(9, branching=2, reward_share=share, seed=4)
+        rewards_SA = mdp.outcomes.reward_NA
+        assert int((rewards_SA != 0).sum()) == kept
+        assert torch.equal(rewards_SA[rewards_SA != 0], dense.outcomes.reward_NA[rewards_SA != 0])
+        assert torch.equal(mdp.outcomes.child_NAK, dense.outcomes.child_NAK)
+    with pytest.raises(PgtsError, match="reward_share is nan"):
+        stationary.sparse_random_mdp(5, branching=1, reward_share=math.nan)
+
+
+@pytest.mark.parametrize(
+    ("mdp", "steps"),
+    [(lambda: ladder(6), 5), (tightrope, 2), (lambda: grid(4, traps=(), slip=0.0), 6), (random_mdp, 1)],
+)
+def test_the_diameter_is_the_longest_of_the_shortest_finite_paths(mdp, steps):
+    assert stationary.diameter(mdp()) == steps
