@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
+import scipy.sparse
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 _INT32_LIMIT = 2**31
+_LARGE = 2**23
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +76,23 @@ class Outcomes:
                 check_invariants=False,
             )
 
+    @cached_property
+    def _scipy_weight(self) -> scipy.sparse.csr_array:
+        """`weight` as scipy sees it, in the same memory."""
+        arrays = (self.weight.values(), self.weight.col_indices(), self.weight.crow_indices())
+        return scipy.sparse.csr_array(
+            tuple(array.numpy() for array in arrays), shape=(self.weight.shape[0], self.num_children), copy=False
+        )
+
+    def expected(self, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
+        """sum_k p_k gamma_k v(s'_k)."""
+        # Where memory is the limit scipy's product is up to a third faster than torch's; before that it is slower.
+        if self.device.type == "cpu" and self.child_NAK.numel() >= _LARGE:
+            product = torch.from_numpy(self._scipy_weight @ v_C.numpy())
+        else:
+            product = torch.mv(self.weight, v_C)
+        return product.view(self.reward_NA.shape)
+
     def rows(self, row_N: Int[Tensor, "N"]) -> Self:
         """The outcomes of some of the states, in the order asked for."""
         return type(self)(
@@ -107,10 +126,9 @@ def backup(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
     Returns:
         q, in the dtype of `outcomes`; it carries no gradient.
     """
-    N, A = outcomes.reward_NA.shape
     with torch.no_grad():
         # In place: a second table of N * A fresh numbers would cost as much as the product itself.
-        return torch.mv(outcomes.weight, v_C).view(N, A).add_(outcomes.reward_NA)
+        return outcomes.expected(v_C.detach()).add_(outcomes.reward_NA)
 
 
 def sweep(outcomes: Outcomes, v_S: Float[Tensor, "S"], times: int) -> Float[Tensor, "S"]:

@@ -39,6 +39,15 @@ def test_backup_is_reward_plus_the_discounted_mean_of_the_children(mdp, seed):
     torch.testing.assert_close(backup(mdp.outcomes, v_S), backup_by_loop(mdp.outcomes, v_S), rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.parametrize("name", ["grid", "Taxi"])
+def test_the_product_for_large_tables_is_the_same(name, monkeypatch):
+    outcomes = zoo(name).outcomes
+    v_S = torch.randn(outcomes.num_states, dtype=torch.float64, generator=stream(0, "v"))
+    small = backup(outcomes, v_S)
+    monkeypatch.setattr("pgts_torch.bellman._LARGE", 1)
+    torch.testing.assert_close(backup(outcomes, v_S), small, rtol=1e-13, atol=1e-13)
+
+
 def test_backup_of_a_hand_made_row_is_the_sum_on_paper():
     outcomes = outcomes_with(reward=2.0, prob=[0.5, 0.25, 0.25], discount=[0.9, 0.5, 0.0], child=[1, 0, 2])
     q = backup(outcomes, torch.tensor([8.0, 10.0, 1e9], dtype=torch.float64))

@@ -6,6 +6,7 @@ Torch is imported only after the arguments have proved themselves, so that mista
 import argparse
 import difflib
 import json
+import math
 import os
 import sys
 import textwrap
@@ -16,6 +17,7 @@ from typing import Any, NoReturn
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.config import INT64_MAX, Config, dump
+from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.schema import Option, Schema
 
@@ -91,6 +93,77 @@ def evaluate(arguments: Arguments) -> None:
 
     answer = run.evaluate_run(given.run_dir, episodes=given.episodes, seed=given.seed)
     _answer({kind: asdict(evaluation) for kind, evaluation in answer.items()}, as_json=given.json)
+
+
+@command
+def figures(arguments: Arguments) -> None:
+    """Reproduce the figures and tables of the paper, and check what it says."""
+    parser = _Parser("figures", figures)
+    parser.add_argument("--only", choices=PARTS, help="compute this part; keep the others as they are in --out")
+    parser.add_argument(
+        "--quick", action="store_true", help="minutes instead of half an hour: fewer seeds and readings"
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", type=_output_folder, default=Path("docs"), help="where to write (default: %(default)s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the data as one JSON object")
+    given = parser.parse_args(arguments)
+    from pgts_torch.experiment.figures import command as reproduction
+
+    effort = reproduction.QUICK if given.quick else reproduction.FULL
+    parts = reproduction.run(only=given.only, effort=effort, out=given.out)
+    print(json.dumps(parts) if given.json else reproduction.describe(parts))
+
+
+STATIONARY_OPTIONS = {
+    "ladder": ("n", "gamma", "start"),
+    "tightrope": ("gamma", "start"),
+    "random": ("states", "actions", "branching", "mdp-seed", "gamma", "start"),
+    "grid": ("n", "traps", "gamma", "start"),
+    "deep_sea": ("n", "gamma", "start"),
+    "file.npz": ("start",),
+}
+"""The MDPs of `pgts stationary`, each with the options that change it."""
+
+
+@command
+def stationary(arguments: Arguments) -> None:
+    """Count the policies that tree search cannot improve, depth by depth."""
+    parser = _Parser("stationary", stationary, usage="%(prog)s WHAT [--OPTION VALUE ...]")
+    parser.add_argument("what", metavar="WHAT", type=_mdp_name, help=", ".join(STATIONARY_OPTIONS))
+    for name, kind, meaning in [
+        ("n", _whole(1), "size: ladder (default 5), grid (3), deep_sea (3)"),
+        ("states", _whole(1), "of random (default 10)"),
+        ("actions", _whole(1), "of random (default 2)"),
+        ("branching", _whole(1), "successors of each state and action of random (default: all states)"),
+        ("mdp-seed", _whole(0), "of random (default 0)"),
+        ("traps", _whole_list, "states of the grid that cost 10, as in 1,5 (default: none)"),
+        ("gamma", _share, "discount (default 0.9; deep_sea 0.99; a file has its own)"),
+        ("start", _start, "a state, or uniform for all alike (default: state 0; a file has its own)"),
+    ]:
+        parser.add_argument(f"--{name}", metavar="N", type=kind, help=meaning)
+    parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
+    parser.epilog = NPZ_HELP
+    given = vars(parser.parse_args(arguments))
+    what, as_json = given.pop("what"), given.pop("json")
+    options = {name: value for name, value in given.items() if value is not None}
+    known = STATIONARY_OPTIONS.get(what, STATIONARY_OPTIONS["file.npz"])
+    for name in (name.replace("_", "-") for name in options):
+        if name not in known:
+            parser.error(f"--{name} does not apply to {what}, which takes {', '.join(f'--{n}' for n in known)}")
+    from pgts_torch.experiment import stationary as sets
+
+    study = sets.answer(what, **options)
+    print(json.dumps(sets.to_json(study)) if as_json else sets.describe(study))
+
+
+NPZ_HELP = """\
+A file of your own, written by numpy.savez("mdp.npz", P=P, R=R, gamma=0.9):
+  P      [S, A, S]  P[s, a] is the distribution of the next state
+  R      [S, A]     expected rewards
+  gamma  a number   discount in [0, 1]
+  start  optional   a state, or a distribution [S]; uniform where it is missing
+An end is a state that leads to itself and earns 0."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -204,6 +277,54 @@ def _whole(least: int) -> Callable[[str], int]:
         return int(text)
 
     return convert
+
+
+def _whole_list(text: str) -> tuple[int, ...]:
+    """An argparse type: whole numbers separated by commas."""
+    return tuple(_whole(0)(part) for part in text.split(","))
+
+
+def _share(text: str) -> float:
+    """An argparse type: a number in [0, 1]."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number in [0, 1]")
+    return value
+
+
+def _start(text: str) -> int | str:
+    """An argparse type: a state, or the word uniform."""
+    if text == "uniform":
+        return text
+    try:
+        return _whole(0)(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a state nor uniform") from None
+
+
+def _mdp_name(text: str) -> str:
+    """An argparse type: the name of an MDP, or the path of a file that ends in .npz."""
+    names = [name for name in STATIONARY_OPTIONS if not name.endswith(".npz")]
+    if text in names:
+        return text
+    if not text.endswith(".npz"):
+        close = difflib.get_close_matches(text, names, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(STATIONARY_OPTIONS)}"
+        raise argparse.ArgumentTypeError(f"{text!r} is not an MDP; {hint}")
+    if not Path(text).is_file():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a file")
+    return text
+
+
+def _output_folder(text: str) -> Path:
+    """An argparse type: a folder, or where one can be made."""
+    path = Path(text)
+    if path.exists() and not path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
+    return path
 
 
 def _run_folder(text: str) -> Path:

@@ -1,5 +1,6 @@
 """Finite Markov decision processes, validated when they are made."""
 
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -211,10 +212,7 @@ class TabularMDP:
         arrays = _read_npz(path)
         try:
             gamma = _single_number("gamma", arrays["gamma"])
-            start = arrays.get("start")
-            if start is not None and start.ndim == 0:
-                start = _single_state(start)
-            return cls.from_dense(arrays["P"], arrays["R"], gamma, start=start)
+            return cls.from_dense(arrays["P"], arrays["R"], gamma, start=_state_or_distribution(arrays.get("start")))
         except PgtsError as error:
             raise PgtsError(f"{path}: {_in_words_of_the_file(str(error))}") from error
 
@@ -233,20 +231,36 @@ def start_distribution(start: int | ArrayLike | None, num_states: int) -> Float[
 _NPZ_ARRAYS = ("P", "R", "gamma", "start")
 
 
+# How numpy, the zip and its compression report a file that is damaged or holds what no array is.
+_UNREADABLE = (
+    ValueError,
+    KeyError,
+    EOFError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+    SyntaxError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
 def _read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """The arrays of an MDP in a file, known by name and numbers; anything else is refused."""
+    """The arrays of an MDP in a file; anything but plain numbers under the known names is refused."""
     try:
-        if Path(path).stat() and not zipfile.is_zipfile(path):
-            raise PgtsError(f"{path}: is not an npz file (numpy.savez writes one)")
-        with np.load(path, allow_pickle=False) as file:
-            _check_names(path, file.files)
-            arrays = {name: _read_array(path, file, name) for name in file.files}
+        with open(path, "rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise PgtsError(f"{path}: is not an npz file (numpy.savez writes one)")
+            with np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
+                _check_names(path, archive.files)
+                return {name: _read_array(path, archive, name) for name in archive.files}
+    except PgtsError:
+        raise
     except OSError as error:
         raise PgtsError(f"{path}: cannot be read: {error.strerror or error}") from error
-    for name, array in arrays.items():
-        if array.dtype.kind not in "biuf":
-            raise PgtsError(f"{path}: {name} is of type {array.dtype}; it must hold real numbers")
-    return arrays
+    except _UNREADABLE as error:
+        raise PgtsError(f"{path}: is damaged: {_first_line(error)}") from error
 
 
 def _check_names(path: str | Path, names: Sequence[str]) -> None:
@@ -258,12 +272,18 @@ def _check_names(path: str | Path, names: Sequence[str]) -> None:
             raise PgtsError(f"{path}: array {name!r} is missing; it holds {', '.join(names) or 'none'}")
 
 
-def _read_array(path: str | Path, file: Any, name: str) -> np.ndarray:
-    # A damaged member is found by the zip, by its compression or by numpy, each with errors of its own.
+def _read_array(path: str | Path, archive: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     try:
-        return np.asarray(file[name])
-    except (ValueError, KeyError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise PgtsError(f"{path}: array {name!r} cannot be read: {str(error).splitlines()[0]}") from error
+        array = np.asarray(archive[name])
+    except _UNREADABLE as error:
+        raise PgtsError(f"{path}: array {name!r} cannot be read: {_first_line(error)}") from error
+    if array.dtype.kind not in "biuf":
+        raise PgtsError(f"{path}: {name} is of type {array.dtype}; it must hold real numbers")
+    return array
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 def _single_number(name: str, array: np.ndarray) -> float:
@@ -272,7 +292,9 @@ def _single_number(name: str, array: np.ndarray) -> float:
     return float(array)
 
 
-def _single_state(array: np.ndarray) -> int:
+def _state_or_distribution(array: np.ndarray | None) -> int | np.ndarray | None:
+    if array is None or array.ndim > 0:
+        return array
     if array.dtype.kind not in "iu":
         raise PgtsError(f"start is {array}; a single state must be a whole number")
     return int(array)

@@ -56,8 +56,8 @@ def closed_form_bound(mdp: TabularMDP, depth: int) -> float:
 
         J* - J^pi <= gamma^{m+1} (r_max - r_min) / (1 - gamma)
 
-    gamma is the largest discount; where some outcome has a smaller one (an end, for instance), r_min <= 0 <= r_max is
-    enforced, since what follows may earn nothing. Infinite where gamma is 1.
+    gamma is the largest discount. Where some outcome has a smaller one, an end for instance, 0 counts as a reward:
+    after an end nothing is earned. Infinite where gamma is 1.
     """
     return _reward_bound(mdp, exact.check_depth(depth), torch.ones(mdp.num_states, dtype=torch.bool))
 
@@ -121,7 +121,7 @@ def residual_bound(mdp: TabularMDP, u_S: Float[Tensor, "S"]) -> Float[Tensor, "S
 
         v* <= T u + gamma delta / (1 - gamma),   delta = max_s [ (T u)(s) - u(s) ], not below 0
 
-    gamma is the largest discount. Where it is 1 the bound is infinite unless delta is 0, and then it needs u <= v*.
+    gamma is the largest discount. Where it is 1 the bound is infinite unless delta is 0; then every policy must end.
     """
     next_S, gamma = backup(mdp.outcomes, u_S).amax(-1), _largest_discount(mdp.outcomes)
     delta = max(0.0, float((next_S - u_S).max()))
@@ -134,22 +134,24 @@ def certificate(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -> flo
     """An upper bound on J* - J^pi, for any pi, that a lookahead of m = depth proves (docs/theory.md, Prop. 6).
 
     The lookahead expands the states that the start distribution reaches in at most m steps. Of all others it knows
-    only that no reward exceeds r_max, so it grants them r_max / (1 - gamma), and takes the optimum of what it sees:
+    only that no reward exceeds r_max, so it grants them w = r_max / (1 - gamma), and takes the optimum of what it sees:
 
-        J* - J^pi <= mu^T (v_hat - v^pi),   v_hat = T v_hat where expanded,   v_hat = r_max / (1 - gamma) elsewhere
+        J* - J^pi <= mu^T (v_hat - v^pi),   v_hat = T v_hat where expanded,   v_hat = w elsewhere
+
+    (w = r_max where it is not positive and outcomes may end.)
 
     It never grows with m, and it is J* - J^pi itself once the expanded states lead nowhere else. Nothing smaller
-    follows from the expanded states and r_max. Infinite where it would grant an infinite value (gamma is 1).
+    follows from the expanded states and r_max. Infinite where w is (gamma is 1).
     """
     expanded_S = _reached_within(mdp, mdp.start_S > 0, exact.check_depth(depth))
     beyond_S = _followers(mdp, expanded_S) & ~expanded_S
-    hope = _highest_value(mdp) if beyond_S.any() else 0.0
-    if math.isinf(hope):
+    w = _highest_value(mdp) if beyond_S.any() else 0.0
+    if math.isinf(w):
         return math.inf
     outcomes = mdp.outcomes
     granted = replace(
         outcomes,
-        reward_NA=torch.where(expanded_S[:, None], outcomes.reward_NA, hope),
+        reward_NA=torch.where(expanded_S[:, None], outcomes.reward_NA, w),
         discount_NAK=torch.where(expanded_S[:, None, None], outcomes.discount_NAK, 0.0),
     )
     hopeful = replace(mdp, outcomes=granted)
@@ -251,14 +253,14 @@ def enumerate_sets(
 def check_enumerable(num_states: int, num_actions: int, *, max_policies: int = MAX_POLICIES) -> None:
     """PgtsError, with their number, if an MDP has more deterministic policies than are enumerated."""
     S, A = num_states, num_actions
-    magnitude = S * math.log10(A)
-    if magnitude <= 40 and A**S <= max_policies:
+    if S * math.log(A) <= math.log(max_policies) + 1e-9:
         return
-    number = f"{A**S:,}" if magnitude < 15 else f"about 10^{magnitude:.0f}"
+    digits = S * math.log10(A)
+    number = f"{A**S:,}" if digits < 15 else f"about 10^{digits:.0f}"
     fit = next(n for n in itertools.count(0) if A ** (n + 1) > max_policies)
     raise PgtsError(
-        f"{S} states with {A} actions have {A}^{S} = {number} deterministic policies; at most {max_policies:,} are "
-        f"enumerated, which is {fit} states with {A} actions"
+        f"{number} = {A}^{S} deterministic policies; at most {max_policies} are enumerated: take at most {fit} states "
+        f"with {A} actions"
     )
 
 
@@ -283,9 +285,9 @@ def _all_values(
     actions only, so policies that agree there share it, and the whole costs about as much as its last step: S numbers
     for each policy. The matrices are diagonally dominant: no pivots are needed.
     """
-    S, A = outcomes.reward_NA.shape
+    S = outcomes.num_states
     row_SAC = torch.cat([weight_SAS, outcomes.reward_NA[:, :, None]], -1)
-    # v_i = sum over the states to come of solved_ICQ[i, j] v_j + solved_ICQ[i, -1], for each of Q beginnings of a policy
+    # v_i = sum_j solved_ICQ[i, j] v_j + solved_ICQ[i, -1] over the states j to come, for each of Q starts of a policy
     solved_ICQ = torch.zeros(0, S + 1, 1, dtype=torch.float64)
     for s in range(S):
         row_AC = row_SAC[s, action_F[s]][None] if s < len(action_F) else row_SAC[s]
@@ -325,16 +327,16 @@ def _first_escape(
     depth_P = torch.full(enough_SP.shape[1:], NEVER)
     short_P = (optimum.v_S[:, None] > enough_SP).any(0).nonzero().flatten()
     v_SP, enough_SP = v_SP[:, short_P], enough_SP[:, short_P]
-    for depth in itertools.count():
-        if not len(short_P):
-            return depth_P
+    depth = 0
+    while len(short_P):
         seen_SP = _optimal_step(mdp.outcomes, v_SP)
         escaped_P = (seen_SP > enough_SP).any(0)
         depth_P[short_P[escaped_P]] = depth
         # Rounding can hold what is seen a last bit below a v* that is `slack` away: what no longer grows never escapes.
         kept_P = ~escaped_P & (seen_SP > v_SP).any(0)
         short_P, v_SP, enough_SP = short_P[kept_P], seen_SP[:, kept_P], enough_SP[:, kept_P]
-    raise AssertionError("unreachable")
+        depth += 1
+    return depth_P
 
 
 def _optimal_step(outcomes: Outcomes, v_SP: Float[Tensor, "S P"]) -> Float[Tensor, "S P"]:
@@ -362,37 +364,37 @@ def _largest_discount(outcomes: Outcomes) -> float:
     return float(outcomes.discount_NAK[outcomes.prob_NAK > 0].max())
 
 
-def _reward_range(mdp: TabularMDP, states_S: Bool[Tensor, "S"]) -> tuple[float, float]:
-    """(r_min, r_max) over the actions of some states, widened to hold 0 where their discounts differ from gamma.
-
-    An outcome with a smaller discount is one with discount gamma that ends with probability 1 - gamma_k / gamma, and
-    after an end every reward is 0 (docs/theory.md, Sec. 2).
-    """
-    outcomes = mdp.outcomes.rows(states_S.nonzero().flatten())
-    low, high = float(outcomes.reward_NA.min()), float(outcomes.reward_NA.max())
-    if float(outcomes.discount_NAK[outcomes.prob_NAK > 0].min()) < _largest_discount(mdp.outcomes):
-        low, high = min(low, 0.0), max(high, 0.0)
-    return low, high
-
-
 def _reward_bound(mdp: TabularMDP, depth: int, states_S: Bool[Tensor, "S"]) -> float:
     """gamma^{m+1} (r_max - r_min) / (1 - gamma) over some states; 0 where there are none or all earn the same."""
     if not states_S.any():
         return 0.0
-    low, high = _reward_range(mdp, states_S)
-    gamma = _largest_discount(mdp.outcomes)
+    outcomes, gamma = mdp.outcomes.rows(states_S.nonzero().flatten()), _largest_discount(mdp.outcomes)
+    low, high = float(outcomes.reward_NA.min()), float(outcomes.reward_NA.max())
+    if _has_ends(outcomes, gamma):
+        low, high = min(low, 0.0), max(high, 0.0)
     if high == low:
         return 0.0
     return math.inf if gamma >= UNDISCOUNTED else gamma ** (depth + 1) * (high - low) / (1 - gamma)
 
 
 def _highest_value(mdp: TabularMDP) -> float:
-    """r_max / (1 - gamma) >= v*, the most that a state can be worth if only rewards and gamma are known."""
-    _, high = _reward_range(mdp, torch.ones(mdp.num_states, dtype=torch.bool))
-    gamma = _largest_discount(mdp.outcomes)
-    if high == 0:
-        return 0.0
-    return math.inf if gamma >= UNDISCOUNTED else high / (1 - gamma)
+    """The most that a state can be worth if only gamma, r_max and whether something ends are known.
+
+    r_max / (1 - gamma), from earning r_max for ever; but r_max, from ending at once, if that is more.
+    """
+    outcomes, gamma = mdp.outcomes, _largest_discount(mdp.outcomes)
+    highest = float(outcomes.reward_NA.max())
+    if highest <= 0 and _has_ends(outcomes, gamma):
+        return highest
+    return math.inf if gamma >= UNDISCOUNTED else highest / (1 - gamma)
+
+
+def _has_ends(outcomes: Outcomes, gamma: float) -> bool:
+    """Whether some outcome has a smaller discount than gamma.
+
+    It is one with discount gamma that ends with probability 1 - gamma_k / gamma (docs/theory.md, Words).
+    """
+    return float(outcomes.discount_NAK[outcomes.prob_NAK > 0].min()) < gamma
 
 
 def _dense_weight(outcomes: Outcomes) -> Float[Tensor, "S A S"]:

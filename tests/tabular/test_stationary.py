@@ -69,6 +69,7 @@ def test_an_optimal_policy_is_stationary_at_every_depth(name):
     mdp = zoo(name)
     pi_SA = exact.optimal(mdp).pi_SA
     assert all(stationary.is_stationary(mdp, pi_SA, depth, tolerance=1e-8) for depth in (0, 1, 20))
+    assert torch.all(stationary.gap(mdp, pi_SA, 0) >= 0)  # though rounding may put v above every q
     assert not stationary.is_stationary(mdp, uniform_policy(mdp), 0)
 
 

@@ -1,0 +1,266 @@
+"""The data and the text behind `pgts stationary`: which policies tree search cannot improve, and how bad they are."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse.csgraph
+import torch
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.seeding import numpy_stream
+from pgts_torch.tabular import TabularMDP, deep_sea, grid, ladder, random_mdp, stationary, tightrope
+from pgts_torch.tabular.mdp import start_distribution
+
+ALL_ROWS = 30
+"""A table of more depths shows only those at which Pi^m changes."""
+
+BAR = 40
+"""Characters of the longest bar."""
+
+
+@dataclass(frozen=True)
+class DepthRow:
+    """What is known of Pi^m for m = depth.
+
+    count: |Pi^m| among the deterministic policies.   worst_return: b^m.   lack: J* - b^m.
+    value_bound, reachable_bound, closed_form_bound: what J* - b^m cannot exceed, without knowing Pi^m
+    (docs/theory.md, Prop. 3 and Cor. 1); infinite where they say nothing.
+    """
+
+    depth: int
+    count: int
+    worst_return: float
+    lack: float
+    value_bound: float
+    reachable_bound: float
+    closed_form_bound: float
+
+
+@dataclass(frozen=True)
+class Study:
+    """The stationary sets of one MDP.
+
+    escape_depths: how many policies leave Pi^m first at each depth; `stationary.NEVER` stands for the optimal ones.
+    sufficient_depth: the smallest M with Pi^M = Pi^inf.
+    depths: a row for each depth 0 .. M.
+    """
+
+    num_states: int
+    num_actions: int
+    num_policies: int
+    J_optimal: float
+    sufficient_depth: int
+    escape_depths: dict[int, int]
+    depths: tuple[DepthRow, ...]
+
+
+def answer(what: str, **options: Any) -> Study:
+    """The study of the MDP that `make` builds from the same arguments, on one thread."""
+    torch.set_num_threads(1)
+    return study(make(what, **options))
+
+
+def make(what: str, **options: Any) -> TabularMDP:
+    """The MDP that `pgts stationary` was asked for.
+
+    Args:
+        what: ladder, tightrope, random, grid, deep_sea, or the path of a file that `TabularMDP.load_npz` reads.
+        options: of the command, without those that were not given.
+
+    Raises:
+        PgtsError: it has more policies than are enumerated, or something about it is wrong.
+    """
+    if options.get("start") == "uniform":
+        options["start"] = None
+    if what == "ladder":
+        return ladder(_size(options, 5, 2, lambda n: n), **options)
+    if what == "tightrope":
+        return tightrope(**options)
+    if what == "random":
+        size = options.pop("states", 10), options.pop("actions", 2)
+        stationary.check_enumerable(*size)
+        return random_mdp(*size, seed=options.pop("mdp_seed", 0), **options)
+    if what == "grid":
+        return grid(_size(options, 3, 4, lambda n: n * n), traps=options.pop("traps", ()), **options)
+    if what == "deep_sea":
+        return deep_sea(_size(options, 3, 2, lambda n: n * n), **options)
+    return _from_file(Path(what), options)
+
+
+def study(mdp: TabularMDP) -> Study:
+    """Enumerate the deterministic policies and hold the bounds beside the truth, for each depth 0 .. M.
+
+    Raises:
+        PgtsError: there are too many policies, or one has no value.
+    """
+    sets = stationary.enumerate_sets(mdp)
+    M, worst_SA = sets.sufficient_depth, stationary.worst_policy(mdp)
+
+    def row(depth: int) -> DepthRow:
+        worst = sets.worst_return(depth)
+        return DepthRow(
+            depth,
+            sets.count(depth),
+            worst,
+            sets.J_optimal - worst if depth < M else 0.0,
+            stationary.worst_case_bound(mdp, worst_SA, depth),
+            stationary.reachable_bound(mdp, depth),
+            stationary.closed_form_bound(mdp, depth),
+        )
+
+    rows = tuple(row(depth) for depth in range(M + 1))
+    return Study(mdp.num_states, mdp.num_actions, len(sets.J_P), sets.J_optimal, M, sets.histogram, rows)
+
+
+def to_json(study: Study) -> dict[str, Any]:
+    """The study in the types of JSON: a bound that says nothing is null, the optimal policies escape at "never"."""
+    answer = asdict(study)
+    answer["escape_depths"] = {_depth_name(depth): count for depth, count in study.escape_depths.items()}
+    for row in answer["depths"]:
+        row |= {name: None for name, value in row.items() if value == math.inf}
+    return answer
+
+
+def describe(study: Study) -> str:
+    """The study as tables within 80 columns."""
+    return "\n".join(_lines(study))
+
+
+# Random families
+
+
+@dataclass(frozen=True)
+class FamilyRow:
+    """One random MDP: how it was drawn, how it is connected, and what its stationary policies are like.
+
+    diameter: the largest finite shortest path between two states, in steps.
+    sufficient_depth: the smallest M with Pi^M = Pi^inf.
+    worst_return: b^0.
+    """
+
+    branching: int
+    reward_share: float
+    gamma: float
+    num_states: int
+    seed: int
+    diameter: int
+    sufficient_depth: int
+    worst_return: float
+    J_optimal: float
+
+
+def family_study(
+    *,
+    branchings: Sequence[int] = (1, 2, 3),
+    reward_shares: Sequence[float] = (0.05, 0.2, 1.0),
+    gammas: Sequence[float] = (0.5, 0.9, 0.99),
+    sizes: Sequence[int] = (5, 7, 9),
+    seeds: Iterable[int] = range(20),
+) -> list[FamilyRow]:
+    """How deep is deep enough in random MDPs of two actions that start in state 0: one row for each MDP.
+
+    The same seed gives the same transitions for all gammas and reward shares, and the same rewards for all gammas.
+    """
+    rows = []
+    for seed in seeds:
+        for branching in branchings:
+            for size in sizes:
+                for share in reward_shares:
+                    for gamma in gammas:
+                        mdp = sparse_random_mdp(size, branching=branching, reward_share=share, gamma=gamma, seed=seed)
+                        sets = stationary.enumerate_sets(mdp)
+                        reached, worst = sets.sufficient_depth, sets.worst_return(0)
+                        drawn = (branching, share, gamma, size, seed)
+                        rows.append(FamilyRow(*drawn, diameter(mdp), reached, worst, sets.J_optimal))
+    return rows
+
+
+def sparse_random_mdp(
+    num_states: int,
+    num_actions: int = 2,
+    *,
+    branching: int,
+    reward_share: float,
+    gamma: float = 0.9,
+    seed: int = 0,
+    start: int | None = 0,
+) -> TabularMDP:
+    """`random_mdp` with most of its rewards set to 0.
+
+    Args:
+        reward_share: the share of (s, a) that keep their reward, drawn at random; at least one does.
+    """
+    if not 0 <= reward_share <= 1:
+        raise PgtsError(f"reward_share is {reward_share}; it must be in [0, 1]")
+    mdp = random_mdp(num_states, num_actions, branching=branching, seed=seed, gamma=gamma, start=start)
+    order = numpy_stream(seed, "sparse_random_mdp").permutation(num_states * num_actions)
+    kept = order < max(1, round(reward_share * len(order)))
+    reward_SA = mdp.outcomes.reward_NA * torch.from_numpy(kept).view(num_states, num_actions)
+    return replace(mdp, outcomes=replace(mdp.outcomes, reward_NA=reward_SA))
+
+
+def diameter(mdp: TabularMDP) -> int:
+    """The largest finite shortest path between two states, in steps with positive probability and discount."""
+    weight_SAS = mdp.outcomes.weight.to_dense().view(mdp.num_states, mdp.num_actions, -1)
+    steps = scipy.sparse.csgraph.shortest_path((weight_SAS > 0).any(1).numpy(), unweighted=True)
+    return int(steps[np.isfinite(steps)].max())
+
+
+def _from_file(path: Path, options: dict[str, Any]) -> TabularMDP:
+    mdp = TabularMDP.load_npz(path)
+    if "start" not in options:
+        return mdp
+    return replace(mdp, start_S=start_distribution(options["start"], mdp.num_states))
+
+
+def _size(options: dict[str, Any], default: int, num_actions: int, num_states: Callable[[int], int]) -> int:
+    """The option n; PgtsError, with the largest size that is none, if it gives more policies than are enumerated."""
+    n = options.pop("n", default)
+    try:
+        stationary.check_enumerable(num_states(n), num_actions)
+    except PgtsError as error:
+        fit = max(k for k in range(1, 21) if num_actions ** num_states(k) <= stationary.MAX_POLICIES)
+        raise PgtsError(f"--n {n} gives {error}, as --n {fit} does") from None
+    return n
+
+
+def _lines(study: Study) -> Iterator[str]:
+    yield f"{study.num_states} states, {study.num_actions} actions, {study.num_policies:,} deterministic policies"
+    yield f"J* = {study.J_optimal:.8g}"
+    yield f"sufficient depth M = {study.sufficient_depth}: all policies in Pi^{study.sufficient_depth} are optimal"
+    yield ""
+    yield "depth     |Pi^m|        b^m   J* - b^m   by values    by reach  closed form"
+    shown = [row for row in study.depths if len(study.depths) <= ALL_ROWS or _changes(study, row.depth)]
+    for row in shown:
+        bounds = (row.value_bound, row.reachable_bound, row.closed_form_bound)
+        value, reach, closed = ("none" if math.isinf(bound) else f"{bound:.5g}" for bound in bounds)
+        yield (
+            f"{row.depth:>5}  {row.count:>9}  {row.worst_return:>9.5g}  {row.lack:>9.5g}  {value:>10}  {reach:>10}  "
+            f"{closed:>11}"
+        )
+    if len(shown) < len(study.depths):
+        yield "Depths at which |Pi^m| stays the same are left out."
+    yield from (
+        "",
+        "b^m is the least return of a policy in Pi^m. What bounds J* - b^m:",
+        "  by values    Prop. 3, with the worst values of any policy",
+        "  by reach     gamma and the rewards that m + 1 steps do not pass by",
+        "  closed form  gamma and all rewards",
+        "",
+    )
+    yield f"{'escapes at':>10}  {'policies':>9}"
+    most = max(study.escape_depths.values())
+    for depth, count in sorted(study.escape_depths.items(), key=lambda item: (item[0] == stationary.NEVER, item[0])):
+        yield f"{_depth_name(depth):>10}  {count:>9}  {'#' * math.ceil(BAR * count / most)}"
+
+
+def _changes(study: Study, depth: int) -> bool:
+    return depth == 0 or depth in study.escape_depths
+
+
+def _depth_name(depth: int) -> str:
+    return "never" if depth == stationary.NEVER else str(depth)
