@@ -2,6 +2,17 @@
 
 from pgts_torch.tabular import ascent, exact, stationary
 from pgts_torch.tabular.mdp import TabularMDP
-from pgts_torch.tabular.zoo import deep_sea, grid, ladder, random_mdp, tightrope
+from pgts_torch.tabular.zoo import deep_sea, grid, ladder, mirage, random_mdp, tightrope
 
-__all__ = ["TabularMDP", "ascent", "deep_sea", "exact", "grid", "ladder", "random_mdp", "stationary", "tightrope"]
+__all__ = [
+    "TabularMDP",
+    "ascent",
+    "deep_sea",
+    "exact",
+    "grid",
+    "ladder",
+    "mirage",
+    "random_mdp",
+    "stationary",
+    "tightrope",
+]

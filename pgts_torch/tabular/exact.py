@@ -120,7 +120,7 @@ def optimal(mdp: TabularMDP) -> Optimum:
         pi_SA = torch.nn.functional.one_hot(action_S, mdp.num_actions).double()
         v_S = policy_values(mdp, pi_SA)
         q_SA = backup(mdp.outcomes, v_S)
-        rounding = 1e-11 * max(1.0, float(q_SA.abs().max()))
+        rounding = 1e-11 * max(float(q_SA.abs().max()), float(mdp.outcomes.reward_NA.abs().max()))
         kept_S = q_SA.gather(1, action_S[:, None]).squeeze(1)
         better_S = q_SA.amax(-1) > kept_S + rounding
         if not better_S.any():

@@ -134,6 +134,28 @@ def grid(
     )
 
 
+def mirage(width: int = 10, *, delta: float = 0.05, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
+    """A choice that a deep lookahead belittles: in state 0, 'right' leads to state 1, where every step earns 1, and
+    'left' to one of `width` states at random, where a step earns 1 - delta by 'right' and nothing by 'left'.
+
+    J* = gamma / (1 - gamma) from state 0, by 'right' in every state. To the policy that always goes left the advantage
+    of 'right' in state 0 is
+
+        (T^m Q)(0, right) - (T^m Q)(0, left) = gamma / (1 - gamma) (1 - (1 - delta) (1 - gamma^m))
+
+    which falls from gamma / (1 - gamma) to delta gamma / (1 - gamma): what 'left' could still be made of counts more
+    and more with depth (docs/theory.md, Sec. 5). The wider, the slower it is made of it.
+    """
+    _check_size("width", width, 1)
+    if not 0 < delta < 1:
+        raise PgtsError(f"delta is {delta}; it must be above 0 and below 1")
+    scattered = [(1 / width, 2 + i, 0.0, False) for i in range(width)]
+    P: list[list[list[Transition]]] = [[scattered, [(1.0, 1, 0.0, False)]], [[(1.0, 1, 1.0, False)]] * 2]
+    for s in range(2, width + 2):
+        P.append([[(1.0, s, 0.0, False)], [(1.0, s, 1 - delta, False)]])
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=("left", "right"))
+
+
 def deep_sea(
     n: int = 10,
     *,

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 import pgts_torch  # noqa: F401  (registers the environments)
 from pgts_torch.agent import build
 from pgts_torch.experiment import strict_yaml
-from pgts_torch.experiment.config import Config, FixedHorizonConfig, dump
+from pgts_torch.experiment.config import Config, FixedHorizonConfig, SearchConfig, dump
 from pgts_torch.experiment.loading import MAX_BYTES, MAX_MISTAKES, ConfigError, load
 from pgts_torch.experiment.schema import Schema
 from pgts_torch.models.tabular import TabularModel
@@ -39,6 +39,9 @@ def mistakes(tmp_path: Path) -> Callable[..., list[str]]:
         return [line.replace(f"{tmp_path}/", "") for line in caught.value.mistakes]
 
     return find
+
+
+SEARCH_KEYS = ", ".join(SearchConfig.model_fields)
 
 
 @pytest.mark.parametrize(
@@ -113,8 +116,8 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ("update: {type: adam}", "update.type is 'adam'; it must be projected, softmax or mirror"),
         ("run: {overwrite: yes}", "run.overwrite is 'yes'; it must be true or false"),
         ("run: {dir: 5}", "run.dir is 5; it must be a folder or null (in quotes, to make it text)"),
-        ("search: 4", "search is 4; it must be a mapping with the keys depth, max_depth, tolerance, stop_at, max_nodes"),
-        ("search:", "search is empty; it must be a mapping with the keys depth, max_depth, tolerance, stop_at, max_nodes"),
+        ("search: 4", "search is 4; it must be a mapping with the keys " + SEARCH_KEYS),
+        ("search:", "search is empty; it must be a mapping with the keys " + SEARCH_KEYS),
         ("critic: 4", "critic is 4; it must be a mapping with the key type (exact, rollout or tabular)"),
         ("critic: {type: neural}", "critic.type is 'neural'; it must be exact, rollout or tabular"),
         ("critic: {type: [1]}", "critic.type is a list; it must be exact, rollout or tabular"),

@@ -1,7 +1,5 @@
 """Algorithm 1 with exact quantities, and the three ways in which a policy may move."""
 
-# ruff: noqa: SIM300  (J is a return, not a constant)
-
 import itertools
 from fractions import Fraction
 

@@ -1,7 +1,6 @@
 """The exact theory: closed forms, second routes, theorems."""
 
-# ruff: noqa: SIM300  (J is a return, not a constant)
-
+import dataclasses
 import itertools
 
 import numpy as np
@@ -463,3 +462,10 @@ def test_a_float32_policy_is_evaluated_to_float32_accuracy_and_carries_no_gradie
     assert single.v_S.dtype == torch.float64
     assert not single.q_SA.requires_grad
     assert single.d_S.sum().item() == pytest.approx(10, rel=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
+def test_the_optimum_does_not_depend_on_the_unit_of_reward(unit):
+    mdp = ladder(5)
+    scaled = TabularMDP(dataclasses.replace(mdp.outcomes, reward_NA=unit * mdp.outcomes.reward_NA), mdp.start_S)
+    assert exact.optimal(scaled).J == pytest.approx(6.561 * unit, rel=1e-12)

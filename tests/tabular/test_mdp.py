@@ -1,7 +1,5 @@
 """How tabular MDPs are made, and what is refused."""
 
-# ruff: noqa: SIM300  (J is a return, not a constant)
-
 import gymnasium
 import numpy as np
 import pytest

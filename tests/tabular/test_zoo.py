@@ -1,7 +1,5 @@
 """Each MDP of the zoo against a description written by hand."""
 
-# ruff: noqa: SIM300  (J is a return, not a constant)
-
 import math
 
 import numpy as np
