@@ -1,0 +1,115 @@
+"""The method from samples, repeated over seeds in worker processes, and what the repetitions say together."""
+
+import multiprocessing
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.stats
+import torch
+from jaxtyping import Float
+
+from pgts_torch.agent.build import Description
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.seeding import numpy_stream, seed_sequence
+from pgts_torch.tabular import exact
+
+WORKERS = 2
+CONFIDENCE = 0.95
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training run: `iterations` updates of PGTS with these arguments, from the stream of its own name.
+
+    stream: names the run; runs of different names draw independently.
+    """
+
+    stream: tuple[str | int, ...]
+    env_id: str
+    iterations: int
+    arguments: Mapping[str, Any]
+
+
+def returns(job: Job) -> list[float]:
+    """The exact return of pi_0 .. pi_K in one run."""
+    seed = int(seed_sequence(0, "figures", *job.stream).generate_state(1, np.uint64)[0] >> np.uint64(1))
+    algorithm = PGTS(job.env_id, seed=seed, **job.arguments)
+    J = [exact.evaluate(algorithm.mdp, algorithm.policy.table()).J]
+    for _ in range(job.iterations):
+        algorithm.iterate()
+        J.append(exact.evaluate(algorithm.mdp, algorithm.policy.table()).J)
+    return J
+
+
+class Here(Executor):
+    """Runs what it is given at once, in this process."""
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """The finished future of function(*args)."""
+        future: Future[Any] = Future()
+        future.set_result(function(*args, **kwargs))
+        return future
+
+
+def executor(workers: int) -> Executor:
+    """Processes that run jobs on one thread each; 0 workers: this process. How many changes no result."""
+    if workers == 0:
+        return Here()
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=torch.set_num_threads, initargs=(1,))
+
+
+@dataclass(frozen=True)
+class Band:
+    """The interquartile mean of several curves and its confidence interval, point by point."""
+
+    iqm: list[float]
+    low: list[float]
+    high: list[float]
+
+
+def band(J_NK: Float[np.ndarray, "N K"], *names: str | int) -> Band:
+    """Interquartile mean over N seeds with its bootstrap percentile interval.   (Agarwal et al. 2021)
+
+    Args:
+        names: of the stream that resamples the seeds.
+    """
+    draws_RN = numpy_stream(0, "bootstrap", *names).integers(0, len(J_NK), size=(RESAMPLES, len(J_NK)))
+    means_RK = interquartile_mean(J_NK[draws_RN], axis=1)
+    tail = (1 - CONFIDENCE) / 2
+    low_K, high_K = np.quantile(means_RK, [tail, 1 - tail], axis=0)
+    return Band(interquartile_mean(J_NK, axis=0).tolist(), low_K.tolist(), high_K.tolist())
+
+
+def interquartile_mean(values: np.ndarray, axis: int) -> np.ndarray:
+    """The mean without the lowest and the highest quarter."""
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
+
+
+def arguments(
+    *,
+    depth: int,
+    update: str,
+    step_size: float,
+    init: Description,
+    critic: Description,
+    horizon: Description,
+    num_envs: int,
+    gamma: float,
+    env_kwargs: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Arguments of PGTS for the paper's projected update of a simplex policy, or the softmax one."""
+    return {
+        "depth": depth,
+        "policy": {"type": {"projected": "simplex", "softmax": "softmax"}[update], "init": init},
+        "update": {"type": update, "step_size": step_size, "state_weight": "occupancy"},
+        "critic": critic,
+        "horizon": horizon,
+        "num_envs": num_envs,
+        "gamma": gamma,
+        "env_kwargs": dict(env_kwargs),
+    }
