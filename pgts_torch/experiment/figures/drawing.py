@@ -1,5 +1,6 @@
 """The pictures, each from the plain data of its part."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -165,7 +166,8 @@ def sufficient_depths(data: Data) -> Figure:
 
 def _draw_groups(ax: Axes, rows: Sequence[Data], across: str, by: str, label: str) -> None:
     """The mean of M over the rows of each value of `across`, a line for each value of `by`, evenly spaced."""
-    ticks = sorted({row[across] for row in rows})
+    sizes = Counter((row[by], row[across]) for row in rows)
+    ticks = sorted({tick for (_, tick), size in sizes.items() if size >= SMALLEST_GROUP})
     values = sorted({row[by] for row in rows})
     names = {"branching": "successors", "gamma": "gamma"}
     for order, (value, colour) in enumerate(depth_colours(values).items()):
@@ -185,8 +187,8 @@ def _draw_groups(ax: Axes, rows: Sequence[Data], across: str, by: str, label: st
     ax.set_xticks(range(len(ticks)), [f"{tick:g}" for tick in ticks])
     ax.set_xlabel(label)
     ax.set_yscale("symlog", linthresh=1)
-    ax.set_yticks([0, 1, 2, 5, 10, 20, 50], ["0", "1", "2", "5", "10", "20", "50"])
-    ax.set_ylim(-0.05, 60)
+    ax.set_yticks([0, 1, 2, 5, 10, 20, 50, 100], ["0", "1", "2", "5", "10", "20", "50", "100"])
+    ax.set_ylim(-0.05, 150)
     ax.legend(frameon=False, fontsize=9, loc="upper left")
     ax.grid(alpha=0.25)
 
