@@ -26,7 +26,7 @@ class Outcomes:
     Rows with fewer than K outcomes are padded with probability 0.
 
     Args:
-        reward_NA: expected immediate reward r(s, a), in reward units.
+        reward_NA: expected immediate reward r(s, a), in reward units; -inf where the action is not allowed.
         prob_NAK: probability p_k of each outcome; every (s, a) sums to 1.
         discount_NAK: gamma_k in [0, 1] of each outcome. An expanded (stride 0) tensor costs no memory.
         child_NAK: position of each child in the table of `num_children` values that `backup` reads.

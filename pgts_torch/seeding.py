@@ -1,9 +1,18 @@
-"""Named random streams: one integer seed, as many independent generators as there are names."""
+"""Randomness without a global state: named streams from one seed, and keys that name a single draw.
+
+A stream is drawn from in order. A key belongs to one thing, for instance to sample 3 of an action in a state, and what
+is drawn for it does not depend on what else is drawn: a batch may be split or reordered.
+"""
 
 import zlib
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+_ODD = 0x9E3779B97F4A7C15 - 2**64
+_FACTORS = 0xBF58476D1CE4E5B9 - 2**64, 0x94D049BB133111EB - 2**64
 
 
 def seed_sequence(seed: int, *names: str | int) -> np.random.SeedSequence:
@@ -40,3 +49,36 @@ def stream(seed: int, *names: str | int, device: torch.device | str = "cpu") -> 
     """
     state = seed_sequence(seed, *names).generate_state(1, np.uint64)[0]
     return torch.Generator(device).manual_seed(int(state) % 2**63)
+
+
+def draw_keys(count: int, *, generator: torch.Generator) -> Int[Tensor, "N"]:
+    """Keys, 64 bits each, from a stream."""
+    return torch.randint(-(2**63), 2**63 - 1, (count,), generator=generator, device=generator.device)
+
+
+def mix(key_N: Int[Tensor, "*#N"], *name_N: Int[Tensor, "*#N"] | int) -> Int[Tensor, "..."]:
+    """A key for each (key, names), as independent of its neighbours' as 64 bits allow; the same on every device.
+
+    SplitMix64 (Steele, Lea and Flood 2014), with one round for each name. Shapes broadcast.
+    """
+    for name in name_N:
+        key_N = _avalanche(key_N * _ODD + name)
+    return key_N
+
+
+def uniform(key_N: Int[Tensor, "*N"], dtype: torch.dtype = torch.float64) -> Float[Tensor, "*N"]:
+    """A number in [0, 1) for each key: its upper bits, as many as a mantissa of the dtype holds."""
+    bits = 53 if dtype == torch.float64 else 24
+    return _shifted(_avalanche(key_N + _ODD), 64 - bits).to(dtype) * 2.0**-bits
+
+
+def _avalanche(x_N: Tensor) -> Tensor:
+    """Every bit of the answer depends on every bit of x."""
+    for shift, factor in zip((30, 27), _FACTORS, strict=True):
+        x_N = (x_N ^ _shifted(x_N, shift)) * factor
+    return x_N ^ _shifted(x_N, 31)
+
+
+def _shifted(x_N: Tensor, bits: int) -> Tensor:
+    """The bits of x moved down, zeros moving in; torch's own shift repeats the sign."""
+    return (x_N >> bits) & ((1 << (64 - bits)) - 1)

@@ -1,12 +1,13 @@
-"""Named random streams."""
+"""Named random streams, and keys of single draws."""
 
 import itertools
 
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
-from pgts_torch.seeding import numpy_stream, seed_sequence, stream
+from pgts_torch.seeding import draw_keys, mix, numpy_stream, seed_sequence, stream, uniform
 
 KEYS = [
     (seed, *names)
@@ -67,3 +68,42 @@ def test_an_integer_name_out_of_range_is_refused(name):
     # 2**32 would be split in two words and so be the stream named (0, 1).
     with pytest.raises(ValueError, match=str(name)):
         seed_sequence(0, "rollout", name)
+
+
+# Keys
+
+
+def test_keys_are_mixed_as_the_published_generator_does_it():
+    """The first three numbers of SplitMix64 with the seed 1234567."""
+    numbers_N = mix(torch.tensor([1, 2, 3]), 1234567)
+    assert [n % 2**64 for n in numbers_N.tolist()] == [6457827717110365317, 3203168211198807973, 9817491932198370423]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_neighbouring_keys_draw_independent_uniform_numbers(dtype):
+    """Each of six p-values is below 1e-4 with probability 1e-4: false alarms in 6 of 10,000 seeds."""
+    key = draw_keys(1, generator=stream(0, "keys"))
+    u_N = uniform(mix(key, torch.arange(20_000)), dtype).double().numpy()
+    v_N = uniform(mix(key, torch.arange(20_000), 1), dtype).double().numpy()
+    assert u_N.min() >= 0
+    assert u_N.max() < 1
+    assert stats.kstest(u_N, "uniform").pvalue > 1e-4
+    assert stats.kstest(v_N, "uniform").pvalue > 1e-4
+    assert stats.pearsonr(u_N, v_N).pvalue > 1e-4
+    assert stats.pearsonr(u_N[1:], u_N[:-1]).pvalue > 1e-4
+
+
+def test_the_order_of_names_counts_and_shapes_broadcast():
+    key_N, a, b = draw_keys(5, generator=stream(0, "keys")), 3, 4
+    assert not torch.equal(mix(key_N, a, b), mix(key_N, b, a))
+    grid_NA = mix(key_N.unsqueeze(-1), torch.arange(3))
+    assert grid_NA.shape == (5, 3)
+    assert torch.equal(grid_NA[:, 2], mix(key_N, 2))
+    assert grid_NA.unique().numel() == 15
+
+
+def test_no_key_is_mixed_into_a_number_outside_the_half_open_interval():
+    extreme_N = torch.tensor([0, -1, 1, 2**63 - 1, -(2**63)])
+    for dtype in (torch.float32, torch.float64):
+        u_N = uniform(extreme_N, dtype)
+        assert bool(((u_N >= 0) & (u_N < 1)).all())

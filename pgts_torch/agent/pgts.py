@@ -22,7 +22,8 @@ from pgts_torch.agent.rollout import Horizon, Rollout, check_vector_env, make_ve
 from pgts_torch.agent.updates import Update
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.tabular import TabularModel, tabular_truth
-from pgts_torch.search.expectimax import MAX_NODES, Leaf, Lookahead, expectimax
+from pgts_torch.search.expectimax import expectimax
+from pgts_torch.search.lookahead import MAX_NODES, Leaf, Lookahead
 from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import stream
 from pgts_torch.tabular.exact import check_depth

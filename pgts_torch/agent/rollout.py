@@ -13,7 +13,7 @@ from torch import Tensor
 from pgts_torch.agent.policies import Policy
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import SamplingModel
-from pgts_torch.seeding import seed_sequence
+from pgts_torch.seeding import draw_keys, seed_sequence
 
 StateWeight = Literal["occupancy", "visits", "uniform"]
 
@@ -213,7 +213,7 @@ def simulated_returns(
     action_N = policy.sample(state_B, generator=generator) if first_action_B is None else first_action_B
     num_steps = 0
     for _ in range(horizon.limit):
-        drawn = model.sample(state_N, action_N, generator=generator)
+        drawn = model.sample(state_N, action_N, key_N=draw_keys(len(state_N), generator=generator))
         returns_B[row_N] += weight_N * drawn.reward_N
         num_steps += len(row_N)
         weight_N = weight_N * horizon.survival(drawn.discount_N, generator)

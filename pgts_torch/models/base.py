@@ -52,7 +52,9 @@ class SamplingModel(Model):
     """A model that draws one outcome of a state and an action."""
 
     @abstractmethod
-    def sample(
-        self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, generator: torch.Generator
-    ) -> Transitions:
-        """One outcome of each (state, action), drawn with the caller's generator and with nothing else."""
+    def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
+        """One outcome of each (state, action): a function of state, action and key (`seeding.mix`) and of nothing else.
+
+        So a search owns its randomness, cannot foresee what an environment will draw, and finds the same outcome
+        however its batch is split or ordered.
+        """

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.seeding import uniform
 from pgts_torch.tabular.mdp import TabularMDP
 
 
@@ -38,15 +39,12 @@ class TabularModel(EnumeratingModel, SamplingModel):
         """The rows of the table. [PGTS Sec. 2]"""
         return self.table.rows(state_N)
 
-    def sample(
-        self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, generator: torch.Generator
-    ) -> Transitions:
+    def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
         """One outcome of each (state, action) by inverting the distribution function; the reward is r(s, a)."""
         cumulative_NK = self._cumulative_NAK[state_N, action_N]
-        total_N1 = cumulative_NK[:, -1:]
-        uniform_N1 = torch.rand(total_N1.shape, generator=generator, device=self.device, dtype=self.dtype)
+        level_N1 = uniform(key_N, self.dtype).unsqueeze(-1) * cumulative_NK[:, -1:]
         # The first k whose cumulative probability exceeds u < total always has positive probability.
-        k_N1 = (cumulative_NK <= uniform_N1 * total_N1).sum(-1, keepdim=True)
+        k_N1 = (cumulative_NK <= level_N1).sum(-1, keepdim=True)
         return Transitions(
             self.table.reward_NA[state_N, action_N],
             self.table.discount_NAK[state_N, action_N].gather(-1, k_N1).squeeze(-1),

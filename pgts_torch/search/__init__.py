@@ -1,6 +1,7 @@
 """Lookahead values at roots."""
 
-from pgts_torch.search.expectimax import Lookahead, expectimax
+from pgts_torch.search.expectimax import expectimax
+from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.search.topology import Topology
 
 __all__ = ["Lookahead", "Topology", "expectimax"]

@@ -11,9 +11,13 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NodeBudgetExceeded, PgtsError
 from pgts_torch.models.base import EnumeratingModel
+from pgts_torch.search.lookahead import check_states, check_vector
 
 _REMEMBERED_ROOTS = 8
 """How many different batches of roots keep their levels."""
+
+_TOLERANCE = 1e-4
+"""By how much the probabilities of a model may miss 1: enough for many of them in float32."""
 
 
 @dataclass(eq=False)
@@ -129,7 +133,7 @@ class Topology:
             PgtsError: no roots, or one that is not a state of the model.
             NodeBudgetExceeded: the levels hold more nodes than that; the model has not been asked about them.
         """
-        _check_vector(root_B)
+        check_vector(root_B)
         key = root_B.cpu().numpy().tobytes()
         levels = self._levels.get(key)
         if levels is None:
@@ -148,7 +152,7 @@ class Topology:
     @torch.no_grad()
     def _start(self, root_B: Int[Tensor, "B"]) -> Levels:
         """Level 0: the distinct roots."""
-        self._check_states(root_B)
+        check_states(root_B, self.model.num_states)
         self._grow_tables()
         roots = self._distinct(root_B)
         return Levels([roots], self._position(roots)[root_B])
@@ -222,17 +226,25 @@ class Topology:
             self._row_S = torch.cat([self._row_S, unknown])
             self._scratch_S = torch.cat([self._scratch_S, unknown])
 
-    def _check_states(self, root_B: Int[Tensor, "B"]) -> None:
-        off = torch.nonzero((root_B < 0) | (root_B >= self.model.num_states)).flatten()
-        if len(off):
-            raise PgtsError(
-                f"root_B[{int(off[0])}] is {int(root_B[off[0]])}; states are 0 to {self.model.num_states - 1}"
-            )
-
     def _check_answer(self, state_N: Int[Tensor, "N"], answer: Outcomes) -> None:
         asked, given = (len(state_N), self.model.num_actions), tuple(answer.reward_NA.shape)
         if given != asked:
             raise PgtsError(f"the model answered for {given} states and actions; it was asked for {asked}")
+        best_N = answer.reward_NA.amax(-1)
+        if not bool(best_N.isfinite().all()):
+            n = int(torch.nonzero(~best_N.isfinite())[0, 0])
+            raise PgtsError(
+                f"the model's rewards in state {int(state_N[n])} are {answer.reward_NA[n].tolist()}; they must be "
+                "numbers, or -inf where an action is not allowed, and one action must be"
+            )
+        total_NA = torch.where(answer.reward_NA > -torch.inf, answer.prob_NAK.sum(-1), 1.0)
+        fair_NA = (total_NA - 1).abs() <= _TOLERANCE
+        if not bool(fair_NA.all()):
+            n, a = torch.nonzero(~fair_NA)[0].tolist()
+            raise PgtsError(
+                f"the model's probabilities of what follows state {int(state_N[n])} and action {a} sum to "
+                f"{float(total_NA[n, a])}"
+            )
         child_NAK = answer.child_NAK
         off_NAK = (child_NAK < 0) | (child_NAK >= self.model.num_states)
         if off_NAK.any():
@@ -243,17 +255,11 @@ class Topology:
             )
 
 
-def _check_vector(root_B: Tensor) -> None:
-    """PgtsError unless these are one or more integers; what they are is checked where they are first met."""
-    if root_B.ndim != 1 or len(root_B) == 0:
-        raise PgtsError(f"root_B has shape {tuple(root_B.shape)}; it must be a vector of at least one state")
-    if root_B.dtype != torch.int64:
-        raise PgtsError(f"root_B is {root_B.dtype}; states are int64")
-
-
 def _counts(outcomes: Outcomes) -> Bool[Tensor, "N A K"]:
-    """Where an outcome has weight. A terminal outcome and padding have none, and what follows them needs no node."""
-    return (outcomes.prob_NAK > 0) & (outcomes.discount_NAK > 0)
+    """Where an outcome has weight. A terminal outcome, an action that is not allowed and padding have none, and what
+    follows them needs no node."""
+    allowed_NA1 = outcomes.reward_NA.unsqueeze(-1) > -torch.inf
+    return (outcomes.prob_NAK > 0) & (outcomes.discount_NAK > 0) & allowed_NA1
 
 
 def _check_budget(levels: Levels, expansions: int, max_nodes: int) -> None:

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel
-from pgts_torch.models import TabularModel, Transitions
+from pgts_torch.models import TabularModel, Transitions, tabular
 from pgts_torch.models.tabular import tabular_truth
-from pgts_torch.seeding import stream
+from pgts_torch.seeding import draw_keys, stream
 from pgts_torch.tabular import TabularMDP, grid, ladder
 from tests.support import ZOO, outcomes_of, zoo
 
@@ -41,9 +41,13 @@ def p_value(mdp: TabularMDP, drawn: Transitions, times: int) -> float:
     return float(scipy.stats.chi2.sf(statistic, freedom)) if freedom else 1.0
 
 
+def keys(count: int, seed: int) -> Tensor:
+    return draw_keys(count, generator=stream(seed, "keys"))
+
+
 def sample(mdp: TabularMDP, times: int, dtype: torch.dtype = torch.float64) -> Transitions:
     state_N, action_N = every_pair(mdp, times)
-    return TabularModel(mdp, dtype=dtype).sample(state_N, action_N, generator=stream(1, "sample"))
+    return TabularModel(mdp, dtype=dtype).sample(state_N, action_N, key_N=keys(len(state_N), 1))
 
 
 @pytest.mark.parametrize("name", ZOO)
@@ -96,7 +100,7 @@ def test_outcomes_with_probability_0_are_never_drawn_wherever_they_stand(prob, d
 @pytest.mark.parametrize(("uniform", "outcome"), [(lambda eps: 0.0, 1), (lambda eps: 1 - eps / 2, 4)])
 def test_even_the_least_and_the_largest_number_below_1_draw_a_possible_outcome(uniform, outcome, dtype, monkeypatch):
     number = uniform(torch.finfo(dtype).eps)
-    monkeypatch.setattr(torch, "rand", lambda shape, *, dtype, **_: torch.full(shape, number, dtype=dtype))
+    monkeypatch.setattr(tabular, "uniform", lambda key_N, dtype: torch.full(key_N.shape, number, dtype=dtype))
     drawn = sample(padded([0.0, 0.1, 0.1, 0.1, 0.7 - 9e-10, 0.0, 0.0]), 1, dtype)
     assert drawn.discount_N.item() == pytest.approx(outcome / 10)
 
@@ -114,24 +118,19 @@ def test_a_terminal_outcome_has_discount_0_and_the_others_keep_theirs():
 def test_the_reward_is_that_of_the_state_and_the_action_whatever_follows():
     mdp = zoo("FrozenLake")
     state_N, action_N = every_pair(mdp, 5)
-    drawn = TabularModel(mdp).sample(state_N, action_N, generator=stream(0, "reward"))
+    drawn = TabularModel(mdp).sample(state_N, action_N, key_N=keys(len(state_N), 0))
     assert torch.equal(drawn.reward_N, mdp.outcomes.reward_NA[state_N, action_N])
     assert bool((drawn.reward_N > 0).any())
 
 
-def test_sampling_uses_the_given_generator_and_no_other():
+def test_an_outcome_is_a_function_of_state_action_and_key_alone():
     model, (state_N, action_N) = TabularModel(zoo("garnet")), every_pair(zoo("garnet"))
     torch_before, numpy_before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-
-    def draw(seed: int) -> Tensor:
-        return model.sample(state_N, action_N, generator=stream(seed, "private")).next_state_N
-
-    assert torch.equal(draw(0), draw(0))
-    assert not torch.equal(draw(0), draw(1))
-    generator = stream(0, "private")
-    first, second = (model.sample(state_N, action_N, generator=generator).next_state_N for _ in range(2))
-    assert torch.equal(first, draw(0))
-    assert not torch.equal(first, second)
+    key_N, order_N = keys(len(state_N), 0), torch.randperm(len(state_N), generator=stream(0, "order"))
+    drawn_N = model.sample(state_N, action_N, key_N=key_N).next_state_N
+    reordered_N = model.sample(state_N[order_N], action_N[order_N], key_N=key_N[order_N]).next_state_N
+    assert torch.equal(reordered_N, drawn_N[order_N])
+    assert not torch.equal(model.sample(state_N, action_N, key_N=keys(len(state_N), 1)).next_state_N, drawn_N)
     assert torch.equal(torch.get_rng_state(), torch_before)
     assert np.array_equal(np.random.get_state()[1], numpy_before)  # noqa: NPY002
 

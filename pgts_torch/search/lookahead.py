@@ -1,0 +1,115 @@
+"""What every search takes and gives: leaf values in, values of all actions of the roots out."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.models.base import Model
+from pgts_torch.tabular.exact import check_depth
+
+Leaf = Callable[[Tensor], Tensor]
+"""A critic as a search asks it: states [N] to values [N, A] (of Q^pi) or [N] (of v^pi)."""
+
+MAX_NODES = 10_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Lookahead:
+    """Estimates of (T^m Q)(s, .) at the roots, how far they can be trusted, and what they cost.
+
+    q_BA: lookahead values of all actions, in reward units and in the dtype of the model; they carry no gradient.
+        -inf where the action is not allowed.
+    stderr_BA: standard error of q that comes from sampled outcomes, in reward units: 0 where all outcomes were listed.
+    pruned_BA: in [0, 1]: the most discounted probability that any plan after (s, a) puts on nodes above the last level
+        that the critic values in place of a deeper look. If the critic is off by at most e there,
+        |q - T^m Q| <= pruned * e beside the sampling error; 0 for a search of full width.
+    model_calls: how many (state, action) the model was asked for in this search.
+    critic_calls: how often the critic was asked, each time for many states together.
+    nodes_per_level: how many nodes are backed up at each level, from the roots to the leaves.
+    """
+
+    q_BA: Float[Tensor, "B A"]
+    stderr_BA: Float[Tensor, "B A"]
+    pruned_BA: Float[Tensor, "B A"]
+    model_calls: int
+    critic_calls: int
+    nodes_per_level: tuple[int, ...]
+
+    @property
+    def nodes(self) -> int:
+        """All nodes of all levels."""
+        return sum(self.nodes_per_level)
+
+
+@final
+class Leaves:
+    """The critic of one search: checks what it says and counts how often it is asked.
+
+    Args:
+        model: whose states are asked about.
+        depth: m, a finite whole number of at least 0.
+        q_leaf: an estimate of Q^pi: states [N] to [N, A].
+        v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.
+
+    Raises:
+        PgtsError: a bad depth, or not exactly one critic.
+    """
+
+    def __init__(self, model: Model, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None) -> None:
+        if (q_leaf is None) == (v_leaf is None):
+            raise PgtsError("give exactly one of q_leaf and v_leaf")
+        self.calls = 0
+        self.expansions = check_depth(depth) + (v_leaf is not None)
+        """How many levels are unfolded: with Q at the bottom m of them, with v one more, for Q = r + gamma P v."""
+        self._model, self._q_leaf, self._v_leaf = model, q_leaf, v_leaf
+
+    def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+        """v, or max_a Q(s, a).
+
+        Raises:
+            PgtsError: the critic's answer has a wrong shape, or is not finite (naming the state).
+        """
+        if self._v_leaf is None:
+            return self.q(state_N).amax(-1)
+        return self._asked(self._v_leaf, state_N, (len(state_N),))
+
+    def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+        """Q(s, .); as `v` otherwise. Only for critics of Q^pi."""
+        assert self._q_leaf is not None
+        return self._asked(self._q_leaf, state_N, (len(state_N), self._model.num_actions))
+
+    def _asked(self, leaf: Leaf, state_N: Tensor, shape: tuple[int, ...]) -> Tensor:
+        self.calls += 1
+        values = leaf(state_N).to(self._model.dtype)
+        if values.shape != shape:
+            given, asked = tuple(values.shape), len(state_N)
+            raise PgtsError(f"the critic answered with shape {given}; {asked} leaves ask for {shape}")
+        if math.isfinite(values.sum()):  # one cheap call; only a sum that overflows makes it look closer in vain
+            return values
+        off = torch.nonzero(~torch.isfinite(values))
+        if len(off):
+            row = int(off[0, 0])
+            value = values[row].tolist()
+            raise PgtsError(f"the critic's value of state {int(state_N[row])} is {value}; it must be finite")
+        return values
+
+
+def check_vector(root_B: Tensor) -> None:
+    """PgtsError unless these are one or more integers."""
+    if root_B.ndim != 1 or len(root_B) == 0:
+        raise PgtsError(f"root_B has shape {tuple(root_B.shape)}; it must be a vector of at least one state")
+    if root_B.dtype != torch.int64:
+        raise PgtsError(f"root_B is {root_B.dtype}; states are int64")
+
+
+def check_states(root_B: Tensor, num_states: int) -> None:
+    """PgtsError unless these are states."""
+    off = torch.nonzero((root_B < 0) | (root_B >= num_states)).flatten()
+    if len(off):
+        raise PgtsError(f"root_B[{int(off[0])}] is {int(root_B[off[0]])}; states are 0 to {num_states - 1}")
