@@ -11,3 +11,7 @@ class NodeBudgetExceeded(PgtsError):
 
 class MissingModel(PgtsError):
     """An environment offers no model that a lookahead could ask."""
+
+
+class RandomOutcomes(PgtsError):
+    """A model that lists outcomes where it is certain of them was asked where chance decides."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.policies import Policy, fitting
+from pgts_torch.agent.policies import Policy, fitting, listed
 from pgts_torch.agent.rollout import GeometricHorizon, Horizon, Rollout, simulated_returns
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import SamplingModel
@@ -64,8 +64,9 @@ class ExactCritic(Critic):
         self._evaluation: exact.Evaluation | None = None
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
-        """Solve the Bellman equation of the policy; the rollout is not looked at."""
-        self._evaluation = exact.evaluate(self.mdp, policy.table())
+        """Solve the Bellman equation of the policy; the rollout only says what the policy sees of the states."""
+        states = torch.arange(self.mdp.num_states, device=rollout.state_TB.device)
+        self._evaluation = exact.evaluate(self.mdp, listed(policy, rollout.observe(states)))
         return {}
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:

@@ -15,50 +15,68 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pgts_torch.agent import saving
-from pgts_torch.agent.build import Description, make_critic, make_horizon, make_policy, make_update
+from pgts_torch.agent.advantages import LookaheadAdvantages, SampledAdvantages, score_function
+from pgts_torch.agent.build import (
+    Description,
+    make_critic,
+    make_estimator,
+    make_horizon,
+    make_policy,
+    make_search,
+    make_update,
+)
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.policies import Policy, SimplexPolicy
-from pgts_torch.agent.rollout import Horizon, Rollout, check_vector_env, make_vector_env, rollout
+from pgts_torch.agent.neural_updates import NetworkUpdate
+from pgts_torch.agent.policies import Policy, TabularPolicy, listed
+from pgts_torch.agent.rollout import Horizon, Rollout, rollout
 from pgts_torch.agent.updates import Update
+from pgts_torch.agent.world import make_vector_env, make_world
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.tabular import TabularModel, tabular_truth
-from pgts_torch.search.expectimax import expectimax
-from pgts_torch.search.lookahead import MAX_NODES, Leaf, Lookahead
-from pgts_torch.search.topology import Topology
+from pgts_torch.search.engine import Search
+from pgts_torch.search.lookahead import Leaf, Lookahead
 from pgts_torch.seeding import stream
 from pgts_torch.tabular.exact import check_depth
-
-DEFAULT_GAMMA = 0.99
-"""Discount of an environment that carries none."""
+from pgts_torch.tabular.mdp import TabularMDP
 
 DEFAULT_MAX_DEPTH = 64
 DEFAULT_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Iteration:
+class Seen:
+    """What the policy pi_k is moved by.
+
+    state_N, weight_N: the states that it visited, and what each counts for in the update; with sampled advantages every
+        visit has a row of its own.
+    pi_NA: pi_k at these states.
+    advantage_NA: how much better each action is.
+    depth: m.
+    look: (T^m Q)(s, .) at these states; None with sampled advantages.
+    gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, with v(s) = <pi(.|s), Q(s, .)> of the same critic.
+    certificate: an upper bound on J* - J^pi; true if the critic is exact, else as far as its v is right at the start
+        states. Infinite where the model knows no largest value, and for sampled searches, which prove nothing.
+    """
+
+    state_N: Int[Tensor, "N"]
+    weight_N: Float[Tensor, "N"]
+    pi_NA: Float[Tensor, "N A"]
+    advantage_NA: Float[Tensor, "N A"]
+    depth: int
+    look: Lookahead | None
+    gap_N: Float[Tensor, "N"]
+    certificate: float
+
+
+@dataclass(frozen=True, eq=False)
+class Iteration(Seen):
     """What one pass through the loop of Algorithm 1 saw and did.
 
     experience: the episodes of pi_k.
-    state_N, weight_N: the states it visited, and what each counted for in the update.
-    pi_NA: pi_k at these states, before the update.
-    depth: m.
-    look: (T^m Q)(s, .) at these states.
-    gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, with v(s) = <pi(.|s), Q(s, .)> of the same critic.
-    certificate: an upper bound on J* - J^pi; true if the critic is exact, else as far as its v is right at the start
-        states. Infinite where the model knows no largest value.
-    losses: the critic's, by name.
+    losses: the critic's and the update's, by name.
     model_calls: (state, action) asked of the model in this pass, by the lookahead and by the critic.
     """
 
     experience: Rollout
-    state_N: Int[Tensor, "N"]
-    weight_N: Float[Tensor, "N"]
-    pi_NA: Float[Tensor, "N A"]
-    depth: int
-    look: Lookahead
-    gap_N: Float[Tensor, "N"]
-    certificate: float
     losses: dict[str, float]
     model_calls: int
 
@@ -77,19 +95,26 @@ class PGTS:
     from streams named by (seed, k), so a loaded model goes on exactly as the saved one would have.
 
     Args:
-        env: a Gymnasium id with a tabular model behind it (pgts/*, or an environment with a P table), or copies of one
-            as a VectorEnv that resets by mask.
+        env: a Gymnasium id, or copies as a VectorEnv that resets by mask. What a lookahead asks is the environment's
+            table (pgts/*, or a P table), else its dynamics in torch (CartPole, Acrobot, MountainCar), else a simulator
+            that is restored from snapshots.
         depth: m. 0 is plain policy gradient. "adaptive": in each iteration the smallest m at which the policy is far
             from stationary, because then it deserves no deeper look: sum_s d(s) g_m(s) > tolerance * certificate.
         max_depth: the largest m of an adaptive depth (default 64).
         tolerance: which share of what may be missing to J* a lookahead must see to be deep enough (default 0.1).
         stop_at: `learn` ends, with the policy in question, once the certificate proves J* - J^pi <= stop_at.
             Default: never.
-        policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax",
-            {"type": "tabular", "target": "q"}, ...
+        search: how the lookahead is made (`search.engine`): "auto", {"type": "sampled", "samples": 8}, ...
+        estimator: "lookahead", or {"type": "sampled", "lambda": 0.95}: advantages of the actions taken, as in PPO and
+            A2C, which need depth 0, a network and no model.
+        policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax", "mlp",
+            {"type": "tabular", "target": "q"}, ... Default: tables where the environment is tabular, else networks.
         num_envs: episodes in each iteration.
+        action_repeat: how often the lookahead takes an action before it takes the next, so that it sees as many times
+            further at the same depth (`TensorModel` says what T^m Q is then); not in tables. Experience, and the
+            policy, take single actions.
+        observation_key: which part of dictionary observations policy and critic see.
         gamma: discount. Default: the environment's own (pgts/*), else 0.99. Copies of pgts/* bring their own.
-        max_nodes: the most nodes of one lookahead.
         seed: of everything random.
         device: where policy, critic and model live.
         env_kwargs: for gymnasium.make, if the environment is given by its id.
@@ -107,13 +132,16 @@ class PGTS:
         max_depth: int | None = None,
         tolerance: float | None = None,
         stop_at: float | None = None,
-        policy: Description | Policy = "softmax",
-        critic: Description | Critic = "tabular",
+        search: Description = "auto",
+        estimator: Description = "lookahead",
+        policy: Description | Policy | None = None,
+        critic: Description | Critic | None = None,
         update: Description | Update | None = None,
         horizon: Description | Horizon = "fixed",
         num_envs: int = 32,
+        action_repeat: int = 1,
+        observation_key: str | None = None,
         gamma: float | None = None,
-        max_nodes: int = MAX_NODES,
         seed: int = 0,
         device: torch.device | str = "cpu",
         env_kwargs: Mapping[str, Any] | None = None,
@@ -125,26 +153,30 @@ class PGTS:
             raise PgtsError(f"stop_at is {stop_at}; it must be finite and at least 0")
         self.stop_at = stop_at
         self.seed = seed
-        self.max_nodes = max_nodes
         self.device = torch.device(device)
-        self.env = self.make_copies(num_envs) if isinstance(env, str) else env
-        check_vector_env(self.env)
-        self.mdp = tabular_truth(self.env, gamma=DEFAULT_GAMMA if gamma is None else gamma)
-        self.gamma = float(self.mdp.outcomes.discount_NAK.max())
-        self.model = TabularModel(self.mdp, device=self.device)
-        self.topology = Topology(self.model)
-        S, A = self.mdp.num_states, self.mdp.num_actions
+        self.estimator = make_estimator(estimator)
+        self.world = make_world(
+            env,
+            num_envs=num_envs,
+            gamma=gamma,
+            observation_key=observation_key,
+            plain=isinstance(self.estimator, SampledAdvantages),
+            action_repeat=action_repeat,
+            device=device,
+            **(env_kwargs or {}),
+        )
         if not isinstance(policy, Policy):
-            policy = make_policy(policy, S, A, seed=seed, device=self.device)
+            policy = make_policy(policy, self.world, seed=seed)
         if not isinstance(critic, Critic):
-            critic = make_critic(critic, self.model, self.mdp)
-        if update is None:
-            update = "projected" if isinstance(policy, SimplexPolicy) else "softmax"
+            critic = make_critic(critic, self.world, policy, seed=seed)
         if not isinstance(update, Update):
-            update = make_update(update)
+            update = make_update(update, policy)
         if not isinstance(horizon, Horizon):
             horizon = make_horizon(horizon)
         self.policy, self.critic, self.update, self.horizon = policy, critic, update, horizon
+        self.search: Search | None = None
+        if isinstance(self.estimator, LookaheadAdvantages):
+            self.search = make_search(search, self.world)
         self._check_parts()
         self.num_iterations = 0
         self.num_env_steps = 0
@@ -153,54 +185,106 @@ class PGTS:
     def _check_parts(self) -> None:
         """PgtsError where parts do not fit each other, or where an argument would have no effect."""
         self.update.check(self.policy)
-        shape, found = (self.mdp.num_states, self.mdp.num_actions), (self.policy.num_states, self.policy.num_actions)
-        if found != shape:
-            raise PgtsError(f"the policy is one of (states, actions) = {found}; the environment has {shape}")
+        if isinstance(self.policy, TabularPolicy):
+            shape, found = (
+                (self.mdp.num_states, self.mdp.num_actions),
+                (self.policy.num_states, self.policy.num_actions),
+            )
+            if found != shape:
+                raise PgtsError(f"the policy is one of (states, actions) = {found}; the environment has {shape}")
         if not isinstance(self._arguments["env"], str):
             gamma, env_kwargs = self._arguments["gamma"], self._arguments["env_kwargs"]
-            if gamma not in (None, self.gamma):
-                raise PgtsError(f"gamma is {gamma}; the given environment has its own, {self.gamma}")
+            if gamma not in (None, self.world.gamma):
+                raise PgtsError(f"gamma is {gamma}; the given environment has its own, {self.world.gamma}")
             if env_kwargs:
                 raise PgtsError(f"env_kwargs is {env_kwargs}; an environment that is given as an object takes none")
+        if isinstance(self.estimator, SampledAdvantages):
+            for name, default in (("depth", 0), ("search", "auto"), ("stop_at", None)):
+                if self._arguments[name] != default:
+                    value = self._arguments[name]
+                    raise PgtsError(f"{name} is {value}; sampled advantages look no step ahead, it must be {default}")
+            if not isinstance(self.update, NetworkUpdate):
+                raise PgtsError(
+                    f"{type(self.update).__name__} takes one row a state; sampled advantages have one a visit"
+                )
 
     def iterate(self) -> Iteration:
         """One pass through the loop: visit states, estimate Q^pi, look m steps ahead, move pi.        [PGTS Alg. 1]"""
         names = ("iteration", self.num_iterations)
         generator = stream(self.seed, *names, device=self.device)
-        calls_before = self.topology.model_calls + self.critic.model_calls
+        if self.world.forget() and self.search is not None:
+            self.search.forget()
+        calls_before = self._model_calls()
 
         # Visit states with pi_k and estimate Q^{pi_k} (line 2).
         experience = rollout(
-            self.env, self.policy, self.horizon, gamma=self.gamma, seed=self.seed, names=names, generator=generator
+            self.world, self.world.env, self.policy, self.horizon, seed=self.seed, names=names, generator=generator
         )
+        taken = self._taken(experience)
         losses = self.critic.fit(self.policy, experience, generator=generator)
 
         # Look m steps ahead from the states with d(s) > 0.
-        states, weight_N = experience.visits(self.update.state_weight)
-        pi_NA = self.policy.probs(states)
-        depth, look, gap_N, certificate = self._look(experience, states, pi_NA)
+        seen = taken or self._look(experience)
 
         # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is proved good enough.
-        if not self._proved(certificate):
-            self.update(self.policy, states, look.q_BA, weight_N)
+        if not self._proved(seen.certificate):
+            observation_N = self.world.observe(seen.state_N)
+            losses |= self.update(self.policy, observation_N, seen.advantage_NA, seen.weight_N, generator=generator)
 
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
-        model_calls = self.topology.model_calls + self.critic.model_calls - calls_before
+        model_calls = self._model_calls() - calls_before
         self.num_model_calls += model_calls
-        return Iteration(experience, states, weight_N, pi_NA, depth, look, gap_N, certificate, losses, model_calls)
+        return Iteration(**vars(seen), experience=experience, losses=losses, model_calls=model_calls)
 
-    def _look(self, experience: Rollout, state_N: Tensor, pi_NA: Tensor) -> tuple[int, Lookahead, Tensor, float]:
-        """The lookahead at the given depth, or at the first that sees enough, with its gap and certificate."""
-        v_N = (pi_NA * self.lookahead(state_N, depth=0).q_BA).sum(-1)
+    def _model_calls(self) -> int:
+        return (0 if self.search is None else self.search.model_calls) + self.critic.model_calls
+
+    def _look(self, experience: Rollout) -> Seen:
+        """The lookahead from the visited states, at the given depth or at the first that sees enough."""
+        states, weight_N = experience.visits(self.update.state_weight)
+        pi_NA = self.policy.probs(self.world.observe(states))
+        v_N = (pi_NA * self.lookahead(states, depth=0).q_BA).sum(-1)
         _, occupancy_N = experience.visits("occupancy")
         for depth in self.depths:
-            look = self.lookahead(state_N, depth=depth)
+            look = self.lookahead(states, depth=depth)
             gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
-            certificate = self._certificate(experience, state_N, v_N, depth)
+            certificate = self._certificate(experience, states, v_N, depth)
             if float(gap_N @ occupancy_N) > self.tolerance * certificate or self._proved(certificate):
                 break
-        return depth, look, gap_N, certificate
+        return Seen(states, weight_N, pi_NA, look.q_BA - v_N.unsqueeze(-1), depth, look, gap_N, certificate)
+
+    def _taken(self, experience: Rollout) -> Seen | None:
+        """The advantages of the actions taken, by the critic as it was when they were; None where a lookahead is
+        asked for all actions instead."""
+        if not isinstance(self.estimator, SampledAdvantages):
+            return None
+        alive_TB = experience.alive_TB
+        states = experience.state_TB[alive_TB]
+        observation_N = self.world.observe(states)
+        pi_NA = self.policy.probs(observation_N)
+        advantage_TB = self.estimator(experience, self.critic)
+        advantage_NA = score_function(experience.action_TB[alive_TB], advantage_TB[alive_TB], pi_NA)
+        weight_N = experience.visit_weight(self.update.state_weight)
+        unknown_N = torch.full_like(weight_N, torch.nan)
+        return Seen(states, weight_N, pi_NA, advantage_NA, 0, None, unknown_N, math.inf)
+
+    @property
+    def gamma(self) -> float:
+        """The discount."""
+        return self.world.gamma
+
+    @property
+    def mdp(self) -> TabularMDP:
+        """The exact truth behind the environment; PgtsError where there is none."""
+        if self.world.mdp is None:
+            raise PgtsError(f"nothing exact is known of {self._arguments['env']}")
+        return self.world.mdp
+
+    def policy_table(self) -> Float[Tensor, "S A"]:
+        """pi(.|s) for all states, on the CPU in float64; PgtsError where they cannot be listed."""
+        states = torch.arange(self.mdp.num_states, device=self.device)
+        return listed(self.policy, self.world.observe(states))
 
     @property
     def env_id(self) -> str:
@@ -221,18 +305,26 @@ class PGTS:
         Args:
             depth: m; default the depth of the training, or its largest if it is adaptive.
         """
-        depth = self.depths[-1] if depth is None else depth
-        leaf = {"v_leaf": self.critic.v} if self.critic.target == "v" else {"q_leaf": self.critic.q}
-        return self._search(state_N, depth, **leaf)
+        observe, critic = self.world.observe, self.critic
+        leaf: Leaf = lambda s: critic.v(observe(s)) if critic.target == "v" else critic.q(observe(s))  # noqa: E731
+        return self._search(state_N, self.depths[-1] if depth is None else depth, **{f"{critic.target}_leaf": leaf})
 
     def _search(self, state_N: Int[Tensor, "N"], depth: int, **leaf: Leaf) -> Lookahead:
-        return expectimax(self.model, state_N, depth=depth, topology=self.topology, max_nodes=self.max_nodes, **leaf)
+        # All searches of an iteration see the same samples: their differences are not noise.
+        generator = stream(self.seed, "iteration", self.num_iterations, "search", device=self.device)
+        if self.search is None:
+            raise PgtsError("with sampled advantages there is no lookahead")
+        return self.search(state_N, depth=depth, generator=generator, **leaf)
 
     def _certificate(self, experience: Rollout, state_N: Tensor, v_N: Tensor, depth: int) -> float:
         """J* - J^pi <= mean over starts of (T^n w)(s) - v(s), for w the highest value there can be; n is the number of
         levels that the lookahead has itself, so the model is asked nothing new.        [docs/theory.md, Prop. 5]"""
         starts, count_N = experience.state_TB[0].unique(return_counts=True)
-        highest = torch.tensor(self.model.highest_value, dtype=torch.float64, device=self.device)
+        assert self.world.model is not None
+        assert self.search is not None
+        if not self.search.keeps_bounds:
+            return math.inf
+        highest = torch.tensor(self.world.model.highest_value, dtype=torch.float64, device=self.device)
         upper_N = highest.expand(len(starts))
         expansions = depth + (self.critic.target == "v")
         if expansions and bool(highest.isfinite()):
@@ -268,19 +360,15 @@ class PGTS:
             deterministic: the most probable action, else one drawn from pi.
             generator: for drawing; default a stream of this model's seed, the same in each call.
         """
-        state = np.asarray(observation)
-        if not np.issubdtype(state.dtype, np.integer):
-            raise PgtsError(f"observation is of {state.dtype}; states are integers")
-        off = state[(state < 0) | (state >= self.mdp.num_states)]
-        if off.size:
-            raise PgtsError(f"state {off[0]} does not exist; states are 0 to {self.mdp.num_states - 1}")
-        state_N = torch.from_numpy(state.astype(np.int64).reshape(-1)).to(self.device)
+        observation_N = self.world.encode(observation)
+        shape = observation_N.shape[: observation_N.ndim - len(self.world.observation_space.shape or ())]
+        observation_N = observation_N.reshape(-1, *observation_N.shape[len(shape) :])
         if deterministic:
-            action_N = self.policy.probs(state_N).argmax(-1)
+            action_N = self.policy.probs(observation_N).argmax(-1)
         else:
             generator = generator or stream(self.seed, "predict", device=self.device)
-            action_N = self.policy.sample(state_N, generator=generator)
-        return action_N.cpu().numpy().reshape(state.shape)[()]
+            action_N = self.policy.sample(observation_N, generator=generator)
+        return action_N.cpu().numpy().reshape(shape)[()]
 
     def save(self, path: str | Path) -> None:
         """Write everything that training or acting goes on from into one file with a checksum.
@@ -290,7 +378,7 @@ class PGTS:
                 argument is no plain value.
         """
         plain = {**self._arguments, "device": str(self.device), "env_kwargs": dict(self._arguments["env_kwargs"] or {})}
-        for name in ("env", "policy", "critic", "update", "horizon"):
+        for name in ("env", "search", "estimator", "policy", "critic", "update", "horizon"):
             if not isinstance(plain[name], str | Mapping | None):
                 raise PgtsError(f"{name} was given as {plain[name]!r}; only models made from descriptions can be saved")
         saving.write(path, {"arguments": plain, "state": self.state_dict()})
@@ -320,6 +408,7 @@ class PGTS:
         return {
             "policy": self.policy.state_dict(),
             "critic": self.critic.state_dict(),
+            "update": self.update.state_dict(),
             "num_iterations": self.num_iterations,
             "num_env_steps": self.num_env_steps,
             "num_model_calls": self.num_model_calls,
@@ -329,6 +418,7 @@ class PGTS:
         """Take over what `state_dict` gave."""
         self.policy.load_state_dict(state["policy"])
         self.critic.load_state_dict(state["critic"])
+        self.update.load_state_dict(state["update"])
         self.num_iterations = state["num_iterations"]
         self.num_env_steps = state["num_env_steps"]
         self.num_model_calls = state["num_model_calls"]

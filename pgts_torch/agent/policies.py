@@ -1,4 +1,4 @@
-"""Tabular policies: a distribution over actions for each state."""
+"""Policies: a distribution over actions for each observation. Tabular ones, whose observations are states."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -57,34 +57,39 @@ Initialisation = Uniform | Random | Biased
 
 
 class Policy(ABC):
-    """pi(a|s) over numbered states, in float64."""
+    """pi(a|o) over observations: states of a tabular world, vectors or images of another."""
 
-    num_states: int
     num_actions: int
 
     @abstractmethod
-    def probs(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
-        """pi(.|s) for each state."""
+    def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
+        """pi(.|o) for each observation; it carries no gradient."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """The parameters, as tensors on the CPU."""
+        """The parameters, as tensors on the CPU and plain values."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over parameters of the same shape; PgtsError if they do not fit."""
 
+    def sample(self, observation_N: Tensor, *, generator: torch.Generator) -> Int[Tensor, "N"]:
+        """One action for each observation, drawn with the caller's generator."""
+        return torch.multinomial(self.probs(observation_N), 1, generator=generator).squeeze(-1)
+
+
+class TabularPolicy(Policy):
+    """pi(a|s) over numbered states, in float64."""
+
+    num_states: int
+
     def table(self) -> Float[Tensor, "S A"]:
         """pi(.|s) for all states, on the CPU."""
         return self.probs(torch.arange(self.num_states)).cpu()
 
-    def sample(self, state_N: Int[Tensor, "N"], *, generator: torch.Generator) -> Int[Tensor, "N"]:
-        """One action for each state, drawn with the caller's generator."""
-        return torch.multinomial(self.probs(state_N), 1, generator=generator).squeeze(-1)
-
 
 @final
-class SoftmaxPolicy(Policy):
+class SoftmaxPolicy(TabularPolicy):
     """pi(a|s) ~ exp(logits[s, a]): every action keeps a positive probability.
 
     Raises:
@@ -106,9 +111,9 @@ class SoftmaxPolicy(Policy):
         self.num_states, self.num_actions = num_states, num_actions
         self.logits_SA = probs_SA.log().to(device)
 
-    def probs(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+    def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         """softmax(logits[s])."""
-        return self.logits_SA[state_N].softmax(-1)
+        return self.logits_SA[observation_N].softmax(-1)
 
     def state_dict(self) -> dict[str, Any]:
         return {"logits_SA": self.logits_SA.cpu().clone()}
@@ -118,7 +123,7 @@ class SoftmaxPolicy(Policy):
 
 
 @final
-class SimplexPolicy(Policy):
+class SimplexPolicy(TabularPolicy):
     """The paper's direct parameters: pi(a|s) is the parameter itself, and may be 0 or 1.        [PGTS Sec. 2]"""
 
     def __init__(
@@ -133,15 +138,21 @@ class SimplexPolicy(Policy):
         self.num_states, self.num_actions = num_states, num_actions
         self.probs_SA = init.probs(num_states, num_actions, stream(seed, "policy")).to(device)
 
-    def probs(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+    def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         """The rows of the parameter."""
-        return self.probs_SA[state_N]
+        return self.probs_SA[observation_N]
 
     def state_dict(self) -> dict[str, Any]:
         return {"probs_SA": self.probs_SA.cpu().clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.probs_SA = fitting(state, "probs_SA", self.probs_SA)
+
+
+def listed(policy: Policy, observation_S: Tensor) -> Float[Tensor, "S A"]:
+    """pi(.|o) as the exact world reads it: on the CPU, in float64, and what float32 left of 1 made up for."""
+    pi_SA = policy.probs(observation_S).cpu()
+    return pi_SA if pi_SA.dtype == torch.float64 else pi_SA.double() / pi_SA.double().sum(-1, keepdim=True)
 
 
 def fitting(state: dict[str, Any], name: str, like: Tensor) -> Tensor:

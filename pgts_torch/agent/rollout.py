@@ -1,16 +1,17 @@
 """Experience: what a policy does in an environment, or in a model of it."""
 
-from dataclasses import dataclass
-from typing import Any, Literal, final
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, final
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import VectorEnv
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.world import World, env_name
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.seeding import draw_keys, seed_sequence
@@ -86,6 +87,7 @@ class Rollout:
     weight_TB: what a visit counts for in the occupancy: the product of the discounts before it (fixed horizon) or 1
         (geometric horizon); 0 where the episode is over.
     survival_TB: what one later unit of weight is worth now: weight_{t+1} = weight_t * survival_t.
+    observe: what policies and critics see of the states.
     """
 
     state_TB: Int[Tensor, "T B"]
@@ -96,6 +98,7 @@ class Rollout:
     alive_TB: Bool[Tensor, "T B"]
     weight_TB: Float[Tensor, "T B"]
     survival_TB: Float[Tensor, "T B"]
+    observe: Callable[[Tensor], Tensor] = field(kw_only=True)
 
     @property
     def num_steps(self) -> int:
@@ -125,20 +128,24 @@ class Rollout:
         states, row_V = self.state_TB[self.alive_TB].unique(return_inverse=True)
         if state_weight == "uniform":
             return states, torch.ones(len(states), dtype=self.weight_TB.dtype, device=states.device)
-        if state_weight == "visits":
-            count_V = torch.full_like(self.weight_TB[self.alive_TB], 1 / len(row_V))
-        else:
-            count_V = self.weight_TB[self.alive_TB] / self.num_episodes
-        weight_N = torch.zeros(len(states), dtype=count_V.dtype, device=states.device)
-        return states, weight_N.index_add_(0, row_V, count_V)
+        weight_V = self.visit_weight(state_weight)
+        weight_N = torch.zeros(len(states), dtype=weight_V.dtype, device=states.device)
+        return states, weight_N.index_add_(0, row_V, weight_V)
+
+    def visit_weight(self, state_weight: StateWeight) -> Float[Tensor, "V"]:
+        """What each single visit adds to w(s), in the order of `state_TB[alive_TB]`; with "uniform" each counts 1."""
+        weight_V = self.weight_TB[self.alive_TB]
+        if state_weight == "occupancy":
+            return weight_V / self.num_episodes
+        return torch.full_like(weight_V, 1 / len(weight_V) if state_weight == "visits" else 1.0)
 
 
 def rollout(
-    env: gymnasium.vector.VectorEnv,
+    world: World,
+    env: VectorEnv,
     policy: Policy,
     horizon: Horizon,
     *,
-    gamma: float,
     seed: int,
     names: tuple[str | int, ...],
     generator: torch.Generator,
@@ -148,47 +155,57 @@ def rollout(
     What happens is a function of (seed, names), the policy and nothing else: the environment is seeded anew.
 
     Args:
-        env: copies with discrete observations and actions, in `AutoresetMode.DISABLED`.
-        gamma: discount of a step whose `info` names none.
+        world: says which states the copies are in.
+        env: copies of its environment, in `AutoresetMode.DISABLED`: `world.env` or others.
         seed, names: the environment's own stream.
         generator: draws actions and the geometric horizon.
 
     Raises:
-        PgtsError: an episode outlived `max_length` of the geometric horizon.
+        PgtsError: an episode outlived `max_length` of the geometric horizon; or the environment raised an error or
+            answered with something that is not a number, naming environment, step and seed.
     """
     words = seed_sequence(seed, *names, "env").generate_state(env.num_envs)
     observation, _ = env.reset(seed=words.tolist())
-    state_B = torch.from_numpy(np.array(observation, dtype=np.int64)).to(generator.device)
+    observation_B, state_B = world.encode(observation), world.number(env, observation)
     alive_B = torch.ones_like(state_B, dtype=torch.bool)
     weight_B = torch.ones_like(state_B, dtype=torch.float64)
     rows: list[tuple[Tensor, ...]] = []
     while len(rows) < horizon.limit and bool(alive_B.any()):
-        action_B = policy.sample(state_B, generator=generator)
-        reward_B, discount_B, next_B, truncated_B = _step(env, action_B, gamma)
+        action_B = policy.sample(observation_B, generator=generator)
+        try:
+            reward_B, discount_B, truncated_B, observation_B, next_B = _step(world, env, action_B)
+        except Exception as error:
+            where = f"in step {len(rows)} of the episodes with the seeds {words.tolist()}"
+            raise PgtsError(f"{env_name(env)} failed {where}: {type(error).__name__}: {error}") from error
         survival_B = horizon.survival(discount_B, generator)
         rows.append((state_B, action_B, reward_B, discount_B, next_B, alive_B, weight_B * alive_B, survival_B))
         weight_B = weight_B * survival_B
         alive_B = alive_B & (survival_B > 0) & ~truncated_B
         state_B = next_B
     horizon.check_end(int(alive_B.sum()))
-    return Rollout(*(torch.stack(column) for column in zip(*rows, strict=True)))
+    return Rollout(*(torch.stack(column) for column in zip(*rows, strict=True)), observe=world.observe)
 
 
 def _step(
-    env: gymnasium.vector.VectorEnv, action_B: Int[Tensor, "B"], gamma: float
-) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"], Int[Tensor, "B"], Bool[Tensor, "B"]]:
-    """Rewards, discounts, next states, and whether a copy was truncated; copies that are over start again."""
+    world: World, env: VectorEnv, action_B: Int[Tensor, "B"]
+) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"], Bool[Tensor, "B"], Tensor, Int[Tensor, "B"]]:
+    """Rewards, discounts, whether a copy was truncated, observations and states; copies that are over start again."""
     device = action_B.device
     observation, reward, terminated, truncated, info = env.step(action_B.cpu().numpy())
-    discount = np.where(terminated, 0.0, info.get("discount", gamma))
+    reward_B = torch.from_numpy(np.asarray(reward, dtype=np.float64)).to(device)
+    if not bool(reward_B.isfinite().all()):
+        raise PgtsError(f"the rewards are {reward_B.tolist()}; they must be finite")
+    discount = np.where(terminated, 0.0, info.get("discount", world.gamma))
+    observation_B, state_B = world.encode(observation), world.number(env, observation)
     over = terminated | truncated
     if over.any():
         env.reset(options={"reset_mask": over})
     return (
-        torch.from_numpy(np.asarray(reward, dtype=np.float64)).to(device),
+        reward_B,
         torch.from_numpy(discount).to(device),
-        torch.from_numpy(np.array(observation, dtype=np.int64)).to(device),
         torch.from_numpy(truncated).to(device),
+        observation_B,
+        state_B,
     )
 
 
@@ -224,39 +241,3 @@ def simulated_returns(
         action_N = policy.sample(state_N, generator=generator)
     horizon.check_end(len(row_N))
     return returns_B, num_steps
-
-
-def make_vector_env(env_id: str, num_envs: int, *, gamma: float | None, **kwargs: Any) -> gymnasium.vector.VectorEnv:
-    """Copies of a registered environment that reset by mask, without its time limit: the horizon is ours.
-
-    Args:
-        gamma: handed to environments that carry a discount of their own (pgts/*), if given.
-
-    Raises:
-        PgtsError: Gymnasium knows no such environment or cannot make it.
-    """
-    if num_envs < 1:
-        raise PgtsError(f"num_envs is {num_envs}; it must be at least 1")
-    options: dict[str, Any] = {"max_episode_steps": -1, **kwargs}
-    try:
-        if gymnasium.spec(env_id).namespace == "pgts":
-            options |= {} if gamma is None else {"gamma": gamma}
-            options |= {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.DISABLED}
-        else:
-            options |= {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode.DISABLED}}
-        return gymnasium.make_vec(env_id, num_envs=num_envs, **options)
-    except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
-        raise PgtsError(f"{env_id} cannot be made: {error}") from error
-
-
-def check_vector_env(env: gymnasium.vector.VectorEnv) -> None:
-    """PgtsError unless rollouts can be made in this environment: discrete spaces, reset by mask."""
-    if not isinstance(env, gymnasium.vector.VectorEnv):
-        raise PgtsError(f"the environment is {env!r}; it must be a Gymnasium id or a VectorEnv")
-    for name in ("single_observation_space", "single_action_space"):
-        space = getattr(env, name)
-        if not isinstance(space, gymnasium.spaces.Discrete) or space.start != 0:
-            raise PgtsError(f"{name} is {space}; tabular policies need Discrete(n) counted from 0")
-    mode = env.metadata.get("autoreset_mode")
-    if mode != AutoresetMode.DISABLED:
-        raise PgtsError(f"the environment resets by {mode}; make it with autoreset_mode=AutoresetMode.DISABLED")

@@ -3,8 +3,9 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -14,25 +15,43 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.tabular.ascent import mirror_step, projected_step, softmax_direction
 
 
-@dataclass(frozen=True)
 class Update(ABC):
-    """One step of a policy at visited states.
+    """How a policy is moved at visited states.
 
-    Args:
-        step_size: eta > 0.
-        state_weight: w(s) of a visited state. `occupancy`: the estimate of d^pi(s), as in the paper. `visits`: its
-            share of all visits, without discounts (sums to 1). `uniform`: 1, as in h-PMD.
+    state_weight: w(s) of a visited state. `occupancy`: the estimate of d^pi(s), as in the paper. `visits`: its share of
+        all visits, without discounts (sums to 1). `uniform`: 1, as in h-PMD.
+    policies: the kinds of policy that it moves.
     """
 
-    step_size: float = 0.1
-    state_weight: StateWeight = "occupancy"
+    state_weight: StateWeight
     policies: ClassVar[tuple[type[Policy], ...]]
 
-    def __post_init__(self) -> None:
-        if not 0 < self.step_size < math.inf:
-            raise PgtsError(f"step_size is {self.step_size}; it must be finite and above 0")
-        if self.state_weight not in ("occupancy", "visits", "uniform"):
-            raise PgtsError(f"state_weight is {self.state_weight!r}; it must be occupancy, visits or uniform")
+    @abstractmethod
+    def __call__(
+        self,
+        policy: Policy,
+        observation_N: Tensor,
+        advantage_NA: Float[Tensor, "N A"],
+        weight_N: Float[Tensor, "N"],
+        *,
+        generator: torch.Generator,
+    ) -> dict[str, float]:
+        """Move pi(.|o) along the advantages of all actions, in place; losses and the like, by name.
+
+        Args:
+            observation_N: what the policy sees of N visited states.
+            advantage_NA: (T^m Q)(s, a) - <pi, Q>. What all actions of a state have in common moves nothing.
+            weight_N: w(s).
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """What an optimiser remembers, as tensors on the CPU and plain values."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave."""
+        if state:
+            raise PgtsError(f"{type(self).__name__} remembers nothing; it cannot take over {sorted(state)}")
 
     def check(self, policy: Policy) -> None:
         """PgtsError unless this update can move such a policy."""
@@ -40,52 +59,88 @@ class Update(ABC):
             names = " or ".join(kind.__name__ for kind in self.policies)
             raise PgtsError(f"{type(self).__name__} moves a {names}, not a {type(policy).__name__}")
 
-    @abstractmethod
+
+@dataclass(frozen=True)
+class TabularUpdate(Update):
+    """One step at the rows of a table; all other states stay as they are.
+
+    Args:
+        step_size: eta > 0.
+    """
+
+    step_size: float = 0.1
+    state_weight: StateWeight = "occupancy"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.step_size < math.inf:
+            raise PgtsError(f"step_size is {self.step_size}; it must be finite and above 0")
+        check_state_weight(self.state_weight)
+
     def __call__(
+        self,
+        policy: Policy,
+        observation_N: Tensor,
+        advantage_NA: Float[Tensor, "N A"],
+        weight_N: Float[Tensor, "N"],
+        *,
+        generator: torch.Generator,
+    ) -> dict[str, float]:
+        """Nothing is drawn, and there is no loss."""
+        self.step(policy, observation_N, advantage_NA, weight_N)
+        return {}
+
+    @abstractmethod
+    def step(
         self,
         policy: Policy,
         state_N: Int[Tensor, "N"],
         q_NA: Float[Tensor, "N A"],
         weight_N: Float[Tensor, "N"],
     ) -> None:
-        """Move pi(.|s) at N distinct states along q(s, .), in place; all other states stay as they are."""
+        """Move pi(.|s) at N distinct states along q(s, .), or along q(s, .) less anything that all actions share."""
 
 
 @final
 @dataclass(frozen=True)
-class ProjectedUpdate(Update):
+class ProjectedUpdate(TabularUpdate):
     """The paper's update, pi(.|s) <- proj[pi(.|s) + eta w(s) q(s, .)].        [PGTS Eq. (3)]"""
 
     policies = (SimplexPolicy,)
 
-    def __call__(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
+    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
         assert isinstance(policy, SimplexPolicy)
         policy.probs_SA[state_N] = projected_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size)
 
 
 @final
 @dataclass(frozen=True)
-class SoftmaxUpdate(Update):
+class SoftmaxUpdate(TabularUpdate):
     """All-action policy gradient on the logits: theta(s, .) <- theta(s, .) + eta w(s) pi (q - <pi, q>)."""
 
     policies = (SoftmaxPolicy,)
 
-    def __call__(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
+    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
         assert isinstance(policy, SoftmaxPolicy)
         policy.logits_SA[state_N] += self.step_size * softmax_direction(policy.probs(state_N), q_NA, weight_N)
 
 
 @final
 @dataclass(frozen=True)
-class MirrorUpdate(Update):
+class MirrorUpdate(TabularUpdate):
     """A KL step at visited states: pi(a|s) <- pi(a|s) exp(eta w(s) q(s, a)) / Z (Protopapas and Barakat 2024)."""
 
     policies = (SoftmaxPolicy, SimplexPolicy)
 
-    def __call__(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
+    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
         if isinstance(policy, SoftmaxPolicy):
             advantage_NA = q_NA - q_NA.amax(-1, keepdim=True)
             policy.logits_SA[state_N] += self.step_size * weight_N[:, None] * advantage_NA
         else:
             assert isinstance(policy, SimplexPolicy)
             policy.probs_SA[state_N] = mirror_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size)
+
+
+def check_state_weight(state_weight: str) -> None:
+    """PgtsError unless it is one."""
+    if state_weight not in ("occupancy", "visits", "uniform"):
+        raise PgtsError(f"state_weight is {state_weight!r}; it must be occupancy, visits or uniform")

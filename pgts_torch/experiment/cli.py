@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.config import INT64_MAX, Config, dump
+from pgts_torch.experiment.config import Config, dump
+from pgts_torch.experiment.fields import INT64_MAX
 from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.schema import Option, Schema
 
-USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
+CHECK_FAILED, USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
 WIDTH = 79
 
 Arguments = Sequence[str]
@@ -39,7 +40,8 @@ def main(arguments: Arguments | None = None) -> int:
     """Run `pgts` with these arguments (default: those of the process).
 
     Returns:
-        The exit code: 0; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C.
+        The exit code: 0; 1 if `check-model` found something missing; 2 after a mistake of the caller, which stands on
+        stderr, a line each; 130 after Ctrl-C.
     """
     try:
         code = _dispatch(sys.argv[1:] if arguments is None else arguments)
@@ -166,6 +168,36 @@ A file of your own, written by numpy.savez("mdp.npz", P=P, R=R, gamma=0.9):
 An end is a state that leads to itself and earns 0."""
 
 
+@command
+def check_model(arguments: Arguments) -> None:
+    """Try out whether an environment can serve as a model of itself."""
+    parser = _Parser("check-model", check_model)
+    parser.add_argument("env_id", metavar="ENV_ID", help="as in gymnasium.make; MODULE:ID imports MODULE first")
+    parser.add_argument(
+        "--kwargs", metavar="JSON", type=_json_object, default={}, help='for gymnasium.make, as {"is_slippery": false}'
+    )
+    parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the walks (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
+    parser.epilog = PROTOCOL_HELP
+    given = parser.parse_args(arguments)
+    from pgts_torch.experiment import check_model as fidelity
+
+    report = fidelity.answer(given.env_id, kwargs=given.kwargs, seed=given.seed)
+    print(json.dumps(fidelity.to_json(report)) if given.json else fidelity.describe(report))
+    if not report.usable:
+        raise SystemExit(CHECK_FAILED)
+
+
+PROTOCOL_HELP = """\
+The exit code is 0 if it can, 1 if a check failed, 2 if it cannot be tried.
+An environment of your own needs two methods:
+  def get_state(self):         # all that step reads or changes, except
+      return self.x, self.fuel # self.np_random: bytes, or what pickles
+  def set_state(self, state):
+      self.x, self.fuel = state
+and draws from self.np_random only."""
+
+
 class _Parser(argparse.ArgumentParser):
     """An argparse parser that reports a mistake in one line and takes no abbreviations."""
 
@@ -282,6 +314,17 @@ def _whole(least: int) -> Callable[[str], int]:
 def _whole_list(text: str) -> tuple[int, ...]:
     """An argparse type: whole numbers separated by commas."""
     return tuple(_whole(0)(part) for part in text.split(","))
+
+
+def _json_object(text: str) -> dict[str, Any]:
+    """An argparse type: a JSON object."""
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        value = None
+    if not isinstance(value, dict):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a JSON object")
+    return value
 
 
 def _share(text: str) -> float:

@@ -14,18 +14,23 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
     """Tags of one iteration, all of the policy pi_k that made its episodes."""
     episodes = iteration.experience
     entropy_N = -torch.special.xlogy(iteration.pi_NA, iteration.pi_NA).sum(-1)
-    return {
+    tags = {
         "charts/episodic_return": float((episodes.reward_TB * episodes.alive_TB).sum(0).mean()),
         "charts/discounted_return": float(episodes.returns().mean()),
         "charts/episodic_length": episodes.num_steps / episodes.num_episodes,
         "losses/entropy": float(entropy_N.mean()),
         **{f"losses/{name}": value for name, value in iteration.losses.items()},
         "search/depth": float(iteration.depth),
-        "search/nodes": float(iteration.look.nodes),
         "search/model_calls": float(algorithm.num_model_calls),
-        "search/stationarity_gap": float(iteration.gap_N.max()),
-        "search/certificate": iteration.certificate,
     }
+    if iteration.look is not None:
+        tags |= {
+            "search/nodes": float(iteration.look.nodes),
+            "search/pruned": float(iteration.look.pruned_BA.max()),
+            "search/stationarity_gap": float(iteration.gap_N.max()),
+            "search/certificate": iteration.certificate,
+        }
+    return tags
 
 
 class Truth:
@@ -43,18 +48,17 @@ class Truth:
     def metrics(self, pi_SA: Float[Tensor, "S A"], iteration: Iteration) -> dict[str, float]:
         """The `exact/*` tags of an iteration that was made with pi_SA.
 
-        J, J* - J, the largest error of the lookahead at the visited states, and the cosine between the direction that
-        the policy moved in and the exact one; the cosine is left out where one of the two is 0.
+        J and J* - J; where there was a lookahead, its largest error at the visited states, and the cosine between the
+        direction that the policy moved in and the exact one, which is left out where one of the two is 0.
         """
         evaluation = exact.evaluate(self.mdp, pi_SA)
+        tags = {"exact/J": evaluation.J, "exact/optimality_gap": max(self.optimum.J - evaluation.J, 0.0)}
+        if iteration.look is None:
+            return tags
         look_SA = exact.lookahead(self.mdp, evaluation.q_SA, iteration.depth)
         states = iteration.state_N.cpu()
         error_NA = iteration.look.q_BA.cpu() - look_SA[states]
-        tags = {
-            "exact/J": evaluation.J,
-            "exact/optimality_gap": max(self.optimum.J - evaluation.J, 0.0),
-            "exact/lookahead_error": float(error_NA.abs().max()),
-        }
+        tags["exact/lookahead_error"] = float(error_NA.abs().max())
         weight_S = evaluation.d_S if self.update.state_weight != "uniform" else (evaluation.d_S > 0).double()
         true_SA = self._direction(pi_SA, look_SA, weight_S)
         made_SA = torch.zeros_like(true_SA)

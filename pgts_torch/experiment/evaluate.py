@@ -3,16 +3,19 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, final
 
 import gymnasium
 import scipy.stats
 import torch
-from jaxtyping import Float
+from gymnasium.vector import VectorEnv
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.agent.policies import Policy, SimplexPolicy
+from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import FixedHorizon, rollout
+from pgts_torch.agent.world import World
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.tracking import CHECKPOINTS
 from pgts_torch.seeding import stream
@@ -51,10 +54,10 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool, seed: int) 
     limit = gymnasium.spec(algorithm.env_id).max_episode_steps or UNLIMITED_LENGTH
     names = ("evaluate", "deterministic" if deterministic else "sampled")
     made = rollout(
+        _Watched(algorithm.world, env),
         env,
-        greedy(algorithm.policy) if deterministic else algorithm.policy,
+        Greedy(algorithm.policy) if deterministic else algorithm.policy,
         FixedHorizon(limit),
-        gamma=algorithm.gamma,
         seed=seed,
         names=names,
         generator=stream(seed, *names, device=algorithm.device),
@@ -68,11 +71,55 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool, seed: int) 
     )
 
 
-def greedy(policy: Policy) -> SimplexPolicy:
-    """The policy that takes the most probable action everywhere."""
-    best = SimplexPolicy(policy.num_states, policy.num_actions)
-    best.probs_SA = torch.nn.functional.one_hot(policy.table().argmax(-1), policy.num_actions).double()
-    return best
+@final
+class _Watched(World):
+    """Copies in which a policy is only watched: no state is asked for again, so none is told from another.
+
+    Args:
+        world: says what the policy sees.
+        env: copies of its environment.
+    """
+
+    def __init__(self, world: World, env: VectorEnv) -> None:
+        self.env, self._world = env, world
+        self.num_actions, self.observation_space = world.num_actions, world.observation_space
+        self.gamma, self.device = world.gamma, world.device
+
+    def encode(self, observation: Any) -> Tensor:
+        """As in the world."""
+        return self._world.encode(observation)
+
+    def number(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
+        """0 for all."""
+        return torch.zeros(env.num_envs, dtype=torch.int64, device=self.device)
+
+    def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        """Nothing can be said."""
+        raise AssertionError("what was watched is over")
+
+    def forget(self) -> bool:
+        """Nothing."""
+        return False
+
+
+@final
+class Greedy(Policy):
+    """Takes the most probable action of another policy."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self.num_actions = policy.num_actions
+
+    def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
+        """1 for the most probable action, 0 for the others."""
+        best_N = self.policy.probs(observation_N).argmax(-1)
+        return torch.nn.functional.one_hot(best_N, self.num_actions).double()
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.policy.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.policy.load_state_dict(state)
 
 
 def last_checkpoint(run: Path) -> Path:

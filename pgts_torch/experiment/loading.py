@@ -11,7 +11,8 @@ from pydantic import ValidationError
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import strict_yaml
-from pgts_torch.experiment.config import INT64_MAX, Config
+from pgts_torch.experiment.config import Config, with_types
+from pgts_torch.experiment.fields import INT64_MAX
 from pgts_torch.experiment.schema import KeyPath, Node, Place, Schema, is_nullable, is_text, requirement
 from pgts_torch.experiment.strict_yaml import Document, YamlMistake
 
@@ -80,6 +81,7 @@ class _Loader:
         file_is_read = path is None or self._read_file(Path(path))
         for key, text in self._flags(arguments):
             self._override(key, text)
+        self.data = with_types(self.data)
         self._fill_types(self.schema.root, self.data)
         config = self._validate(file_is_read)
         if self.mistakes or config is None:
@@ -189,15 +191,16 @@ class _Loader:
             return self._unmet(place, (*place.path, "type"), tag)
         if place.node is None:
             return _Mistake(self._unknown(place), self._origin(place.path))
-        return self._unmet(place, place.path, error["input"])
+        is_item = isinstance(error["loc"][-1], int)
+        return self._unmet(place, place.path, error["input"], verb="holds" if is_item else "is")
 
-    def _unmet(self, place: Place, path: KeyPath, value: Any) -> _Mistake:
+    def _unmet(self, place: Place, path: KeyPath, value: Any, *, verb: str = "is") -> _Mistake:
         assert place.node is not None
         origin = self._origin(path)
         shown = _show(value, origin.text)
         key = ".".join(path)
         must = _what(place.node) if path == place.path else requirement(place.node)
-        sentence = f"{key} is {shown}; it must be {must}{_advice(place.node, value)}"
+        sentence = f"{key} {verb} {shown}; it must be {must}{_advice(place.node, value)}"
         if origin.where == f"--{key}":
             return _Mistake(f"--{sentence}", _Origin(""))
         return _Mistake(sentence, origin)

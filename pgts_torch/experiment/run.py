@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -11,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from pgts_torch.agent.pgts import PGTS, Iteration
 from pgts_torch.experiment import diagnostics
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.evaluate import Evaluation, evaluate, last_checkpoint
+from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.pictures import policy_picture
 from pgts_torch.experiment.tracking import (
     CHECKPOINTS,
@@ -27,6 +30,7 @@ from pgts_torch.experiment.tracking import (
     prepare_folder,
     versions,
 )
+from pgts_torch.models.environments import make_env
 from pgts_torch.tabular import exact, stationary
 
 PLAIN_LINES = 20
@@ -37,9 +41,10 @@ PLAIN_LINES = 20
 class Summary:
     """What a finished run came to.
 
-    J, J_optimal: exact return of the trained policy and of the best one.
+    J, J_optimal: exact return of the trained policy and of the best one; None where nothing exact is known.
     depth: m, the largest if it was adaptive.
-    stationarity_gap: max over visited states of the exact g_m.
+    search: how the lookahead was made, and why where it chose that itself.
+    stationarity_gap: max over visited states of the exact g_m; None likewise.
     certificate: what the last iteration bounds J* - J^pi by; None: it knows no bound.
     certificate_is_proved: whether that is a proof, because the critic is exact, or an estimate.
     """
@@ -47,9 +52,10 @@ class Summary:
     run: str
     seed: int
     depth: int
-    J: float
-    J_optimal: float
-    stationarity_gap: float
+    search: str
+    J: float | None
+    J_optimal: float | None
+    stationarity_gap: float | None
     certificate: float | None
     certificate_is_proved: bool
     iterations: int
@@ -66,24 +72,32 @@ def build(config: Config) -> PGTS:
     Raises:
         PgtsError: the environment does not exist or has no model, or parts do not fit it.
     """
-    plain = config.model_dump(by_alias=True)
+    sampled = config.estimator.type == "sampled"
+    _check_env(config)
     return PGTS(
         config.env.id,
         depth=config.search.depth,
         max_depth=config.search.max_depth,
         tolerance=config.search.tolerance,
         stop_at=config.search.stop_at,
-        policy=plain["policy"],
-        critic=plain["critic"],
-        update=plain["update"],
-        horizon=plain["rollout"]["horizon"],
+        search="auto" if sampled else config.search.description(),
+        estimator=config.estimator.plain(),
+        policy=config.policy.plain(),
+        critic=config.critic_description(),
+        update=config.update.plain(),
+        horizon=config.rollout.horizon.plain(),
         num_envs=config.rollout.num_envs,
+        observation_key=config.env.observation_key,
         gamma=config.env.gamma,
-        max_nodes=config.search.max_nodes,
         seed=config.seed,
         device=config.device,
-        env_kwargs=plain["env"]["kwargs"],
+        env_kwargs=dict(config.env.kwargs),
     )
+
+
+def _check_env(config: Config) -> None:
+    """Import what registers the environment; PgtsError where it is not installed, or cannot be made."""
+    make_env(config.env.id, **config.env.kwargs).close()
 
 
 def train(config: Config) -> Summary:
@@ -111,6 +125,8 @@ def train(config: Config) -> Summary:
 def evaluate_run(run: str | Path, *, episodes: int, seed: int) -> dict[str, Evaluation]:
     """Evaluate the last checkpoint of a run: greedily and by drawing actions from the policy."""
     torch.set_num_threads(1)
+    config = load(Path(run) / CONFIG_FILE)
+    _check_env(config)
     algorithm = PGTS.load(last_checkpoint(Path(run)))
     return {
         kind: evaluate(algorithm, episodes=episodes, deterministic=kind == "deterministic", seed=seed)
@@ -136,10 +152,10 @@ class _Recorder:
         self.config = config
         self.algorithm = algorithm
         self.folder = folder
-        self.truth = diagnostics.Truth(algorithm)
+        self.truth = diagnostics.Truth(algorithm) if algorithm.world.mdp is not None else None
         self.report = _Reporter(config.total_steps)
         self.started = self._clock = time.perf_counter()
-        self._pi_SA = algorithm.policy.table()
+        self._pi_SA = self._table()
         self._deepest, self._certificate = 0, math.inf
 
     def __call__(self, algorithm: PGTS, iteration: Iteration) -> None:
@@ -147,7 +163,9 @@ class _Recorder:
         k, step = algorithm.num_iterations, algorithm.num_env_steps
         self._deepest, self._certificate = max(self._deepest, iteration.depth), iteration.certificate
         if k % self.config.log.every == 0:
-            tags = diagnostics.metrics(algorithm, iteration) | self.truth.metrics(self._pi_SA, iteration)
+            tags = diagnostics.metrics(algorithm, iteration)
+            if self.truth is not None and self._pi_SA is not None:
+                tags |= self.truth.metrics(self._pi_SA, iteration)
             tags["charts/SPS"] = iteration.experience.num_steps / seconds
             self.folder.log(step, tags)
             self.report.line(step, tags)
@@ -155,15 +173,26 @@ class _Recorder:
             self.folder.log(step, _evaluation_tags(algorithm, self.config))
         if self.config.log.checkpoint_every and k % self.config.log.checkpoint_every == 0:
             _save(algorithm, self.folder)
-        self._pi_SA = algorithm.policy.table()
+        self._pi_SA = self._table()
         self._clock = time.perf_counter()
+
+    def _table(self) -> Tensor | None:
+        """The policy in all states, where they can be listed."""
+        return None if self.truth is None else self.algorithm.policy_table()
 
     def finish(self) -> Summary:
         """The picture and the summary of the trained policy."""
         seconds = time.perf_counter() - self.started
-        config, algorithm, pi_SA = self.config, self.algorithm, self.algorithm.policy.table()
-        title = f"{config.env.id}, depth {config.search.depth}, seed {config.seed}"
-        self.folder.picture("policy", policy_picture(algorithm.mdp, pi_SA, title=title), algorithm.num_env_steps)
+        config, algorithm, exactly = self.config, self.algorithm, dict[str, float | None]()
+        if self.truth is not None:
+            pi_SA = algorithm.policy_table()
+            title = f"{config.env.id}, depth {config.search.depth}, seed {config.seed}"
+            self.folder.picture("policy", policy_picture(algorithm.mdp, pi_SA, title=title), algorithm.num_env_steps)
+            exactly = {
+                "J": exact.evaluate(algorithm.mdp, pi_SA).J,
+                "J_optimal": self.truth.optimum.J,
+                "stationarity_gap": float(stationary.gap(algorithm.mdp, pi_SA, self._deepest).max()),
+            }
         deterministic, sampled = (
             evaluate(algorithm, episodes=config.eval.episodes, deterministic=kind, seed=config.seed)
             for kind in (True, False)
@@ -172,9 +201,10 @@ class _Recorder:
             run=str(self.folder.path),
             seed=config.seed,
             depth=self._deepest,
-            J=exact.evaluate(algorithm.mdp, pi_SA).J,
-            J_optimal=self.truth.optimum.J,
-            stationarity_gap=float(stationary.gap(algorithm.mdp, pi_SA, self._deepest).max()),
+            search="none" if algorithm.search is None else str(algorithm.search),
+            J=exactly.get("J"),
+            J_optimal=exactly.get("J_optimal"),
+            stationarity_gap=exactly.get("stationarity_gap"),
             certificate=self._certificate if math.isfinite(self._certificate) else None,
             certificate_is_proved=config.critic.type == "exact",
             iterations=algorithm.num_iterations,
@@ -217,11 +247,8 @@ class _Reporter:
 
     def line(self, step: int, tags: Mapping[str, float]) -> None:
         """What a person wants to see while it runs."""
-        numbers = {
-            "return": tags["charts/discounted_return"],
-            "J": tags["exact/J"],
-            "gap": tags["search/stationarity_gap"],
-        }
+        shown_as = {"charts/episodic_return": "return", "exact/J": "J", "search/stationarity_gap": "gap"}
+        numbers = {name: tags[tag] for tag, name in shown_as.items() if tag in tags}
         if self._terminal:
             self._bar.set_postfix({name: f"{value:.3g}" for name, value in numbers.items()}, refresh=False)
             self._bar.update(min(step, self._total) - self._bar.n)
@@ -236,14 +263,19 @@ class _Reporter:
 
 def describe(summary: Summary) -> str:
     """The summary as a person reads it, within 80 columns."""
-    share = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 else ""
-    rows: dict[str, Any] = {
-        "return of the policy, J": f"{summary.J:.4g}{share}",
-        "optimal return, J*": f"{summary.J_optimal:.4g}",
-        f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
+    rows: dict[str, Any] = {}
+    if summary.J is not None and summary.J_optimal is not None:
+        share = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 else ""
+        rows |= {
+            "return of the policy, J": f"{summary.J:.4g}{share}",
+            "optimal return, J*": f"{summary.J_optimal:.4g}",
+            f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
+        }
+    rows |= {
         "certificate, J* - J <=": _certificate_text(summary),
         "greedy episodes, return": _score_text(summary.deterministic),
         "sampled episodes, return": _score_text(summary.sampled),
+        "search": textwrap.fill(summary.search, 50).replace("\n", "\n" + 28 * " "),
         "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",
         "model calls": summary.model_calls,
         "seconds": f"{summary.seconds:.1f}",

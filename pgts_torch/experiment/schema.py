@@ -5,13 +5,13 @@ Everything is read from the JSON schema of the pydantic model, so help and messa
 
 import difflib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 from pydantic import BaseModel
 
-from pgts_torch.experiment.config import INT64_MAX
+from pgts_torch.experiment.fields import INT64_MAX
 
 Node = dict[str, Any]
 KeyPath = tuple[str, ...]
@@ -27,7 +27,7 @@ class Option:
         default: its value where nothing is said.
         meaning: one sentence.
         choices: (value, meaning) of each value, where they have one.
-        when: the choice that the key belongs to, for instance "critic.type tabular"; "" for the others.
+        when: the choices that the key belongs to, for instance "critic.type tabular|rollout"; "" for the others.
     """
 
     key: str
@@ -93,7 +93,7 @@ class Schema:
 
     def options(self) -> list[Option]:
         """Every key with a value, in the order of the model."""
-        return list(self._options(self.root, (), ""))
+        return list(self._options(self.root, ()))
 
     def nearest(self, key: str) -> str | None:
         """The key that was probably meant: one that ends the same, or one that is spelled nearly the same."""
@@ -107,23 +107,35 @@ class Schema:
         parts = [option.key.split(".") for option in self.options()]
         return list(dict.fromkeys(".".join(part[:end]) for part in parts for end in range(1, len(part) + 1)))
 
-    def _options(self, section: Node, path: KeyPath, when: str) -> Iterator[Option]:
+    def _options(self, section: Node, path: KeyPath) -> Iterator[Option]:
         for name, node in self.fields(section).items():
             child = (*path, name)
             key = ".".join(child)
             if variants := self.variants(node):
-                yield self._choice(node, f"{key}.type", variants, when)
-                for tag, variant in variants.items():
-                    options = self._options(variant, child, f"{key}.type {tag}")
-                    yield from (option for option in options if option.key != f"{key}.type")
+                yield self._choice(node, f"{key}.type", variants)
+                yield from self._options_of_variants(f"{key}.type", variants, child)
             elif self.fields(node):
-                yield from self._options(node, child, when)
+                yield from self._options(node, child)
             else:
-                yield Option(key, requirement(node), node["default"], _sentence(node), when=when)
+                yield Option(key, requirement(node), node["default"], _sentence(node))
 
-    def _choice(self, node: Node, key: str, variants: dict[str, Node], when: str) -> Option:
+    def _options_of_variants(self, key: str, variants: dict[str, Node], path: KeyPath) -> list[Option]:
+        """The options of all variants, equal ones once, those with the same condition together."""
+        distinct: dict[str, tuple[Option, list[str]]] = {}
+        for tag, variant in variants.items():
+            for option in self._options(variant, path):
+                if option.key != key:
+                    distinct.setdefault(repr(option), (option, []))[1].append(tag)
+        options = [
+            replace(option, when=" and ".join(filter(None, [f"{key} {'|'.join(tags)}", option.when])))
+            for option, tags in distinct.values()
+        ]
+        first = {option.when: n for n, option in reversed(list(enumerate(options)))}
+        return sorted(options, key=lambda option: first[option.when])
+
+    def _choice(self, node: Node, key: str, variants: dict[str, Node]) -> Option:
         choices = tuple((tag, _sentence(variant)) for tag, variant in variants.items())
-        return Option(key, requirement(node), node["default"]["type"], _sentence(node), choices, when)
+        return Option(key, requirement(node), node["default"]["type"], _sentence(node), choices)
 
     def _follow(self, node: Node) -> Node:
         """The node with what its reference points at; what stands beside the reference goes first."""
@@ -156,6 +168,9 @@ def requirement(node: Node) -> str:
             return "true or false"
         case "null":
             return "null"
+        case "array":
+            assert node["items"]["type"] == "integer", "a list of other things than whole numbers has no words yet"
+            return f"a list of at most {node['maxItems']} whole numbers{_bounds(node['items'])}"
         case kind:
             assert kind == "object", f"a configuration key of type {kind} has no words yet"
             keys = ", ".join(node.get("properties", ()))

@@ -1,6 +1,25 @@
 """Models of environments: what a lookahead may ask."""
 
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.classic import Acrobot, CartPole, MountainCar, Pendulum, with_torques
+from pgts_torch.models.fidelity import check_model
+from pgts_torch.models.numbering import Numbering
+from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.tabular import TabularModel
+from pgts_torch.models.tensor import TensorModel
 
-__all__ = ["EnumeratingModel", "SamplingModel", "TabularModel", "Transitions"]
+__all__ = [
+    "Acrobot",
+    "CartPole",
+    "EnumeratingModel",
+    "MountainCar",
+    "Numbering",
+    "Pendulum",
+    "SamplingModel",
+    "SimulatorModel",
+    "TabularModel",
+    "TensorModel",
+    "Transitions",
+    "check_model",
+    "with_torques",
+]

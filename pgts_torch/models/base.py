@@ -31,11 +31,13 @@ class Model(ABC):
     """A finite action set over numbered states.
 
     highest_value: an upper bound of v* in every state; infinite where none is known.
+    generation: how often the model has forgotten its states and begun to number them anew.
     """
 
     num_states: int
     num_actions: int
     highest_value: float = math.inf
+    generation: int = 0
     device: torch.device
     dtype: torch.dtype
 

@@ -8,6 +8,7 @@ from pgts_torch.bellman import backup, sweep
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead
+from pgts_torch.search.pruned import pruned
 from pgts_torch.search.topology import Topology
 
 
@@ -21,6 +22,7 @@ def expectimax(
     v_leaf: Leaf | None = None,
     topology: Topology | None = None,
     max_nodes: int = MAX_NODES,
+    max_width: int | None = None,
 ) -> Lookahead:
     """(T^m Q)(s, .) at the roots for m = depth.        [PGTS Sec. 3]
 
@@ -39,15 +41,20 @@ def expectimax(
         v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.
         topology: what earlier searches of the same model found; this search adds to it. Default: a fresh one.
         max_nodes: the most nodes, summed over levels.
+        max_width: W, the most states of each level below the roots that are unfolded further; the critic values the
+            others at once (`pgts_torch.search.pruned`). None: all of them.
 
     Raises:
-        PgtsError: a bad depth, roots that are no states, leaf values of a wrong shape or not finite (naming the state).
+        PgtsError: a bad depth or width, roots that are no states, leaf values of a wrong shape or not finite (naming
+            the state).
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
     leaves = Leaves(model, depth, q_leaf, v_leaf)
     topology = topology or Topology(model)
     if topology.model is not model:
         raise PgtsError("the topology belongs to another model")
+    if max_width is not None:
+        return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
     calls_before = topology.model_calls
     levels = topology.levels(root_B, leaves.expansions, max_nodes=max_nodes)
     bottom = levels.leaves(leaves.expansions)

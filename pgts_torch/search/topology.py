@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NodeBudgetExceeded, PgtsError
-from pgts_torch.models.base import EnumeratingModel
+from pgts_torch.models.base import EnumeratingModel, Model
 from pgts_torch.search.lookahead import check_states, check_vector
 
 _REMEMBERED_ROOTS = 8
@@ -116,6 +116,7 @@ class Topology:
     def __init__(self, model: EnumeratingModel) -> None:
         self.model = model
         self.model_calls = 0
+        self._generation = model.generation
         self._known = _Rows()
         self._row_S = torch.empty(0, dtype=torch.int64, device=model.device)
         self._scratch_S = torch.empty(0, dtype=torch.int64, device=model.device)
@@ -130,9 +131,10 @@ class Topology:
             max_nodes: the most nodes, summed over levels 0 .. expansions.
 
         Raises:
-            PgtsError: no roots, or one that is not a state of the model.
+            PgtsError: no roots, or one that is not a state of the model; the model has forgotten its states since.
             NodeBudgetExceeded: the levels hold more nodes than that; the model has not been asked about them.
         """
+        self._check_generation()
         check_vector(root_B)
         key = root_B.cpu().numpy().tobytes()
         levels = self._levels.get(key)
@@ -147,7 +149,22 @@ class Topology:
         _check_budget(levels, expansions, max_nodes)
         return levels
 
-    # What these two make outlives the call: it must be ordinary tensors even if the caller is in inference mode.
+    # What these three make outlives the call: it must be ordinary tensors even if the caller is in inference mode.
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def step(self, state_N: Int[Tensor, "N"]) -> tuple[Outcomes, Int[Tensor, "C"]]:
+        """What follows these states, in terms of positions among their distinct children; and these, ascending.
+
+        Nothing but the answers of the model is remembered. Where every outcome ends there are no children, and the
+        outcomes cannot be backed up.
+        """
+        self._check_generation()
+        self._grow_tables()
+        outcomes = self._outcomes(state_N)
+        counts_NAK = counting(outcomes)
+        children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
+        return self._renumbered(outcomes, counts_NAK, children), children
+
     @torch.inference_mode(False)
     @torch.no_grad()
     def _start(self, root_B: Int[Tensor, "B"]) -> Levels:
@@ -163,7 +180,7 @@ class Topology:
         """One more level: ask about the states of the last frontier that are new, and find their children."""
         frontier = levels.frontiers[-1]
         outcomes = self._outcomes(frontier)
-        counts_NAK = _counts(outcomes)
+        counts_NAK = counting(outcomes)
         children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
         new = self._missing(children, levels.closed_states)
         step = self._renumbered(outcomes, counts_NAK, children if len(new) else levels.closed_states)
@@ -175,7 +192,7 @@ class Topology:
             levels.closed = step
         else:
             inside = self._outcomes(levels.closed_states)
-            levels.closed = self._renumbered(inside, _counts(inside), levels.closed_states)
+            levels.closed = self._renumbered(inside, counting(inside), levels.closed_states)
         levels.outcomes.append(step)
 
     def _outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
@@ -185,7 +202,7 @@ class Topology:
             answer = self.model.outcomes(missing)
             self.model_calls += len(missing) * self.model.num_actions
             self._grow_tables()
-            self._check_answer(missing, answer)
+            check_answer(self.model, missing, answer)
             self._row_S[missing] = self._known.append(answer)
         return self._known.rows(self._row_S[state_N])
 
@@ -217,6 +234,10 @@ class Topology:
         self._scratch_S[states] = torch.arange(len(states), device=self.model.device)
         return self._scratch_S
 
+    def _check_generation(self) -> None:
+        if self.model.generation != self._generation:
+            raise PgtsError("the model has forgotten its states since this topology was made: make a new topology")
+
     def _grow_tables(self) -> None:
         """Room for the states that the model has numbered since, and for as many again: growing is rare."""
         room = len(self._row_S)
@@ -226,40 +247,42 @@ class Topology:
             self._row_S = torch.cat([self._row_S, unknown])
             self._scratch_S = torch.cat([self._scratch_S, unknown])
 
-    def _check_answer(self, state_N: Int[Tensor, "N"], answer: Outcomes) -> None:
-        asked, given = (len(state_N), self.model.num_actions), tuple(answer.reward_NA.shape)
-        if given != asked:
-            raise PgtsError(f"the model answered for {given} states and actions; it was asked for {asked}")
-        best_N = answer.reward_NA.amax(-1)
-        if not bool(best_N.isfinite().all()):
-            n = int(torch.nonzero(~best_N.isfinite())[0, 0])
-            raise PgtsError(
-                f"the model's rewards in state {int(state_N[n])} are {answer.reward_NA[n].tolist()}; they must be "
-                "numbers, or -inf where an action is not allowed, and one action must be"
-            )
-        total_NA = torch.where(answer.reward_NA > -torch.inf, answer.prob_NAK.sum(-1), 1.0)
-        fair_NA = (total_NA - 1).abs() <= _TOLERANCE
-        if not bool(fair_NA.all()):
-            n, a = torch.nonzero(~fair_NA)[0].tolist()
-            raise PgtsError(
-                f"the model's probabilities of what follows state {int(state_N[n])} and action {a} sum to "
-                f"{float(total_NA[n, a])}"
-            )
-        child_NAK = answer.child_NAK
-        off_NAK = (child_NAK < 0) | (child_NAK >= self.model.num_states)
-        if off_NAK.any():
-            n, a, k = torch.nonzero(off_NAK)[0].tolist()
-            raise PgtsError(
-                f"the model leads from state {int(state_N[n])} by action {a} to {int(child_NAK[n, a, k])}; "
-                f"states are 0 to {self.model.num_states - 1}"
-            )
 
-
-def _counts(outcomes: Outcomes) -> Bool[Tensor, "N A K"]:
+def counting(outcomes: Outcomes) -> Bool[Tensor, "N A K"]:
     """Where an outcome has weight. A terminal outcome, an action that is not allowed and padding have none, and what
     follows them needs no node."""
     allowed_NA1 = outcomes.reward_NA.unsqueeze(-1) > -torch.inf
     return (outcomes.prob_NAK > 0) & (outcomes.discount_NAK > 0) & allowed_NA1
+
+
+def check_answer(model: Model, state_N: Int[Tensor, "N"], answer: Outcomes) -> None:
+    """PgtsError, naming the state, unless these may be the outcomes of so many states of the model."""
+    asked, given = (len(state_N), model.num_actions), tuple(answer.reward_NA.shape)
+    if given != asked:
+        raise PgtsError(f"the model answered for {given} states and actions; it was asked for {asked}")
+    best_N = answer.reward_NA.amax(-1)
+    if not bool(best_N.isfinite().all()):
+        n = int(torch.nonzero(~best_N.isfinite())[0, 0])
+        raise PgtsError(
+            f"the model's rewards in state {int(state_N[n])} are {answer.reward_NA[n].tolist()}; they must be "
+            "numbers, or -inf where an action is not allowed, and one action must be"
+        )
+    total_NA = torch.where(answer.reward_NA > -torch.inf, answer.prob_NAK.sum(-1), 1.0)
+    fair_NA = (total_NA - 1).abs() <= _TOLERANCE
+    if not bool(fair_NA.all()):
+        n, a = torch.nonzero(~fair_NA)[0].tolist()
+        raise PgtsError(
+            f"the model's probabilities of what follows state {int(state_N[n])} and action {a} sum to "
+            f"{float(total_NA[n, a])}"
+        )
+    child_NAK = answer.child_NAK
+    off_NAK = (child_NAK < 0) | (child_NAK >= model.num_states)
+    if off_NAK.any():
+        n, a, k = torch.nonzero(off_NAK)[0].tolist()
+        raise PgtsError(
+            f"the model leads from state {int(state_N[n])} by action {a} to {int(child_NAK[n, a, k])}; "
+            f"states are 0 to {model.num_states - 1}"
+        )
 
 
 def _check_budget(levels: Levels, expansions: int, max_nodes: int) -> None:

@@ -2,12 +2,14 @@
 
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
-from pgts_torch.agent.policies import SimplexPolicy
+from pgts_torch.agent.policies import Policy, SimplexPolicy
 from pgts_torch.agent.rollout import Horizon, Rollout, rollout
+from pgts_torch.agent.world import TabularWorld
 from pgts_torch.envs import TabularVectorEnv
+from pgts_torch.models.tabular import tabular_truth
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP
 
@@ -27,15 +29,24 @@ def experience(
     mdp: TabularMDP, pi_SA: Tensor, horizon: Horizon, *, episodes: int, seed: int = 0, gamma=np.nan
 ) -> Rollout:
     """Episodes in copies of the MDP, which knows its own discounts: `gamma` must not be needed."""
-    return rollout(
-        copies(mdp, episodes),
-        following(pi_SA),
-        horizon,
-        gamma=gamma,
-        seed=seed,
-        names=("test",),
-        generator=stream(seed, "test"),
-    )
+    return made_in(copies(mdp, episodes), following(pi_SA), horizon, gamma=gamma, seed=seed)
+
+
+def made_in(
+    env: VectorEnv,
+    policy: Policy,
+    horizon: Horizon,
+    *,
+    gamma: float,
+    seed: int = 0,
+    names: tuple[str | int, ...] = ("test",),
+    generator: torch.Generator | None = None,
+) -> Rollout:
+    """A rollout in the world of these copies; `gamma` is the discount of steps that name none."""
+    world = TabularWorld(env, tabular_truth(env, gamma=0.9))
+    world.gamma = gamma
+    generator = generator or stream(seed, *names)
+    return rollout(world, env, policy, horizon, seed=seed, names=names, generator=generator)
 
 
 def transitions(made: Rollout) -> list[tuple[int, int, float, float, int]]:
@@ -75,4 +86,5 @@ def log_slope(count: list[int], error: list[float]) -> float:
 
 
 def same_bits(first: Rollout, second: Rollout) -> bool:
-    return all(torch.equal(value, getattr(second, name)) for name, value in vars(first).items())
+    columns = [name for name, value in vars(first).items() if isinstance(value, Tensor)]
+    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in columns)

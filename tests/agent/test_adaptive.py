@@ -77,7 +77,7 @@ def test_the_certificate_asks_the_model_nothing_that_the_lookahead_does_not():
                 "pgts/Ladder-v0", depth=depth, policy=LEFT, critic={"type": "exact", "target": target}, num_envs=2
             )
             model.iterate()
-            calls.append(model.topology.model_calls)
+            calls.append(model.search.model_calls)
     # From s0, m levels ask about m states of 2 actions each, and v at the leaves takes one level more.
     assert calls == [2, 0, 8, 6]
 

@@ -7,23 +7,30 @@ from pgts_torch.agent.critics import ExactCritic, MonteCarlo, RolloutCritic, Tab
 from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate
+from pgts_torch.agent.world import TabularWorld
 from pgts_torch.errors import PgtsError
-from pgts_torch.models import TabularModel
+from tests.agent.helpers import copies
 from tests.support import zoo
+
+WORLD = TabularWorld(copies(zoo("ladder"), 2), zoo("ladder"))
 
 
 def policy(description):
-    return make_policy(description, 5, 2, seed=0, device="cpu")
+    return make_policy(description, WORLD, seed=0)
+
+
+def update(description):
+    return make_update(description, policy("softmax"))
 
 
 def critic(description):
-    return make_critic(description, TabularModel(zoo("ladder")), zoo("ladder"))
+    return make_critic(description, WORLD, policy("softmax"), seed=0)
 
 
 def test_a_word_stands_for_a_part_with_its_defaults():
     assert make_horizon("fixed") == make_horizon({"type": "fixed"}) == FixedHorizon()
     assert make_horizon("geometric") == GeometricHorizon()
-    assert make_update("projected") == ProjectedUpdate()
+    assert update("projected") == ProjectedUpdate()
     assert isinstance(policy("softmax"), SoftmaxPolicy)
     assert isinstance(policy("simplex"), SimplexPolicy)
     assert isinstance(critic("exact"), ExactCritic)
@@ -32,8 +39,8 @@ def test_a_word_stands_for_a_part_with_its_defaults():
 
 def test_options_reach_their_part():
     assert make_horizon({"type": "fixed", "length": 7}) == FixedHorizon(7)
-    assert make_update({"type": "softmax", "step_size": 0.3, "state_weight": "visits"}) == SoftmaxUpdate(0.3, "visits")
-    assert make_update({"type": "mirror", "step_size": 2}) == MirrorUpdate(2)
+    assert update({"type": "softmax", "step_size": 0.3, "state_weight": "visits"}) == SoftmaxUpdate(0.3, "visits")
+    assert update({"type": "mirror", "step_size": 2}) == MirrorUpdate(2)
     biased = policy({"type": "simplex", "init": {"type": "biased", "action": 1, "probability": 1}})
     assert biased.table().tolist() == [[0.0, 1.0]] * 5
     made = critic(
@@ -62,8 +69,8 @@ def test_a_description_is_not_changed_by_being_built():
         (make_horizon, {"type": "fixed", "length": 0}, "length is 0"),
         (make_horizon, {"type": "geometric", "max_length": 0}, "max_length is 0"),
         (make_horizon, 7, "horizon is 7"),
-        (make_update, "adam", "update is 'adam'"),
-        (make_update, None, "update is None"),
+        (update, "adam", "update is 'adam'"),
+        (update, 3, "update is 3"),
         (policy, {"type": "softmax", "device": "cpu"}, "'device'"),
         (policy, {"type": "softmax", "init": "zero"}, "policy.init is 'zero'"),
         (policy, {"type": "softmax", "init": {"type": "biased"}}, "policy.init 'biased' does not take"),

@@ -10,8 +10,9 @@ import torch
 from pgts_torch import PGTS
 from pgts_torch.agent import saving
 from pgts_torch.agent.policies import SoftmaxPolicy
-from pgts_torch.agent.rollout import FixedHorizon, make_vector_env
+from pgts_torch.agent.rollout import FixedHorizon
 from pgts_torch.agent.updates import SoftmaxUpdate
+from pgts_torch.agent.world import make_vector_env
 from pgts_torch.errors import PgtsError
 from tests.agent.helpers import same_bits
 
@@ -69,15 +70,16 @@ def test_a_model_is_loaded_with_everything_that_it_was_made_with(tmp_path):
         update={"type": "softmax", "step_size": 0.2, "state_weight": "visits"},
         num_envs=3,
         gamma=0.8,
-        max_nodes=5000,
+        search={"type": "expectimax", "max_nodes": 5000},
         env_kwargs={"size": 4, "traps": (5,)},
     )
     made.save(path)
     loaded = PGTS.load(path, device="cpu")
     assert torch.equal(loaded.policy.table(), made.policy.table())
-    for name in ("depths", "seed", "max_nodes", "gamma", "update", "horizon", "device"):
+    for name in ("depths", "seed", "gamma", "update", "horizon", "device"):
         assert getattr(loaded, name) == getattr(made, name)
-    assert loaded.env.num_envs == 3
+    assert loaded.search.max_nodes == 5000
+    assert loaded.world.env.num_envs == 3
     assert torch.equal(loaded.mdp.outcomes.reward_NA, made.mdp.outcomes.reward_NA)
     loaded.save(path)
     assert PGTS.load(path).iterate().experience.num_steps == made.iterate().experience.num_steps

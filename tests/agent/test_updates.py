@@ -30,7 +30,7 @@ def question(seed: int = 0):
 def test_an_update_is_the_exact_formula_at_the_visited_states(update, kind, step, step_size):
     policy = kind(7, 4, init=Random(), seed=3)
     before_SA, (q_NA, weight_N) = policy.table(), question()
-    update(step_size=step_size)(policy, STATES, q_NA, weight_N)
+    update(step_size=step_size).step(policy, STATES, q_NA, weight_N)
     expected_NA = step(before_SA[STATES], q_NA, weight_N, step_size)
     torch.testing.assert_close(policy.probs(STATES), expected_NA)
     assert not torch.allclose(expected_NA, step(before_SA[STATES], q_NA, weight_N, 2 * step_size))
@@ -38,10 +38,20 @@ def test_an_update_is_the_exact_formula_at_the_visited_states(update, kind, step
 
 
 @pytest.mark.parametrize(("update", "kind", "step"), CASES)
+def test_an_update_is_one_step_and_draws_nothing(update, kind, step):
+    called, stepped = kind(7, 4, init=Random(), seed=3), kind(7, 4, init=Random(), seed=3)
+    generator = stream(0, "untouched")
+    assert update()(called, STATES, *question(), generator=generator) == {}
+    update().step(stepped, STATES, *question())
+    assert torch.equal(called.table(), stepped.table())
+    assert torch.equal(generator.get_state(), stream(0, "untouched").get_state())
+
+
+@pytest.mark.parametrize(("update", "kind", "step"), CASES)
 def test_states_that_were_not_visited_stay_bit_for_bit(update, kind, step):
     policy = kind(7, 4, init=Random(), seed=3)
     before = {name: value.clone() for name, value in policy.state_dict().items()}
-    update(step_size=5.0)(policy, STATES, *question())
+    update(step_size=5.0).step(policy, STATES, *question())
     others = torch.tensor([1, 2, 4, 6])
     for name, value in policy.state_dict().items():
         assert torch.equal(value[others], before[name][others])
@@ -52,7 +62,7 @@ def test_states_that_were_not_visited_stay_bit_for_bit(update, kind, step):
 def test_after_many_large_steps_a_policy_is_still_one(update, kind, step):
     policy = kind(7, 4, init=Random(), seed=3)
     for seed in range(200):
-        update(step_size=50.0)(policy, STATES, *question(seed))
+        update(step_size=50.0).step(policy, STATES, *question(seed))
     pi_SA = policy.table()
     assert (pi_SA >= 0).all()
     torch.testing.assert_close(pi_SA.sum(-1), torch.ones(7, dtype=torch.float64))
@@ -62,7 +72,7 @@ def test_after_many_large_steps_a_policy_is_still_one(update, kind, step):
 def test_an_update_moves_toward_the_better_action(update, kind, step):
     policy = kind(2, 3)
     q_NA = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64)
-    update(step_size=0.1)(policy, torch.tensor([1]), q_NA, torch.ones(1, dtype=torch.float64))
+    update(step_size=0.1).step(policy, torch.tensor([1]), q_NA, torch.ones(1, dtype=torch.float64))
     assert policy.table()[1, 1] > 1 / 3 > policy.table()[1, 0]
 
 
@@ -71,7 +81,7 @@ def test_mirror_steps_on_logits_and_on_probabilities_are_the_same():
     on_logits = SoftmaxPolicy(7, 4, init=Random(), seed=3)
     for seed in range(20):
         for policy in (on_probs, on_logits):
-            MirrorUpdate(step_size=0.3)(policy, STATES, *question(seed))
+            MirrorUpdate(step_size=0.3).step(policy, STATES, *question(seed))
     torch.testing.assert_close(on_probs.table(), on_logits.table())
 
 
@@ -81,7 +91,7 @@ def test_the_softmax_update_is_the_gradient_of_the_weighted_mean_value():
     logits_SA = policy.logits_SA.clone().requires_grad_()
     (weight_N * (logits_SA[STATES].softmax(-1) * q_NA).sum(-1)).sum().backward()
     before_SA = policy.logits_SA.clone()
-    SoftmaxUpdate(step_size=0.7)(policy, STATES, q_NA, weight_N)
+    SoftmaxUpdate(step_size=0.7).step(policy, STATES, q_NA, weight_N)
     torch.testing.assert_close(policy.logits_SA - before_SA, 0.7 * logits_SA.grad)
 
 

@@ -5,21 +5,30 @@ import random
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
+import torch
+from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from torch import nn
 
 import pgts_torch  # noqa: F401  (registers the environments)
 from pgts_torch.agent import build
+from pgts_torch.agent.critics import TDLambda
+from pgts_torch.agent.networks import CNN, MLP
+from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.world import TabularWorld, make_vector_env
 from pgts_torch.experiment import strict_yaml
-from pgts_torch.experiment.config import Config, FixedHorizonConfig, SearchConfig, dump
+from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import MAX_BYTES, MAX_MISTAKES, ConfigError, load
-from pgts_torch.experiment.schema import Schema
-from pgts_torch.models.tabular import TabularModel
+from pgts_torch.experiment.schema import Option, Schema
+from pgts_torch.experiment.sections import SEARCH_OPTIONS, FixedHorizonConfig, SampledAdvantagesConfig, SearchConfig
 from pgts_torch.tabular import ladder
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
@@ -41,6 +50,7 @@ def mistakes(tmp_path: Path) -> Callable[..., list[str]]:
     return find
 
 
+SIZES = "a list of at most 16 whole numbers in [1, 65536]"
 SEARCH_KEYS = ", ".join(SearchConfig.model_fields)
 
 
@@ -113,15 +123,33 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ("env: {kwargs: {gamma: 0.9}}", "env.kwargs must not have the key gamma: env.gamma sets it"),
         ("update: {step_size: 0}", "update.step_size is 0; it must be a number > 0"),
         ("update: {step_size: .inf}", "update.step_size is .inf; it must be a number > 0"),
-        ("update: {type: adam}", "update.type is 'adam'; it must be projected, softmax or mirror"),
+        ("update: {type: adam}", "update.type is 'adam'; it must be gradient, mirror, ppo, projected or softmax"),
+        ("policy: {type: resnet}", "policy.type is 'resnet'; it must be cnn, mlp, simplex or softmax"),
+        ("policy: mlp", "policy is 'mlp'; it must be a mapping with the key type (cnn, mlp, simplex or softmax)"),
+        ("policy: {type: mlp, hidden: 64}", f"policy.hidden is 64; it must be {SIZES}"),
+        ("policy: {type: mlp, hidden: [64, 0]}", f"policy.hidden holds 0; it must be {SIZES}"),
+        ("policy: {type: mlp, hidden: [[64]]}", f"policy.hidden holds a list; it must be {SIZES}"),
+        ("policy: {type: cnn, channels: [1.5]}", f"policy.channels holds 1.5; it must be {SIZES}"),
+        (
+            "policy: {type: mlp, init: {type: random}}",
+            "policy.init does not belong to policy.type mlp; it must be left out, or policy.type changed",
+        ),
+        (
+            "{policy: {type: mlp}, critic: {step_size: 0.3}}",
+            "critic.step_size does not belong to critic.type network; it must be left out, or critic.type changed",
+        ),
+        (
+            "{policy: {type: mlp}, update: {max_grad_norm: off}}",
+            "update.max_grad_norm is 'off'; it must be a number > 0 or never",
+        ),
         ("run: {overwrite: yes}", "run.overwrite is 'yes'; it must be true or false"),
         ("run: {dir: 5}", "run.dir is 5; it must be a folder or null (in quotes, to make it text)"),
         ("search: 4", "search is 4; it must be a mapping with the keys " + SEARCH_KEYS),
         ("search:", "search is empty; it must be a mapping with the keys " + SEARCH_KEYS),
-        ("critic: 4", "critic is 4; it must be a mapping with the key type (exact, rollout or tabular)"),
-        ("critic: {type: neural}", "critic.type is 'neural'; it must be exact, rollout or tabular"),
-        ("critic: {type: [1]}", "critic.type is a list; it must be exact, rollout or tabular"),
-        ("critic: {type: null}", "critic.type is null; it must be exact, rollout or tabular"),
+        ("critic: 4", "critic is 4; it must be a mapping with the key type (exact, network, rollout or tabular)"),
+        ("critic: {type: neural}", "critic.type is 'neural'; it must be exact, network, rollout or tabular"),
+        ("critic: {type: [1]}", "critic.type is a list; it must be exact, network, rollout or tabular"),
+        ("critic: {type: null}", "critic.type is null; it must be exact, network, rollout or tabular"),
         ("critic: {step_size: men}", "critic.step_size is 'men'; it must be a number in (0, 1] or mean"),
         ("critic: {method: {lambda: 2}}", "critic.method.lambda is 2; it must be a number in [0, 1]"),
         ("critic: {method: {type: td}}", "critic.method.type is 'td'; it must be monte_carlo or td_lambda"),
@@ -151,6 +179,64 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
             "{policy: {type: simplex, init: {type: biased, probability: 1}}, update: {type: mirror}}",
             "update.type is mirror, which leaves probabilities of 0 at 0; "
             "a policy with policy.init.probability 1 would never move",
+        ),
+        (
+            "{env: {observation_key: image}, policy: {type: softmax}}",
+            "env.observation_key is image, a part of dictionary observations; "
+            "policy.type softmax is a table of numbered states, it must be mlp or cnn",
+        ),
+        (
+            "{policy: {type: cnn}, critic: {type: tabular}}",
+            "critic.type is tabular, which needs numbered states; with policy.type cnn it must be network",
+        ),
+        (
+            "{env: {observation_key: image}, policy: {type: mlp}, critic: {type: exact}}",
+            "critic.type is exact, which needs numbered states; with env.observation_key image it must be network",
+        ),
+        (
+            "critic: {type: network, network: {type: shared}}",
+            "critic.network.type is shared; policy.type softmax is a table, which has no network to share",
+        ),
+        (
+            "{policy: {type: mlp}, critic: {network: {type: cnn}}}",
+            "critic.network.type is cnn and policy.type is mlp; a cnn sees images, the others do not",
+        ),
+        (
+            "{policy: {type: cnn}, critic: {network: {type: mlp}}}",
+            "critic.network.type is mlp and policy.type is cnn; a cnn sees images, the others do not",
+        ),
+        (
+            "{policy: {type: mlp}, estimator: {type: sampled}}",
+            "search.depth is 4; with estimator.type sampled there is no lookahead, it must be 0",
+        ),
+        (
+            "{policy: {type: mlp}, search: {depth: 0, kind: mcts}, estimator: {type: sampled}}",
+            "search.kind is mcts; with estimator.type sampled there is no lookahead, it must be auto",
+        ),
+        (
+            "{policy: {type: mlp}, search: {depth: 0, stop_at: 1}, estimator: {type: sampled}}",
+            "search.stop_at is 1.0; with estimator.type sampled there is no lookahead, it must be null",
+        ),
+        (
+            "{search: {depth: 0}, estimator: {type: sampled}}",
+            "estimator.type is sampled, which needs policy.type mlp or cnn; policy.type is softmax",
+        ),
+        (
+            "{policy: {type: mlp}, search: {depth: 0}, estimator: {type: sampled}, update: {type: mirror}}",
+            "update.type is mirror, which needs the advantages of all actions; estimator.type is sampled",
+        ),
+        ("update: {type: ppo}", "update.type is ppo, which needs policy.type mlp or cnn; policy.type is softmax"),
+        (
+            "{policy: {type: mlp}, update: {type: softmax}}",
+            "update.type is softmax, which needs policy.type softmax; policy.type is mlp",
+        ),
+        (
+            "update: {type: mirror, temperature: 2}",
+            "update.temperature is 2.0, which the mirror update of a table does not heed; policy.type is softmax",
+        ),
+        (
+            "{policy: {type: mlp}, update: {type: mirror, step_size: 2}}",
+            "update.step_size is 2.0, which the mirror update of a network does not heed; policy.type is mlp",
         ),
     ],
 )
@@ -217,7 +303,7 @@ def test_all_mistakes_are_reported_at_once_in_the_order_of_lines_then_flags(
         "c.yaml:2: nam is unknown; did you mean name?",
         "c.yaml:3: search.depth is -1; it must be a whole number >= 0 or adaptive",
         "c.yaml:5: the key seed is given twice",
-        "c.yaml:6: critic.type is 'x'; it must be exact, rollout or tabular",
+        "c.yaml:6: critic.type is 'x'; it must be exact, network, rollout or tabular",
         "--sed is unknown; did you mean --seed?",
         "'stray' belongs to no option; write --KEY VALUE",
         "--threads is 0; it must be a whole number in [1, 1024]",
@@ -247,7 +333,7 @@ def test_the_readable_forms_of_yaml_1_2_mean_what_they_say(tmp_path: Path) -> No
     path = tmp_path / "c.yaml"
     path.write_bytes(b"\xef\xbb\xbftotal_steps: 1_000\r\nseed: 010\r\nupdate: {step_size: 5e-2}\r\nname: no\r\n")
     config = load(path)
-    assert (config.total_steps, config.seed, config.update.step_size, config.name) == (1000, 10, 0.05, "no")
+    assert (config.total_steps, config.seed, config.update.plain()["step_size"], config.name) == (1000, 10, 0.05, "no")
 
 
 def test_an_override_changes_one_key_and_a_mapping_replaces_a_section(tmp_path: Path) -> None:
@@ -283,7 +369,7 @@ def test_a_section_without_type_has_the_default_one() -> None:
 
 def test_a_configuration_cannot_be_changed() -> None:
     with pytest.raises(ValidationError, match="frozen"):
-        Config().seed = 1  # type: ignore[misc]
+        Config().seed = 1
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -319,6 +405,9 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a whole number in [1, 1024]": st.integers(1, 1024),
     "a number > 0": st.floats(0, exclude_min=True, allow_infinity=False),
     "a whole number >= 0 or adaptive": st.just("adaptive") | st.integers(0, 2**63 - 1),
+    "a whole number >= 1 or null": st.none() | st.integers(1, 2**63 - 1),
+    "true or false or null": st.none() | st.booleans(),
+    "none, level or search or null": st.sampled_from([None, "none", "level", "search"]),
     "a whole number >= 0 or null": st.none() | st.integers(0, 2**63 - 1),
     "a number >= 0 or null": st.none() | st.floats(0, allow_infinity=False),
     "a number in [0, 1]": st.floats(0, 1),
@@ -330,6 +419,14 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "the id of a Gymnasium environment": st.from_regex(r"[A-Za-z0-9_.:/-]{1,20}", fullmatch=True),
     "letters, digits, '.', '_', '-', at most 100": st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", fullmatch=True),
     "cpu, cuda or cuda:N": st.sampled_from(["cpu", "cuda", "cuda:3"]),
+    "a number > 0 or null": st.none() | st.floats(0, exclude_min=True, allow_infinity=False),
+    "a number > 0 or never": st.just("never") | st.floats(0, exclude_min=True, allow_infinity=False),
+    "a number > 0 or never or null": st.sampled_from([None, "never", 0.25]),
+    "a number >= 0": st.floats(0, allow_infinity=False),
+    "adam or sgd or null": st.sampled_from([None, "adam", "sgd"]),
+    "occupancy, visits or uniform or null": st.sampled_from([None, "occupancy", "visits", "uniform"]),
+    "a key of dictionary observations or null": st.none() | st.from_regex(r"[A-Za-z0-9_.:-]{1,20}", fullmatch=True),
+    SIZES: st.lists(st.integers(1, 65536), max_size=16),
     "a mapping": st.dictionaries(st.sampled_from(["n", "traps", "word"]), PLAIN),
 }
 """Valid values for each requirement."""
@@ -338,35 +435,58 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
 OPTIONS = Schema(Config).options()
 
 
+UPDATES = {
+    "softmax": ["softmax", "mirror"],
+    "simplex": ["projected", "mirror"],
+    "mlp": ["gradient", "ppo", "mirror"],
+    "cnn": ["gradient", "ppo", "mirror"],
+}
+"""What can move a policy of each type."""
+
+
 @st.composite
 def configurations(draw: st.DrawFn) -> Config:
-    """Every key with any valid value; the policy and its update, and the keys of the depth, fit each other."""
-    data: dict[str, Any] = {}
+    """Every key with any valid value; choices that must fit each other do."""
+    given: dict[str, Any] = {}
+    types = {option.key: draw(st.sampled_from(_words(option))) for option in OPTIONS if option.choices}
+    policy = types["policy.type"]
+    is_table = policy in ("softmax", "simplex")
+    types["update.type"] = draw(st.sampled_from(UPDATES[policy]))
+    types["critic.network.type"] = draw(st.sampled_from(["own", "mlp"] if is_table else ["own", "shared", policy]))
+    types["critic.type"] = "network" if policy == "cnn" else types["critic.type"]
+    types["estimator.type"] = "lookahead" if is_table or types["update.type"] == "mirror" else types["estimator.type"]
     for option in OPTIONS:
-        *sections, name = option.key.split(".")
+        if _holds(option.when, types):
+            words = st.sampled_from(_words(option))
+            given[option.key] = types.get(option.key) or draw(SAMPLES.get(option.requirement, words))
+    if is_table or types["critic.type"] != "network":
+        given["env.observation_key"] = None
+    if types["update.type"] == "mirror":
+        ignored = [key for key in given if key.startswith("update.") and (key == "update.step_size") != is_table]
+        given |= {key: None for key in ignored if key not in ("update.type", "update.state_weight")}
+    if given["search.depth"] != "adaptive":
+        given["search.max_depth"] = given["search.tolerance"] = None
+    for name, kind in SEARCH_OPTIONS.items():
+        if given["search.kind"] != kind:
+            given[f"search.{name}"] = None
+    if types["estimator.type"] == "sampled":
+        given = {key: value for key, value in given.items() if not key.startswith("search.")} | {"search.depth": 0}
+    return Config.model_validate(_nested(given))
+
+
+def _words(option: Option) -> list[str]:
+    return option.requirement.replace(" or ", ", ").split(", ")
+
+
+def _nested(values: dict[str, Any]) -> dict[str, Any]:
+    data: dict[str, Any] = {}
+    for key, value in values.items():
+        *sections, name = key.split(".")
         section = data
         for part in sections:
             section = section.setdefault(part, {})
-        chosen = option.when.rpartition(" ")[2]
-        if option.when and section.get("type", chosen) != chosen:
-            continue
-        choices = option.requirement.replace(" or ", ", ").split(", ")
-        section[name] = draw(SAMPLES.get(option.requirement, st.sampled_from(choices)))
-    data["update"]["type"] = {"simplex": "projected", "softmax": "softmax"}[data["policy"]["type"]]
-    if data["search"]["depth"] != "adaptive":
-        data["search"]["max_depth"] = data["search"]["tolerance"] = None
-    _drop_parts_of_other_choices(data)
-    return Config.model_validate(data)
-
-
-def _drop_parts_of_other_choices(data: dict[str, Any]) -> None:
-    critic = data["critic"]
-    kept = {
-        "exact": {"target"},
-        "tabular": {"target", "method", "step_size"},
-        "rollout": {"samples", "target", "horizon"},
-    }
-    data["critic"] = {"type": critic["type"]} | {k: v for k, v in critic.items() if k in kept[critic["type"]]}
+        section[name] = value
+    return data
 
 
 @given(configurations())
@@ -384,19 +504,17 @@ def test_what_only_an_adaptive_depth_heeds_is_refused_beside_a_number(key: str) 
 
 def test_every_default_is_the_one_that_the_help_names() -> None:
     defaults = Config().model_dump(by_alias=True)
-    options = {option.key: option for option in OPTIONS if _holds(option.when, defaults)}
+    types = {key: _look_up(defaults, key) for key in _leaves(defaults) if key.endswith(".type")}
+    options = {option.key: option for option in OPTIONS if _holds(option.when, types)}
     for key, option in options.items():
         assert _look_up(defaults, key) == option.default, key
     assert set(options) == set(_leaves(defaults))
 
 
-def _holds(when: str, data: dict[str, Any]) -> bool:
-    key, _, tag = when.partition(" ")
-    return not when or (_holds_key(key, data) and _look_up(data, key) == tag)
-
-
-def _holds_key(key: str, data: dict[str, Any]) -> bool:
-    return any(leaf == key for leaf in _leaves(data))
+def _holds(when: str, types: dict[str, Any]) -> bool:
+    """Whether the choices that an option belongs to were made: "critic.type a|b and critic.method.type c"."""
+    conditions = [condition.split(" ") for condition in when.split(" and ") if condition]
+    return all(types.get(key) in tags.split("|") for key, tags in conditions)
 
 
 def _look_up(data: Any, key: str) -> Any:
@@ -412,23 +530,99 @@ def _leaves(data: dict[str, Any], prefix: str = "") -> list[str]:
     return leaves
 
 
-def test_the_library_accepts_every_part_that_can_be_configured() -> None:
-    mdp = ladder()
-    model = TabularModel(mdp)
-    for kind in ("exact", "tabular", "rollout"):
-        critic = load(None, ["--critic.type", kind]).model_dump(by_alias=True)["critic"]
-        assert build.make_critic(critic, model, mdp).target == "v"
-    build.make_critic(
-        load(None, ["--critic.method.type", "monte_carlo"]).model_dump(by_alias=True)["critic"], model, mdp
-    )
-    for kind in ("uniform", "random", "biased"):
-        policy = load(None, ["--policy.init.type", kind]).model_dump(by_alias=True)["policy"]
-        for form in ("softmax", "simplex"):
-            assert build.make_policy(policy | {"type": form}, 5, 2, seed=0, device="cpu").num_actions == 2
-    for kind in ("fixed", "geometric"):
-        build.make_horizon(load(None, ["--rollout.horizon.type", kind]).model_dump(by_alias=True)["rollout"]["horizon"])
-    for kind in ("projected", "softmax", "mirror"):
-        build.make_update(Config().model_dump(by_alias=True)["update"] | {"type": kind})
+NUMBERED = TabularWorld(make_vector_env("pgts/Ladder-v0", 1, gamma=None), ladder())
+PICTURED = SimpleNamespace(
+    observation_space=spaces.Box(0, 255, (7, 7, 3), np.uint8), num_actions=2, device=torch.device("cpu")
+)
+"""The world of a numbered environment, and as much of one with images as parts ask for."""
+
+PARTS = [
+    [],
+    ["--policy.type", "simplex", "--update.type", "projected"],
+    ["--policy.init.type", "random", "--update.type", "mirror", "--update.step_size", "0.2"],
+    ["--policy.init.type", "biased", "--critic.method.type", "monte_carlo"],
+    ["--critic.type", "exact", "--rollout.horizon.type", "geometric"],
+    ["--critic.type", "rollout", "--critic.horizon.type", "fixed"],
+    ["--critic.type", "rollout", "--critic.horizon.type", "geometric"],
+    ["--critic.type", "network", "--critic.method.type", "monte_carlo"],
+    ["--policy.type", "mlp", "--critic.type", "tabular"],
+    ["--policy.type", "mlp", "--critic.network.type", "mlp", "--critic.network.hidden", "[]"],
+    ["--policy.type", "mlp", "--critic.network.type", "shared", "--update.type", "gradient"],
+    ["--policy.type", "mlp", "--update", "{type: mirror, temperature: 0.5, max_grad_norm: never}"],
+    ["--policy.type", "cnn", "--policy.scale", "10", "--update.target_kl", "0.1"],
+    ["--policy.type", "cnn", "--critic.network", "{type: cnn, channels: [4]}", "--critic.polyak", "0.1"],
+    ["--policy.type", "mlp", "--search.depth", "0", "--estimator.type", "sampled", "--estimator.lambda", "0.9"],
+]
+"""Command lines that together name every type there is."""
+
+
+@pytest.mark.parametrize("arguments", PARTS, ids=" ".join)
+def test_the_library_builds_what_is_configured(arguments: list[str]) -> None:
+    config = load(None, arguments)
+    world: Any = PICTURED if config.policy.type == "cnn" else NUMBERED
+    policy = build.make_policy(config.policy.plain(), world, seed=0)
+    critic = build.make_critic(config.critic_description(), world, policy, seed=0)
+    assert critic.target == config.critic.target
+    build.make_update(config.update.plain(), policy).check(policy)
+    build.make_horizon(config.rollout.horizon.plain())
+    build.make_estimator(config.estimator.plain())
+    build.make_search(config.search.description(), NUMBERED)
+
+
+def test_these_parts_name_every_type_there_is() -> None:
+    named: dict[str, set[str]] = {}
+    for arguments in PARTS:
+        data = load(None, arguments).model_dump(by_alias=True)
+        for key in (key for key in _leaves(data) if key.endswith(".type")):
+            named.setdefault(key, set()).add(_look_up(data, key))
+    assert named == {option.key: {tag for tag, _ in option.choices} for option in OPTIONS if option.choices}
+
+
+def test_what_is_configured_reaches_the_part() -> None:
+    config = load(None, ["--policy.type", "mlp", "--policy.hidden", "[7, 5]", "--update.max_grad_norm", "never"])
+    policy = build.make_policy(config.policy.plain(), NUMBERED, seed=0)
+    assert isinstance(policy, NetworkPolicy)
+    assert [layer.out_features for layer in policy.network.modules() if isinstance(layer, nn.Linear)] == [7, 5, 2]
+    assert build.make_update(config.update.plain(), policy).max_grad_norm is None  # type: ignore[attr-defined]
+    own = build.make_critic(config.critic_description(), NUMBERED, policy, seed=0)
+    assert isinstance(own, NetworkCritic)
+    assert [layer.out_features for layer in own.network.modules() if isinstance(layer, nn.Linear)] == [7, 5, 1]
+    shared = load(None, ["--policy.type", "mlp", "--critic.network.type", "shared"])
+    critic = build.make_critic(shared.critic_description(), NUMBERED, policy, seed=0)
+    assert isinstance(critic, NetworkCritic)
+    assert critic.network.trunk is policy.network.trunk is not own.network.trunk
+
+
+def test_the_defaults_of_networks_are_those_of_the_library() -> None:
+    policy = build.make_policy("mlp", NUMBERED, seed=0)
+    for kind in ("gradient", "ppo", "mirror"):
+        configured = load(None, ["--policy.type", "mlp", "--update.type", kind]).update.plain()
+        own, given = (build.make_update(update, policy) for update in (kind, configured))
+        assert _plain_options(own) == _plain_options(given)
+    critic = load(None, ["--policy.type", "mlp"]).critic_description()
+    own_critic, given_critic = (build.make_critic(each, NUMBERED, policy, seed=0) for each in ("network", critic))
+    assert _plain_options(own_critic) == _plain_options(given_critic)
+    assert MLP(**_without_type(load(None, ["--policy.type", "mlp"]).policy.plain())) == MLP()
+    assert CNN(**_without_type(load(None, ["--policy.type", "cnn"]).policy.plain())) == CNN()
+    assert build.make_estimator("sampled") == build.make_estimator(SampledAdvantagesConfig().plain())
+
+
+def _plain_options(part: Any) -> dict[str, Any]:
+    return {name: value for name, value in vars(part).items() if isinstance(value, int | float | str | None | TDLambda)}
+
+
+def _without_type(description: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in description.items() if name != "type"}
+
+
+@pytest.mark.parametrize("policy", ["mlp", "cnn"])
+def test_a_network_policy_brings_a_network_critic_and_ppo_with_it(policy: str, tmp_path: Path) -> None:
+    assert (Config().critic.type, Config().update.type) == ("tabular", "softmax")
+    config = load(None, ["--policy.type", policy, "--update.learning_rate", "1e-3"])
+    assert (config.critic.type, config.update.type) == ("network", "ppo")
+    assert Config.model_validate({"policy": {"type": policy}, "update": {"learning_rate": 1e-3}}) == config
+    (tmp_path / "c.yaml").write_text(dump(config))
+    assert load(tmp_path / "c.yaml") == config
 
 
 CHARACTERS = [chr(n) for n in range(1, 300)]
@@ -496,4 +690,4 @@ def test_numbers_that_are_not_finite_are_refused_wherever_they_stand() -> None:
         for value in (".nan", ".inf", "1e999", "-.inf"):
             with pytest.raises(ConfigError):
                 load(None, [f"--{key}", value])
-    assert math.isfinite(load(None, ["--update.step_size", "1e300"]).update.step_size)
+    assert math.isfinite(load(None, ["--update.step_size", "1e300"]).update.plain()["step_size"])

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgts_torch.agent.build import Description, make_policy
+from pgts_torch.agent.build import Description, make_tabular_policy
 from pgts_torch.experiment.figures.batch import Batch, Cells, Iterate, Step
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.ascent import projected_step
@@ -111,4 +111,4 @@ def cells(settings: Sequence[tuple[int, float]], pi_SA: Float[Tensor, "S A"]) ->
 def initial_policy(mdp: TabularMDP, init: Description) -> Float[Tensor, "S A"]:
     """The policy that a description like {"type": "biased", "action": 0, "probability": 1.0} names."""
     description = {"type": "simplex", "init": init}
-    return make_policy(description, mdp.num_states, mdp.num_actions, seed=0, device="cpu").table()
+    return make_tabular_policy(description, mdp.num_states, mdp.num_actions).table()

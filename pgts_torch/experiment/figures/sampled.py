@@ -38,10 +38,10 @@ def returns(job: Job) -> list[float]:
     """The exact return of pi_0 .. pi_K in one run."""
     seed = int(seed_sequence(0, "figures", *job.stream).generate_state(1, np.uint64)[0] >> np.uint64(1))
     algorithm = PGTS(job.env_id, seed=seed, **job.arguments)
-    J = [exact.evaluate(algorithm.mdp, algorithm.policy.table()).J]
+    J = [exact.evaluate(algorithm.mdp, algorithm.policy_table()).J]
     for _ in range(job.iterations):
         algorithm.iterate()
-        J.append(exact.evaluate(algorithm.mdp, algorithm.policy.table()).J)
+        J.append(exact.evaluate(algorithm.mdp, algorithm.policy_table()).J)
     return J
 
 

@@ -1,0 +1,74 @@
+"""Advantages of the actions that were taken, in the form in which updates take those of all actions."""
+
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.agent.critics import Critic, lambda_returns
+from pgts_torch.agent.rollout import Rollout
+from pgts_torch.errors import PgtsError
+
+
+@final
+@dataclass(frozen=True)
+class LookaheadAdvantages:
+    """Of all actions, by a lookahead from the visited states."""
+
+
+@final
+@dataclass(frozen=True)
+class SampledAdvantages:
+    """Of the actions taken, from what came of them, as in PPO and A2C (`gae`)."""
+
+    lambda_: float = 0.95
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.lambda_ <= 1:
+            raise PgtsError(f"lambda is {self.lambda_}; it must be in [0, 1]")
+
+    def __call__(self, rollout: Rollout, critic: Critic) -> Float[Tensor, "T B"]:
+        """The advantages; where an episode is over, they mean nothing."""
+        v_TB, next_v_TB = (
+            critic.v(rollout.observe(state_TB.reshape(-1))).to(rollout.reward_TB).view(state_TB.shape)
+            for state_TB in (rollout.state_TB, rollout.next_state_TB)
+        )
+        return gae(rollout, v_TB, next_v_TB, self.lambda_)
+
+
+Estimator = LookaheadAdvantages | SampledAdvantages
+
+
+def gae(
+    rollout: Rollout, v_TB: Float[Tensor, "T B"], next_v_TB: Float[Tensor, "T B"], lambda_: float
+) -> Float[Tensor, "T B"]:
+    """Generalised advantage estimates (Schulman et al. 2016), as what the lambda-return is above v:
+
+        A_t = G_t^lambda - v(s_t) = delta_t + gamma_t lambda A_{t+1},    delta_t = r_t + gamma_t v(s_{t+1}) - v(s_t)
+
+    Where an episode was cut, v(s_{t+1}) stands for the rest; where it terminated, nothing does.
+
+    Args:
+        v_TB, next_v_TB: v(s_t) and v(s_{t+1}) of one critic.
+        lambda_: in [0, 1].
+    """
+    return lambda_returns(rollout, next_v_TB, rollout.discount_TB, lambda_) - v_TB
+
+
+def score_function(
+    action_N: Int[Tensor, "N"], advantage_N: Float[Tensor, "N"], pi_NA: Float[Tensor, "N A"]
+) -> Float[Tensor, "N A"]:
+    """The unbiased estimate of the advantages of all actions from one that was taken: A / pi(a|s) there, 0 elsewhere.
+
+        sum_a rho_a pi(a|s) adv(s, a) = rho_{a_t} A_t   for any numbers rho
+
+    So objectives over all actions become those of A2C (Mnih et al. 2016) and PPO (Schulman et al. 2017).
+
+    Args:
+        pi_NA: the policy that took the actions.
+    """
+    index_N1 = action_N[:, None]
+    estimate_N1 = advantage_N[:, None] / pi_NA.gather(-1, index_N1).to(advantage_N.dtype)
+    return torch.zeros_like(pi_NA, dtype=advantage_N.dtype).scatter(-1, index_N1, estimate_N1)

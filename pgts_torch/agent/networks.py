@@ -1,0 +1,294 @@
+"""Networks from plain descriptions. Their weights are drawn from a named stream, never from torch's global generator.
+
+    output(o) = head(trunk(encode(o)))
+
+`encode` makes float32 inputs of what is observed: one-hot rows of states, vectors as they are, images scaled. It holds
+no weights, so a training loop encodes its batch once.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, final
+
+import torch
+from gymnasium import spaces
+from gymnasium.spaces import Space
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.utils import skip_init
+
+from pgts_torch.agent.policies import fitting
+from pgts_torch.errors import PgtsError
+
+Activation = Literal["tanh", "relu"]
+
+_ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
+_MOST_INPUTS = 2**24
+_CLIP = 10.0
+
+
+@final
+class RunningNorm(nn.Module):
+    """(x - mean) / standard deviation of all rows absorbed so far, clipped to [-10, 10]; the identity before the first.
+
+    Each entry of the last axis has statistics of its own, in float64: mean and sum of squared deviations are merged
+    batch by batch (Chan, Golub and LeVeque 1983). They change in `absorb` only.
+    """
+
+    count: Tensor
+    mean_D: Tensor
+    square_D: Tensor
+
+    def __init__(self, num_features: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean_D", torch.zeros(num_features, dtype=torch.float64))
+        self.register_buffer("square_D", torch.zeros(num_features, dtype=torch.float64))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not bool(self.count):
+            return x
+        std_D = (self.square_D / self.count).sqrt()
+        # A feature that never moved says nothing: it stays near 0 instead of being blown up.
+        std_D = torch.where(std_D > 1e-6 * (1 + self.mean_D.abs()), std_D, 1.0)
+        return ((x - self.mean_D) / std_D).clamp(-_CLIP, _CLIP)
+
+    @torch.no_grad()
+    def absorb(self, x: Tensor) -> None:
+        """Count the rows of x among those seen; PgtsError, and nothing counted, unless they are finite."""
+        x_ND = x.reshape(-1, x.shape[-1]).double()
+        mean_D, total = x_ND.mean(0), self.count + len(x_ND)
+        if not bool(mean_D.isfinite().all()):
+            raise PgtsError(f"the mean of the observations is {mean_D.tolist()}; observations must be finite")
+        apart_D = mean_D - self.mean_D
+        self.square_D += (x_ND - mean_D).square().sum(0) + apart_D.square() * self.count * len(x_ND) / total
+        self.mean_D += apart_D * len(x_ND) / total
+        self.count.copy_(total)
+
+
+@final
+class Encoder(nn.Module):
+    """Observations of a space as float32 inputs.
+
+    Discrete(n): one-hot rows [N, n].   Box (D,): [N, D].   Box (H, W, C): divided by `scale`, as [N, C, H, W].
+
+    Raises:
+        PgtsError: another space, or a normalisation of states.
+    """
+
+    def __init__(self, observation_space: Space[Any], *, normalize: bool, scale: float | None = None) -> None:
+        super().__init__()
+        self.num_states: int | None = None
+        if isinstance(observation_space, spaces.Discrete) and observation_space.start == 0:
+            if normalize:
+                raise PgtsError("normalize is True; states are numbers without a scale, it must be False")
+            self.num_states = int(observation_space.n)
+            self.shape: tuple[int, ...] = (self.num_states,)
+        elif isinstance(observation_space, spaces.Box) and len(observation_space.shape) in (1, 3):
+            self.shape = observation_space.shape
+        else:
+            raise PgtsError(f"observations are {observation_space}; a network sees Discrete(n), vectors or images")
+        self.scale = scale if scale is not None else 255.0 if observation_space.dtype == "uint8" else 1.0
+        self.norm = RunningNorm(self.shape[-1]) if normalize else None
+
+    @property
+    def num_inputs(self) -> int:
+        return math.prod(self.shape)
+
+    def forward(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
+        if self.num_states is not None:
+            return nn.functional.one_hot(observation_N, self.num_states).float()
+        x = self._scaled(observation_N)
+        x = (x if self.norm is None else self.norm(x)).float()
+        return x.permute(0, 3, 1, 2) if len(self.shape) == 3 else x
+
+    def _scaled(self, observation_N: Tensor) -> Tensor:
+        if observation_N.shape[1:] != self.shape:
+            raise PgtsError(f"an observation has shape {tuple(observation_N.shape[1:])}; it must be {self.shape}")
+        return observation_N if self.scale == 1 else observation_N / self.scale
+
+    def absorb(self, observation_N: Tensor) -> None:
+        """Let the running statistics see these observations, where there are any."""
+        if self.norm is not None:
+            self.norm.absorb(self._scaled(observation_N))
+
+    @property
+    def fresh(self) -> bool:
+        """Whether there are running statistics that have seen nothing yet."""
+        return self.norm is not None and not bool(self.norm.count)
+
+
+@final
+class Trunk(nn.Module):
+    """All of a network but its last layer. A policy and a critic that are given the same one share its weights."""
+
+    def __init__(self, encoder: Encoder, layers: nn.Sequential, num_features: int) -> None:
+        super().__init__()
+        self.encoder, self.layers, self.num_features = encoder, layers, num_features
+
+    def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
+        return self.layers(input_N)
+
+
+@final
+@dataclass(frozen=True)
+class MLP:
+    """Fully connected layers over states or vectors; without hidden layers, one number for each (state, output).
+
+    Args:
+        hidden: the sizes of the hidden layers.
+        activation: "tanh" or "relu".
+        normalize: observations by their running mean and variance (vectors only).
+    """
+
+    hidden: tuple[int, ...] = (64, 64)
+    activation: Activation = "tanh"
+    normalize: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden", _sizes("hidden", self.hidden))
+        _check_activation(self.activation)
+
+    def trunk(self, observation_space: Space[Any], *, generator: torch.Generator) -> Trunk:
+        """A trunk on the CPU: orthogonal weights of gain sqrt(2) (Saxe et al. 2014), biases 0."""
+        encoder = Encoder(observation_space, normalize=self.normalize)
+        if len(encoder.shape) != 1:
+            raise PgtsError(f"an mlp sees states or vectors, not images of shape {encoder.shape}; use a cnn")
+        layers = _dense(encoder.num_inputs, self.hidden, self.activation, generator)
+        return Trunk(encoder, nn.Sequential(*layers), (encoder.num_inputs, *self.hidden)[-1])
+
+
+@final
+@dataclass(frozen=True)
+class CNN:
+    """Convolutions without padding over channels-last images, then fully connected layers.
+
+    The default is the usual one for the 7x7x3 views of MiniGrid (Chevalier-Boisvert et al. 2023).
+
+    Args:
+        channels: of the convolutions, one after the other.
+        kernel_size, stride: of all of them.
+        hidden: the sizes of the fully connected layers after them.
+        activation: "tanh" or "relu".
+        normalize: each channel by its running mean and variance.
+        scale: what observations are divided by. Default: 255 for uint8, else 1. MiniGrid's numbers are codes of at
+            most 10, so 10 suits them better.
+    """
+
+    channels: tuple[int, ...] = (16, 32, 64)
+    kernel_size: int = 2
+    stride: int = 1
+    hidden: tuple[int, ...] = (128,)
+    activation: Activation = "relu"
+    normalize: bool = False
+    scale: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "channels", _sizes("channels", self.channels))
+        object.__setattr__(self, "hidden", _sizes("hidden", self.hidden))
+        _sizes("kernel_size and stride", (self.kernel_size, self.stride))
+        _check_activation(self.activation)
+        if self.scale is not None and not 0 < self.scale < math.inf:
+            raise PgtsError(f"scale is {self.scale}; it must be finite and above 0")
+
+    def trunk(self, observation_space: Space[Any], *, generator: torch.Generator) -> Trunk:
+        """A trunk on the CPU, initialised as that of `MLP`."""
+        encoder = Encoder(observation_space, normalize=self.normalize, scale=self.scale)
+        if len(encoder.shape) != 3:
+            raise PgtsError(f"a cnn sees images (H, W, C), not {observation_space}; use an mlp")
+        height, width, inputs = encoder.shape
+        layers: list[nn.Module] = []
+        for outputs in self.channels:
+            height, width = ((side - self.kernel_size) // self.stride + 1 for side in (height, width))
+            if min(height, width) < 1:
+                raise PgtsError(f"images of shape {encoder.shape} are too small for {self}")
+            conv = skip_init(nn.Conv2d, inputs, outputs, self.kernel_size, self.stride)
+            layers += [_orthogonal(conv, math.sqrt(2), generator), _ACTIVATIONS[self.activation]()]
+            inputs = outputs
+        flat = height * width * inputs
+        layers += [nn.Flatten(), *_dense(flat, self.hidden, self.activation, generator)]
+        return Trunk(encoder, nn.Sequential(*layers), (flat, *self.hidden)[-1])
+
+
+NetworkDescription = MLP | CNN
+
+
+@final
+class Network(nn.Module):
+    """A trunk and a linear head.
+
+    Args:
+        trunk: may be another network's, too.
+        num_outputs: of the head.
+        gain: of the head's orthogonal weights; its biases are 0.
+    """
+
+    def __init__(self, trunk: Trunk, num_outputs: int, *, gain: float, generator: torch.Generator) -> None:
+        super().__init__()
+        self.trunk = trunk
+        head = skip_init(nn.Linear, trunk.num_features, num_outputs)
+        self.head: nn.Linear = _orthogonal(head, gain, generator)
+
+    @cached_property
+    def weights(self) -> list[nn.Parameter]:
+        """All parameters, the trunk's first."""
+        return list(self.parameters())
+
+    def encode(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
+        """The inputs that `forward` takes; they carry no gradient."""
+        with torch.no_grad():
+            return self.trunk.encoder(observation_N)
+
+    def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
+        return self.head(self.trunk(input_N))
+
+    @torch.no_grad()
+    def evaluate(self, observation_N: Tensor) -> Float[Tensor, "N D"]:
+        """Outputs without gradient, in pieces of bounded memory."""
+        rows = max(1, _MOST_INPUTS // max(self.trunk.encoder.num_inputs, self.trunk.num_features))
+        if len(observation_N) <= rows:
+            return self(self.encode(observation_N))
+        return torch.cat([self(self.encode(piece)) for piece in observation_N.split(rows)])
+
+    def plain_state(self) -> dict[str, Tensor]:
+        """Weights and running statistics, copied to the CPU."""
+        return {name: value.detach().cpu().clone() for name, value in self.state_dict().items()}
+
+    @torch.no_grad()
+    def take_over(self, state: Mapping[str, Any]) -> None:
+        """What `plain_state` gave; PgtsError, and nothing changed, unless all of it fits."""
+        own = self.state_dict()
+        if unknown := sorted(set(state) - set(own)):
+            raise PgtsError(f"{unknown[0]} belongs to another network; this one has {sorted(own)}")
+        found = {name: fitting(dict(state), name, like) for name, like in own.items()}
+        for name, value in found.items():
+            own[name].copy_(value)
+
+
+def _dense(inputs: int, hidden: tuple[int, ...], activation: Activation, generator: torch.Generator) -> list[nn.Module]:
+    layers: list[nn.Module] = []
+    for outputs in hidden:
+        linear = skip_init(nn.Linear, inputs, outputs)
+        layers += [_orthogonal(linear, math.sqrt(2), generator), _ACTIVATIONS[activation]()]
+        inputs = outputs
+    return layers
+
+
+def _orthogonal(layer: Any, gain: float, generator: torch.Generator) -> Any:
+    nn.init.orthogonal_(layer.weight, gain, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def _sizes(name: str, sizes: Any) -> tuple[int, ...]:
+    """The sizes as a tuple; PgtsError unless they are whole numbers of at least 1."""
+    if not isinstance(sizes, list | tuple) or not all(isinstance(size, int) and size >= 1 for size in sizes):
+        raise PgtsError(f"{name} is {sizes!r}; sizes are whole numbers of at least 1")
+    return tuple(sizes)
+
+
+def _check_activation(activation: str) -> None:
+    if activation not in _ACTIVATIONS:
+        raise PgtsError(f"activation is {activation!r}; it must be one of {', '.join(_ACTIVATIONS)}")

@@ -1,0 +1,239 @@
+"""Policies and critics whose answers come from networks."""
+
+import copy
+import math
+from typing import Any, final
+
+import torch
+from gymnasium.spaces import Space
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.agent.critics import Critic, Method, MonteCarlo, Target, TDLambda, check_target, lambda_returns
+from pgts_torch.agent.networks import MLP, Network, NetworkDescription, Trunk
+from pgts_torch.agent.optimisers import Optimiser, check_count, minibatches
+from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.rollout import Rollout
+from pgts_torch.errors import PgtsError
+from pgts_torch.seeding import stream
+
+_SMALLEST_SCALE = 1e-4
+_SLOWEST_RATE = 0.1
+
+
+@final
+class NetworkPolicy(Policy):
+    """pi(a|o) ~ exp(logit_a(o)), float32; nearly uniform at first, for the last layer starts with gain 0.01.
+
+    Args:
+        observation_space: Discrete(n), vectors or channels-last images.
+        num_actions: of the discrete action set.
+        network: its trunk.
+        seed: the weights are drawn from the stream (seed, "policy"), alike on every device.
+
+    Raises:
+        PgtsError: a network that cannot see such observations.
+    """
+
+    def __init__(
+        self,
+        observation_space: Space[Any],
+        num_actions: int,
+        *,
+        network: NetworkDescription = MLP(),  # noqa: B008 - frozen
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        generator = stream(seed, "policy")
+        trunk = network.trunk(observation_space, generator=generator)
+        self.network = Network(trunk, num_actions, gain=0.01, generator=generator).to(device)
+        self.num_actions = num_actions
+
+    def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
+        """softmax of the logits."""
+        return self.network.evaluate(observation_N).softmax(-1)
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.network.plain_state()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.network.take_over(state)
+
+
+@final
+class NetworkCritic(Critic):
+    """v(o), or Q(o, .), fitted by least squares to targets from rollouts.
+
+        minimise  mean over visits of ((y_t - mean) / scale - net(o_t))^2,    v(o) = mean + scale * net(o)
+
+    y_t are lambda-returns or Monte-Carlo returns: where an episode was cut, v of the target network stands for the
+    rest; where it terminated, nothing does. mean and scale follow the targets (1/k of fit k, never less than 1/10);
+    when they change, the last layer is changed so that v stays as it is (PopArt; van Hasselt et al. 2016).
+
+    Args:
+        observation_space, num_actions: what is seen and done.
+        network: a trunk's description; or the trunk of a policy, to share it. A shared trunk is moved by both, and its
+            running statistics of observations by the policy's update.
+        target: learn "v", or "q" at the actions taken.
+        method: how targets are made.
+        learning_rate, max_grad_norm: of Adam; `max_grad_norm=None` clips nothing.
+        num_epochs, minibatch_size: passes over the visits in each fit, and visits in each gradient step.
+        normalize_returns: False keeps mean 0 and scale 1.
+        polyak, target_period: after every `target_period` fits the target network moves by the share `polyak` toward
+            the network. 1 and 1: the network as the last fit left it.
+        seed: the weights are drawn from the stream (seed, "critic").
+    """
+
+    def __init__(
+        self,
+        observation_space: Space[Any],
+        num_actions: int,
+        *,
+        network: NetworkDescription | Trunk = MLP(),  # noqa: B008 - frozen
+        target: Target = "v",
+        method: Method = TDLambda(0.95),  # noqa: B008 - frozen
+        learning_rate: float = 3e-4,
+        max_grad_norm: float | None = 0.5,
+        num_epochs: int = 10,
+        minibatch_size: int = 64,
+        normalize_returns: bool = True,
+        polyak: float = 1.0,
+        target_period: int = 1,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        check_count("num_epochs", num_epochs)
+        check_count("minibatch_size", minibatch_size)
+        check_count("target_period", target_period)
+        if not 0 < polyak <= 1:
+            raise PgtsError(f"polyak is {polyak}; it must be above 0 and at most 1")
+        self.target = check_target(target)
+        self.num_actions, self.method = num_actions, method
+        self.num_epochs, self.minibatch_size, self.normalize_returns = num_epochs, minibatch_size, normalize_returns
+        self.polyak, self.target_period = polyak, target_period
+        generator = stream(seed, "critic")
+        trunk = network if isinstance(network, Trunk) else network.trunk(observation_space, generator=generator)
+        outputs = 1 if target == "v" else num_actions
+        self.network = Network(trunk, outputs, gain=1.0, generator=generator).to(device)
+        self._lags = polyak < 1 or target_period > 1
+        self._target_network = copy.deepcopy(self.network) if self._lags else self.network
+        self._optimiser = Optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
+        self._policy: Policy | None = None
+        self._mean, self._scale, self._num_fits = 0.0, 1.0, 0
+
+    def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
+        """Move the network toward the targets of all visits.
+
+        Returns:
+            value: the mean squared error in squared reward units, and explained_variance: 1 less its share of the
+            variance of the targets; both before the fit. value_grad_norm: mean over the gradient steps.
+
+        Raises:
+            PgtsError: a target, a loss or a gradient is not finite.
+        """
+        self._policy = policy
+        alive_TB = rollout.alive_TB
+        observation_V, action_V = rollout.observe(rollout.state_TB[alive_TB]), rollout.action_TB[alive_TB]
+        target_V = self._targets(rollout)[alive_TB]
+        if not math.isfinite(target_V.sum()):
+            raise PgtsError("a target of the critic is not finite; it has learned nothing from this rollout")
+        error_V = target_V - self._taken(self._values(self.network, observation_V), action_V)
+
+        encoder = self.network.trunk.encoder
+        if encoder.fresh or not _share(policy, self.network):
+            encoder.absorb(observation_V)
+        if self.normalize_returns:
+            self._rescale(target_V)
+        columns = (self.network.encode(observation_V), action_V, ((target_V - self._mean) / self._scale).float())
+        norms = []
+        for _ in range(self.num_epochs):
+            for input_N, action_N, y_N in minibatches(columns, self.minibatch_size, generator=generator):
+                loss = (y_N - self._taken(self.network(input_N), action_N)).square().mean()
+                norms.append(self._optimiser.step(self.network.weights, loss, "value"))
+        self._num_fits += 1
+        self._move_target_network()
+        explained = 1 - error_V.var(correction=0) / target_V.var(correction=0).clamp(min=1e-12)
+        return {
+            "value": float(error_V.square().mean()),
+            "explained_variance": float(explained),
+            "value_grad_norm": sum(norms) / len(norms),
+        }
+
+    def v(self, observation_N: Tensor) -> Float[Tensor, "N"]:
+        """The network's value, or sum_a pi(a|o) Q(o, a) of it."""
+        return self._v(self.network, observation_N)
+
+    def q(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
+        if self.target != "q":
+            raise PgtsError("this critic learns v; it has no Q. Make it with target='q', or search with v_leaf")
+        return self._values(self.network, observation_N)
+
+    def state_dict(self) -> dict[str, Any]:
+        state = {
+            "network": self.network.plain_state(),
+            "optimiser": self._optimiser.state_dict(),
+            "mean": self._mean,
+            "scale": self._scale,
+            "num_fits": self._num_fits,
+        }
+        return state | ({"target_network": self._target_network.plain_state()} if self._lags else {})
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        wanted = {"network", "optimiser", "mean", "scale", "num_fits"} | ({"target_network"} if self._lags else set())
+        if set(state) != wanted:
+            raise PgtsError(f"the state of a network critic has {sorted(wanted)}; this one has {sorted(state)}")
+        self.network.take_over(state["network"])
+        if self._lags:
+            self._target_network.take_over(state["target_network"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._mean, self._scale, self._num_fits = state["mean"], state["scale"], state["num_fits"]
+
+    def _values(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N D"]:
+        """The network's outputs in reward units."""
+        return self._mean + self._scale * network.evaluate(observation_N)
+
+    def _v(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N"]:
+        if self.target == "v":
+            return self._values(network, observation_N).squeeze(-1)
+        if self._policy is None:
+            raise PgtsError("the critic knows no policy yet; fit it, or iterate, before asking for values")
+        return (self._policy.probs(observation_N) * self._values(network, observation_N)).sum(-1)
+
+    def _taken(self, value_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+        """v, or Q of the actions taken."""
+        return value_ND.squeeze(-1) if self.target == "v" else value_ND.gather(-1, action_N[:, None]).squeeze(-1)
+
+    def _targets(self, rollout: Rollout) -> Float[Tensor, "T B"]:
+        bootstrap_TB = torch.zeros_like(rollout.reward_TB)
+        after_V = rollout.observe(rollout.next_state_TB[rollout.alive_TB])
+        bootstrap_TB[rollout.alive_TB] = self._v(self._target_network, after_V).to(bootstrap_TB)
+        if isinstance(self.method, MonteCarlo):
+            return lambda_returns(rollout, bootstrap_TB, rollout.survival_TB, 1.0)
+        return lambda_returns(rollout, bootstrap_TB, rollout.discount_TB, self.method.lambda_)
+
+    @torch.no_grad()
+    def _rescale(self, target_V: Float[Tensor, "V"]) -> None:
+        """Let mean and scale follow the targets; what was learned before keeps its values in reward units."""
+        rate = max(1 / (self._num_fits + 1), _SLOWEST_RATE)
+        old_mean, old_scale = self._mean, self._scale
+        new_mean, new_var = float(target_V.mean()), float(target_V.var(correction=0))
+        mean = old_mean + rate * (new_mean - old_mean)
+        spread = (1 - rate) * (old_scale**2 + (old_mean - mean) ** 2) + rate * (new_var + (new_mean - mean) ** 2)
+        self._mean, self._scale = mean, max(math.sqrt(spread), _SMALLEST_SCALE)
+        if self._num_fits:
+            for network in {self.network, self._target_network}:
+                network.head.weight.mul_(old_scale / self._scale)
+                network.head.bias.mul_(old_scale / self._scale).add_((old_mean - self._mean) / self._scale)
+
+    @torch.no_grad()
+    def _move_target_network(self) -> None:
+        if not self._lags or self._num_fits % self.target_period:
+            return
+        for moved, aim in zip(self._target_network.weights, self.network.weights, strict=True):
+            moved.lerp_(aim, self.polyak)
+        for statistic, present in zip(self._target_network.buffers(), self.network.buffers(), strict=True):
+            statistic.copy_(present)
+
+
+def _share(policy: Policy, network: Network) -> bool:
+    return isinstance(policy, NetworkPolicy) and policy.network.trunk is network.trunk

@@ -1,0 +1,317 @@
+"""How network policies move: by gradient steps on an objective over all actions of the visited observations.
+
+`advantage_NA` are either the advantages of all actions, q - <pi, q>, or the estimate of `advantages.score_function`
+from the action taken, A_t / pi(a_t|s_t) there and 0 elsewhere, one row a visit. With the latter, `GradientUpdate` is
+A2C and `PPOUpdate` is PPO:
+
+    sum_a pi(a|s) adv(s, a)                                     has the gradient of   log pi(a_t|s_t) A_t
+    sum_a pi_old(a|s) min(rho_a adv, clip(rho_a) adv)           is                    min(rho A_t, clip(rho) A_t)
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pgts_torch.agent.networks import Network
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.optimisers import Optimiser, check_count, check_positive, minibatches
+from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.rollout import StateWeight
+from pgts_torch.agent.updates import Update, check_state_weight
+from pgts_torch.errors import PgtsError
+
+
+class Batch(NamedTuple):
+    """What one update moves the policy by.
+
+    input_N: encoded observations.   old_NA: log pi before the update.   advantage_NA, weight_N: float32.
+    """
+
+    input_N: Float[Tensor, "N ..."]
+    old_NA: Float[Tensor, "N A"]
+    advantage_NA: Float[Tensor, "N A"]
+    weight_N: Float[Tensor, "N"]
+
+
+@dataclass(eq=False, kw_only=True)
+class NetworkUpdate(Update):
+    """Gradient steps on the parameters of a network policy.
+
+    Running statistics of the observations see the batch after the steps, so that these start from the policy that made
+    it; only the first batch of all is seen before.
+
+    Args:
+        learning_rate: of the optimiser.
+        optimizer: "adam" or plain gradient descent, "sgd".
+        max_grad_norm: longer gradients are shortened to it; None: never.
+    """
+
+    policies = (NetworkPolicy,)
+
+    learning_rate: float = 3e-4
+    optimizer: Literal["adam", "sgd"] = "adam"
+    max_grad_norm: float | None = 0.5
+    state_weight: StateWeight = "visits"
+    _optimiser: Optimiser = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        check_state_weight(self.state_weight)
+        self._optimiser = Optimiser(
+            learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm, method=self.optimizer
+        )
+        self.check_options()
+
+    def __call__(
+        self,
+        policy: Policy,
+        observation_N: Tensor,
+        advantage_NA: Float[Tensor, "N A"],
+        weight_N: Float[Tensor, "N"],
+        *,
+        generator: torch.Generator,
+    ) -> dict[str, float]:
+        """Move the network.
+
+        Returns:
+            The losses and diagnostics of the update; and, after it, entropy: the mean entropy of pi in nats, and kl:
+            the mean KL(pi_old || pi).
+
+        Raises:
+            PgtsError: an advantage or a weight is not finite, no state counts, or a loss or its gradient is not finite.
+                The step in question moves nothing.
+        """
+        assert isinstance(policy, NetworkPolicy)
+        _check_numbers(advantage_NA, weight_N)
+        network, encoder = policy.network, policy.network.trunk.encoder
+        if fresh := encoder.fresh:
+            encoder.absorb(observation_N)
+        input_N = network.encode(observation_N)
+        with torch.no_grad():
+            old_NA = network(input_N).log_softmax(-1)
+        batch = Batch(input_N, old_NA, advantage_NA.float(), weight_N.float())
+        losses = self.move(network, batch, generator)
+        with torch.no_grad():
+            new_NA = network(input_N).log_softmax(-1)
+        share_N = batch.weight_N / batch.weight_N.sum()
+        losses["entropy"] = float(share_N @ entropy(new_NA))
+        losses["kl"] = float(share_N @ divergence(old_NA, new_NA))
+        if not fresh:
+            encoder.absorb(observation_N)
+        return losses
+
+    def state_dict(self) -> dict[str, Any]:
+        return self._optimiser.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._optimiser.load_state_dict(state)
+
+    @abstractmethod
+    def check_options(self) -> None:
+        """PgtsError if an option beside those above is out of range."""
+
+    @abstractmethod
+    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> dict[str, float]:
+        """Take the steps; losses and diagnostics by name."""
+
+    def step(self, network: Network, loss: Tensor, *, through: tuple[Tensor, Tensor] | None = None) -> float:
+        """One step down the loss (see `Optimiser.step`); the norm of its gradient."""
+        return self._optimiser.step(network.weights, loss, "policy", through=through)
+
+
+@final
+@dataclass(eq=False, kw_only=True)
+class GradientUpdate(NetworkUpdate):
+    """One step up the all-action policy gradient; with sampled advantages, A2C (Mnih et al. 2016).
+
+        maximise  sum_s w(s) [ sum_a pi(a|s) adv(s, a) + entropy_coef H(pi(.|s)) ]
+
+    With one-hot states, no hidden layer and plain gradient descent it is `SoftmaxUpdate`.
+
+    Args:
+        entropy_coef: at least 0, in reward units.
+    """
+
+    entropy_coef: float = 0.0
+
+    def check_options(self) -> None:
+        _check_entropy_coef(self.entropy_coef)
+
+    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> dict[str, float]:
+        """policy: less the objective without entropy, before the step; grad_norm: before clipping."""
+        log_NA = network(batch.input_N).log_softmax(-1)
+        policy_loss = -(batch.weight_N @ (log_NA.exp() * batch.advantage_NA).sum(-1))
+        bonus = batch.weight_N @ entropy(log_NA) if self.entropy_coef else 0.0
+        norm = self.step(network, policy_loss - self.entropy_coef * bonus)
+        return {"policy": float(policy_loss.detach()), "grad_norm": norm}
+
+
+@final
+@dataclass(eq=False, kw_only=True)
+class PPOUpdate(NetworkUpdate):
+    """Many small steps up an objective that is clipped where pi has moved far enough (Schulman et al. 2017).
+
+        maximise  mean_s w(s) [ sum_a pi_old(a|s) min(rho_a adv, clip(rho_a, 1 - clip_range, 1 + clip_range) adv)
+                                + entropy_coef H(pi(.|s)) ],        rho_a = pi(a|s) / pi_old(a|s)
+
+    over minibatches, the weights scaled to a mean of 1.
+
+    Args:
+        clip_range: above 0.
+        num_epochs, minibatch_size: passes over the batch, and observations in each step.
+        entropy_coef: at least 0, in units of the advantages (after their normalisation).
+        target_kl: no further step once the mean KL(pi_old || pi) of a minibatch, over all actions, exceeds it.
+        normalize_advantage: divide by the root of mean_s w(s) (sum_a pi_old(a|s) |adv(s, a)|)^2; for sampled advantages
+            that is their root mean square. Nothing is subtracted: sums over all actions are 0 already.
+    """
+
+    clip_range: float = 0.2
+    num_epochs: int = 10
+    minibatch_size: int = 64
+    entropy_coef: float = 0.0
+    target_kl: float | None = None
+    normalize_advantage: bool = True
+
+    def check_options(self) -> None:
+        check_positive("clip_range", self.clip_range)
+        check_count("num_epochs", self.num_epochs)
+        check_count("minibatch_size", self.minibatch_size)
+        _check_entropy_coef(self.entropy_coef)
+        if self.target_kl is not None:
+            check_positive("target_kl", self.target_kl)
+
+    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> dict[str, float]:
+        """policy: mean over the steps of less the objective without entropy; grad_norm: mean, before clipping;
+        clip_fraction: the share of actions, after the steps, whose rho is out of range; num_steps taken."""
+        batch = batch._replace(weight_N=batch.weight_N / batch.weight_N.mean())
+        if self.normalize_advantage:
+            batch = batch._replace(advantage_NA=batch.advantage_NA / _scale(batch))
+        policy_losses, norms = [], []
+        passes = _passes(network, batch, self.num_epochs, self.minibatch_size, generator)
+        for log_NA, (_, old_NA, advantage_NA, weight_N) in passes:
+            if self.target_kl is not None and _mean(weight_N, divergence(old_NA, log_NA)) > self.target_kl:
+                break
+            with torch.no_grad():
+                gain_NA, push_NA = self.objective(log_NA, old_NA, advantage_NA)
+                policy_loss = -_mean(weight_N, (old_NA.exp() * gain_NA).sum(-1))
+                down_NA = -push_NA * (weight_N / len(weight_N))[:, None]
+            norms.append(self.step(network, policy_loss, through=(log_NA, down_NA)))
+            policy_losses.append(float(policy_loss))
+        return {
+            "policy": sum(policy_losses) / len(policy_losses),
+            "grad_norm": sum(norms) / len(norms),
+            "clip_fraction": self._clip_fraction(network, batch),
+            "num_steps": len(norms),
+        }
+
+    def objective(
+        self, log_NA: Float[Tensor, "N A"], old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"]
+    ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
+        """min(rho adv, clip(rho) adv), and the gradient of the whole objective of a state in log pi(a|s):
+
+            pi(a|s) ( adv(s, a) 1(not clipped) - entropy_coef (log pi(a|s) + 1) )
+
+        Autograd through these dozen operations would cost as much as the network itself.
+        """
+        ratio_NA = (log_NA - old_NA).exp()
+        clipped_NA = ratio_NA.clamp(1 - self.clip_range, 1 + self.clip_range)
+        free_NA = ratio_NA * advantage_NA
+        gain_NA = torch.minimum(free_NA, clipped_NA * advantage_NA)
+        slope_NA = torch.where(gain_NA == free_NA, advantage_NA, 0.0)
+        if self.entropy_coef:
+            slope_NA = slope_NA - self.entropy_coef * (log_NA + 1)
+        return gain_NA, log_NA.exp() * slope_NA
+
+    @torch.no_grad()
+    def _clip_fraction(self, network: Network, batch: Batch) -> float:
+        ratio_NA = (network(batch.input_N).log_softmax(-1) - batch.old_NA).exp()
+        outside_NA = (ratio_NA - 1).abs() > self.clip_range
+        return float(_mean(batch.weight_N, (batch.old_NA.exp() * outside_NA).sum(-1)))
+
+
+@final
+@dataclass(eq=False, kw_only=True)
+class NetworkMirrorUpdate(NetworkUpdate):
+    """The mirror step, projected onto the network by KL (Tomar et al. 2022; Protopapas and Barakat 2024).
+
+        minimise  mean_s w(s) KL(target(.|s) || pi(.|s)),    target(a|s) = pi_old(a|s) exp(adv(s, a) / temperature) / Z
+
+    over minibatches, the weights scaled to a mean of 1. A network that can be any policy ends where `MirrorUpdate`
+    with step_size * w(s) = 1 / temperature does. The advantages must be of all actions: in the exponent, an estimate
+    from one action is not unbiased.
+
+    Args:
+        temperature: in reward units; small ones make long steps.
+        num_epochs, minibatch_size: passes over the batch, and observations in each step.
+    """
+
+    temperature: float = 1.0
+    num_epochs: int = 10
+    minibatch_size: int = 64
+
+    def check_options(self) -> None:
+        check_positive("temperature", self.temperature)
+        check_count("num_epochs", self.num_epochs)
+        check_count("minibatch_size", self.minibatch_size)
+
+    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> dict[str, float]:
+        """policy: mean_s w(s) KL(target || pi) after the steps; grad_norm: mean over the steps, before clipping."""
+        target_NA = (batch.old_NA + batch.advantage_NA / self.temperature).log_softmax(-1)
+        weight_N = batch.weight_N / batch.weight_N.mean()
+        columns, norms = (batch.input_N, target_NA, weight_N), []
+        passes = _passes(network, columns, self.num_epochs, self.minibatch_size, generator)
+        for log_NA, (_, part_NA, part_N) in passes:
+            norms.append(self.step(network, _mean(part_N, divergence(part_NA, log_NA))))
+        with torch.no_grad():
+            after = _mean(weight_N, divergence(target_NA, network(batch.input_N).log_softmax(-1)))
+        return {"policy": float(after), "grad_norm": sum(norms) / len(norms)}
+
+
+def entropy(log_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
+    """H(pi(.|s)) in nats, from log pi."""
+    return -(log_NA.exp() * log_NA).sum(-1)
+
+
+def divergence(log_p_NA: Float[Tensor, "N A"], log_q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
+    """KL(p(.|s) || q(.|s)) in nats, from log p and log q."""
+    return (log_p_NA.exp() * (log_p_NA - log_q_NA)).sum(-1)
+
+
+def _passes(
+    network: Network, columns: Sequence[Tensor], num_epochs: int, minibatch_size: int, generator: torch.Generator
+) -> Iterator[tuple[Float[Tensor, "N A"], tuple[Tensor, ...]]]:
+    """log pi of the network as it is by then, and the columns, of which the first are its inputs, in minibatches."""
+    for _ in range(num_epochs):
+        for part in minibatches(columns, minibatch_size, generator=generator):
+            yield network(part[0]).log_softmax(-1), part
+
+
+def _mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"]) -> Float[Tensor, ""]:
+    """mean_n w_n value_n."""
+    return weight_N @ value_N / len(value_N)
+
+
+def _scale(batch: Batch) -> Float[Tensor, ""]:
+    size_N = (batch.old_NA.exp() * batch.advantage_NA.abs()).sum(-1)
+    return _mean(batch.weight_N, size_N.square()).sqrt() + 1e-8
+
+
+def _check_numbers(advantage_NA: Tensor, weight_N: Tensor) -> None:
+    for name, value in (("advantage_NA", advantage_NA), ("weight_N", weight_N)):
+        if not math.isfinite(value.sum()):
+            off = torch.nonzero(~torch.isfinite(value))
+            if len(off):
+                place = tuple(off[0].tolist())
+                raise PgtsError(f"{name}[{', '.join(map(str, place))}] is {float(value[place])}; it must be finite")
+    if not float(weight_N.sum()) > 0 or bool((weight_N < 0).any()):
+        raise PgtsError(f"weight_N is {weight_N.tolist()[:8]}; weights are at least 0, and some state must count")
+
+
+def _check_entropy_coef(entropy_coef: float) -> None:
+    if not 0 <= entropy_coef < math.inf:
+        raise PgtsError(f"entropy_coef is {entropy_coef}; it must be finite and at least 0")

@@ -1,0 +1,135 @@
+"""Gradient steps on networks that refuse to move by what is not finite."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal, final
+
+import torch
+from torch import Tensor, nn
+
+from pgts_torch.agent.policies import fitting
+from pgts_torch.errors import PgtsError
+
+_BETAS = 0.9, 0.999
+_EPSILON = 1e-8
+
+
+@final
+class Optimiser:
+    """Steps down a gradient, after clipping its norm:
+
+        adam:   theta <- theta - learning_rate m / (sqrt(v) + 1e-8),   bias-corrected moments (Kingma and Ba 2015)
+        sgd:    theta <- theta - learning_rate g
+
+    All gradients are handled as one vector: for a small network the calls cost more than the numbers.
+
+    Args:
+        learning_rate: above 0.
+        max_grad_norm: gradients longer than this are shortened to it; None: never.
+        method: "adam" or "sgd".
+    """
+
+    def __init__(
+        self, *, learning_rate: float, max_grad_norm: float | None, method: Literal["adam", "sgd"] = "adam"
+    ) -> None:
+        check_positive("learning_rate", learning_rate)
+        if max_grad_norm is not None:
+            check_positive("max_grad_norm", max_grad_norm)
+        if method not in ("adam", "sgd"):
+            raise PgtsError(f"optimizer is {method!r}; it must be adam or sgd")
+        self.learning_rate, self.max_grad_norm, self.method = learning_rate, max_grad_norm, method
+        self._num_steps = 0
+        self._first_D: Tensor | None = None
+        self._second_D: Tensor | None = None
+
+    def step(
+        self,
+        parameters: Sequence[nn.Parameter],
+        loss: Tensor,
+        name: str,
+        *,
+        through: tuple[Tensor, Tensor] | None = None,
+    ) -> float:
+        """Move the parameters, the same ones in each call; returns the norm of the gradient before clipping.
+
+        Args:
+            loss: what is minimised.
+            name: what an error calls it.
+            through: an output of the network and the loss's gradient in it, where a formula gives it for less than
+                autograd does. The loss then needs no gradient of its own.
+
+        Raises:
+            PgtsError: the loss or its gradient is not finite, or the moments are those of other parameters. Nothing
+                has moved then.
+        """
+        output, gradient = (loss, None) if through is None else through
+        gradients = torch.autograd.grad(output, parameters, gradient)
+        with torch.no_grad():
+            gradient_D = torch.cat([piece.reshape(-1) for piece in gradients])
+            norm = float(torch.linalg.vector_norm(gradient_D))
+            for what, value in (("", float(loss.detach())), ("the gradient of ", norm)):
+                if not math.isfinite(value):
+                    raise PgtsError(f"{what}the {name} loss is {value}; nothing has been moved by it")
+            if self.max_grad_norm is not None and norm > self.max_grad_norm:
+                gradient_D *= self.max_grad_norm / norm
+            step_D = self._adam(gradient_D) if self.method == "adam" else gradient_D.mul_(-self.learning_rate)
+            pieces = step_D.split([parameter.numel() for parameter in parameters])
+            for parameter, piece in zip(parameters, pieces, strict=True):
+                parameter.add_(piece.view_as(parameter))
+        return norm
+
+    def _adam(self, gradient_D: Tensor) -> Tensor:
+        if self._first_D is None or self._second_D is None:
+            self._first_D, self._second_D = torch.zeros_like(gradient_D), torch.zeros_like(gradient_D)
+        if len(self._first_D) != len(gradient_D):
+            raise PgtsError(
+                f"the optimiser remembers {len(self._first_D)} parameters; the network has {len(gradient_D)}"
+            )
+        first_D, second_D = self._first_D, self._second_D = self._first_D.to(gradient_D), self._second_D.to(gradient_D)
+        self._num_steps += 1
+        first_D.lerp_(gradient_D, 1 - _BETAS[0])
+        second_D.mul_(_BETAS[1]).addcmul_(gradient_D, gradient_D, value=1 - _BETAS[1])
+        # m / c1 / (sqrt(v / c2) + eps), with the corrections taken out of the vectors.
+        mean_correction, square_correction = (1 - beta**self._num_steps for beta in _BETAS)
+        root = math.sqrt(square_correction)
+        scale_D = second_D.sqrt().add_(_EPSILON * root)
+        return torch.div(first_D, scale_D).mul_(-self.learning_rate * root / mean_correction)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The moments and how many steps they stand for."""
+        if self._first_D is None or self._second_D is None:
+            return {}
+        return {
+            "num_steps": self._num_steps,
+            "first_D": self._first_D.cpu().clone(),
+            "second_D": self._second_D.cpu().clone(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave; PgtsError if it is something else."""
+        if not state:
+            self._num_steps, self._first_D, self._second_D = 0, None, None
+            return
+        num_steps, first_D = state.get("num_steps"), state.get("first_D")
+        if not isinstance(num_steps, int) or num_steps < 1 or not isinstance(first_D, Tensor) or self.method == "sgd":
+            raise PgtsError(f"{self.method} cannot take over {sorted(state)} with num_steps = {num_steps}")
+        second_D = fitting(state, "second_D", first_D)
+        self._num_steps, self._first_D, self._second_D = num_steps, first_D.clone(), second_D
+
+
+def minibatches(columns: Sequence[Tensor], size: int, *, generator: torch.Generator) -> Iterator[tuple[Tensor, ...]]:
+    """Rows of all columns in one common random order, `size` at a time, the last ones fewer; each row once."""
+    order_N = torch.randperm(len(columns[0]), generator=generator, device=generator.device)
+    return zip(*(column[order_N.to(column.device)].split(size) for column in columns), strict=True)
+
+
+def check_positive(name: str, value: float) -> None:
+    """PgtsError unless it is finite and above 0."""
+    if not 0 < value < math.inf:
+        raise PgtsError(f"{name} is {value}; it must be finite and above 0")
+
+
+def check_count(name: str, value: int) -> None:
+    """PgtsError unless it is a whole number of at least 1."""
+    if not isinstance(value, int) or value < 1:
+        raise PgtsError(f"{name} is {value!r}; it must be a whole number of at least 1")

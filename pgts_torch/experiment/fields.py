@@ -1,0 +1,107 @@
+"""What the keys of a configuration are made of: values with their ranges, and sections.
+
+The docstring under a field is its meaning in `pgts train --help`; the annotation is its range there and in messages.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
+
+INT64_MAX = 2**63 - 1
+NEVER = "never"
+
+Count = Annotated[int, Field(ge=1, le=INT64_MAX)]
+Natural = Annotated[int, Field(ge=0, le=INT64_MAX)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+UnitInterval = Annotated[float, Field(ge=0, le=1)]
+Share = Annotated[float, Field(gt=0, le=1)]
+Sizes = Annotated[list[Annotated[int, Field(ge=1, le=2**16)]], Field(max_length=16)]
+Clip = Positive | Literal["never"]
+
+
+def _text(pattern: str, requirement: str, max_length: int) -> Any:
+    """A string field; `requirement` says in words what the pattern asks for."""
+    return Field(pattern=pattern, max_length=max_length, json_schema_extra={"requirement": requirement})
+
+
+Name = Annotated[str, _text(r"^[A-Za-z0-9][A-Za-z0-9._-]*$", "letters, digits, '.', '_', '-', at most 100", 100)]
+EnvId = Annotated[str, _text(r"^[A-Za-z0-9_.:/-]+$", "the id of a Gymnasium environment", 200)]
+Key = Annotated[str, _text(r"^[A-Za-z0-9_.:-]+$", "a key of dictionary observations", 100)]
+Folder = Annotated[str, _text(r"^[^\x00-\x1f\x7f]+$", "a folder", 4000)]
+Device = Annotated[str, _text(r"^(cpu|cuda(:[0-9]{1,3})?)$", "cpu, cuda or cuda:N", 8)]
+
+RESERVED_KWARGS = {
+    "id": "env.id sets it",
+    "gamma": "env.gamma sets it",
+    "num_envs": "rollout.num_envs sets it",
+    "max_episode_steps": "rollout.horizon ends episodes",
+    "vectorization_mode": "the rollout sets it",
+    "autoreset_mode": "the rollout sets it",
+    "vector_kwargs": "the rollout sets it",
+}
+"""Arguments of gymnasium.make_vec that are not the environment's own, and why each is refused."""
+
+
+def _check_kwargs(kwargs: dict[str, Any]) -> dict[str, Any]:
+    for name in kwargs:
+        if not name.isidentifier():
+            raise conflict(
+                "env.kwargs has the key {key}, which cannot be the name of an argument",
+                f"env.kwargs.{name}",
+                key=repr(name),
+            )
+        if name in RESERVED_KWARGS:
+            raise conflict(
+                "env.kwargs must not have the key {key}: {why}",
+                f"env.kwargs.{name}",
+                key=name,
+                why=RESERVED_KWARGS[name],
+            )
+    for value in _plain_values(kwargs):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise conflict("env.kwargs holds {value}; numbers must be finite", value=str(value))
+        if not (value is None or isinstance(value, bool | int | float | str)):
+            raise conflict("env.kwargs holds {value}; values must be plain", value=repr(value))
+    return kwargs
+
+
+def _plain_values(value: Any) -> Iterator[Any]:
+    if isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _plain_values(item)
+    else:
+        yield value
+
+
+def conflict(reason: str, *keys: str, **values: str) -> PydanticCustomError:
+    """An error that is a whole sentence; `keys` are the dotted keys of which any could be changed."""
+    return PydanticCustomError("conflict", "{reason}", {"reason": reason.format(**values), "keys": keys})
+
+
+Kwargs = Annotated[dict[str, Any], AfterValidator(_check_kwargs)]
+
+
+class Section(BaseModel):
+    """Keys that belong together."""
+
+    model_config = ConfigDict(
+        strict=True,
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        validate_default=True,
+        use_attribute_docstrings=True,
+    )
+
+    def plain(self) -> dict[str, Any]:
+        """The section as `agent.build` reads it: without the keys that leave the choice to it."""
+        return _given(self.model_dump(by_alias=True))
+
+
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    kept = {name: _given(value) if isinstance(value, dict) else value for name, value in values.items()}
+    return {name: None if value == NEVER else value for name, value in kept.items() if value is not None}

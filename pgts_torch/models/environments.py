@@ -1,0 +1,131 @@
+"""Environments as models need them: made anew, their actions in a list, what they say held to what they declare."""
+
+import importlib
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.models.snapshots import env_name
+from pgts_torch.seeding import numpy_stream
+
+EnvSource = str | EnvSpec | gymnasium.Env | Callable[[], gymnasium.Env]
+"""What an environment can be made from: an id, a spec, another instance (by its spec) or a function."""
+
+
+def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
+    """A new environment, with these arguments if `env` is an id or a spec. An instance is not used itself: another one
+    is made from its spec.
+
+    Raises:
+        PgtsError: there is no such id, an extra is missing, or an instance has no spec.
+    """
+    if isinstance(env, gymnasium.Env):
+        if env.spec is None:
+            raise PgtsError(
+                f"{env_name(env)} has no spec to make another instance from: give a function that makes one"
+            )
+        env = env.spec
+    if not isinstance(env, str | EnvSpec):
+        return env()
+    name = env if isinstance(env, str) else env.id
+    for start, (module, extra) in _MODULES.items():
+        if name.startswith(start):
+            try:
+                importlib.import_module(module)
+            except ModuleNotFoundError as error:
+                raise PgtsError(f"{name} needs {module}: pip install 'pgts_torch[{extra}]'") from error
+    try:
+        return gymnasium.make(env, **kwargs)
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise PgtsError(f"{name} needs something that is not installed: {error}") from error
+    except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
+        raise PgtsError(f"{name} cannot be made: {error}") from error
+
+
+_MODULES = {"MiniGrid-": ("minigrid", "envs"), "BabyAI-": ("minigrid", "envs"), "ALE/": ("ale_py", "atari")}
+"""Environments that are registered by a module, by the start of their ids, and the extra that installs it."""
+
+
+def all_actions(space: spaces.Space) -> Iterator[Any]:
+    """Every action of a Discrete or MultiDiscrete space.
+
+    Raises:
+        PgtsError: the space is another one.
+    """
+    if isinstance(space, spaces.Discrete):
+        return (int(space.start) + a for a in range(int(space.n)))
+    if isinstance(space, spaces.MultiDiscrete):
+        shape, start = space.nvec.shape, space.start
+        each = itertools.product(*[range(n) for n in space.nvec.reshape(-1)])
+        return (np.array(action, dtype=space.dtype).reshape(shape) + start for action in each)
+    raise PgtsError(f"the actions of {space} cannot be listed: give some, as grid_actions or sampled_actions do")
+
+
+def grid_actions(space: spaces.Space, per_dimension: int) -> list[np.ndarray]:
+    """A grid over a bounded Box, `per_dimension` values from lowest to highest in each dimension.
+
+    Raises:
+        PgtsError: the space is no bounded Box, there are fewer than 2 values, or more than 10,000 actions.
+    """
+    low, high = _bounds(space)
+    if per_dimension < 2 or per_dimension**low.size > 10_000:
+        raise PgtsError(
+            f"per_dimension is {per_dimension}; it must be at least 2 and give at most 10,000 actions in "
+            f"{low.size} dimensions: see sampled_actions"
+        )
+    values = np.linspace(low.reshape(-1), high.reshape(-1), per_dimension, dtype=low.dtype)
+    return [np.array(action, low.dtype).reshape(low.shape) for action in itertools.product(*values.T)]
+
+
+def sampled_actions(space: spaces.Space, count: int, *, seed: int) -> list[np.ndarray]:
+    """`count` actions drawn uniformly from a bounded Box.
+
+    Raises:
+        PgtsError: the space is no bounded Box, or count is below 1.
+    """
+    low, high = _bounds(space)
+    if count < 1:
+        raise PgtsError(f"count is {count}; it must be at least 1")
+    drawn = numpy_stream(seed, "actions").uniform(low, high, (count, *low.shape))
+    return list(drawn.astype(low.dtype))
+
+
+def _bounds(space: spaces.Space) -> tuple[np.ndarray, np.ndarray]:
+    if not (isinstance(space, spaces.Box) and space.is_bounded()):
+        raise PgtsError(f"{space} is no bounded Box")
+    return space.low, space.high
+
+
+def wrong_answer(space: spaces.Space, observation: Any, reward: float) -> str:
+    """What is wrong with what a step gave; empty if nothing is."""
+    if not math.isfinite(reward):
+        return f"the reward is {reward}"
+    return _wrong_observation(space, observation)
+
+
+def _wrong_observation(space: spaces.Space, value: Any) -> str:
+    if isinstance(space, spaces.Box):
+        shape = np.shape(value)
+        if shape != space.shape:
+            return f"the observation has shape {shape}; {space.shape} is declared"
+        if space.dtype.kind == "f" and not np.isfinite(value).all():
+            return f"the observation is {np.asarray(value).tolist()}; it must be finite"
+    elif isinstance(space, spaces.Dict):
+        if not isinstance(value, dict) or value.keys() != space.keys():
+            return f"the observation is no dict of {', '.join(map(str, space.keys()))}"
+        return next((wrong for name in space if (wrong := _wrong_observation(space[name], value[name]))), "")
+    elif isinstance(space, spaces.Tuple):
+        if not isinstance(value, tuple) or len(value) != len(space):
+            return f"the observation is no tuple of {len(space)} parts"
+        parts = zip(space, value, strict=True)
+        return next((wrong for part, content in parts if (wrong := _wrong_observation(part, content))), "")
+    elif isinstance(space, spaces.Discrete) and not space.contains(value):
+        return f"the observation is {value!r}, which is not in {space}"
+    return ""

@@ -1,0 +1,271 @@
+"""Whether a simulator can serve as a model: what a search relies on, tried out, and what a call costs."""
+
+import functools
+import random
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.models.environments import EnvSource, all_actions, make_env, sampled_actions
+from pgts_torch.models.snapshots import adapter_for, env_name, generator_state
+from pgts_torch.models.walks import Setup, Walk, again, live, replays, walks_of
+from pgts_torch.seeding import draw_keys, numpy_stream, stream
+
+_CONTINUOUS_ACTIONS = 8
+"""How many actions of a continuous space are tried."""
+
+_ACTIONS_TRIED, _TIMED_CALLS = 8, 200
+_LEVELS, _WIDTH = 3, 8
+"""The search that is run beside a real environment: so many levels, and states of a level."""
+
+_GENERATORS = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random, torch.Generator)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that a search relies on.
+
+    needed: without it the values of a search are wrong; else it only costs more.
+    detail: what was found; where the check failed, what is missing.
+    """
+
+    name: str
+    needed: bool
+    passed: bool
+    detail: str
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Median microseconds of each part of a call, and the bytes of a snapshot's key."""
+
+    restore: float
+    step: float
+    snapshot: float
+    bytes: int
+
+    @property
+    def call(self) -> float:
+        return self.restore + self.step + self.snapshot
+
+
+@dataclass(frozen=True)
+class Report:
+    """The answer of `check_model`.
+
+    random_share: how many of the (state, action) tried are decided by chance, in [0, 1].
+    """
+
+    env: str
+    family: str
+    num_actions: int
+    random_share: float
+    checks: tuple[Check, ...]
+    cost: Cost
+
+    @property
+    def usable(self) -> bool:
+        return all(check.passed or not check.needed for check in self.checks)
+
+    @property
+    def verdict(self) -> str:
+        """One line: by which searches it can be used, or what is missing."""
+        missing = "; ".join(check.detail for check in self.checks if not check.passed)
+        if not self.usable:
+            return f"{self.env} cannot serve as a model: {missing}"
+        random = "random, so search it by `sampled`" if self.random_share else "its outcomes can be listed"
+        return f"{self.env} can serve as a model: {random}{'; but ' * bool(missing)}{missing}"
+
+
+@dataclass
+class _Tried:
+    """What the check of answers learns beside them."""
+
+    random_share: float = 0.0
+
+
+class _Missing(Exception):
+    """A check failed; the message is its detail."""
+
+
+def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, length: int = 20) -> Report:
+    """Try out whether an environment can serve as a `SimulatorModel`.
+
+        answers     rewards and observations are finite and fit the spaces that the environment declares
+        restore     from a snapshot, the same actions and draws give the same observations, rewards and ends, bit for
+                    bit, in another instance that has been elsewhere since
+        merge       equal states have equal snapshots, so that a search can merge them
+        chance      what follows is a function of state, action and key, and no generator is in a snapshot: a search
+                    cannot foresee what the environment is about to draw
+        untouched   a search from the state of a real environment leaves it and its generator as they were: it goes on
+                    like a twin that nobody searched from
+
+    Args:
+        env: an id, a spec, an environment with a spec, or a function that makes one; only fresh instances are used.
+        seed: of the walks.
+        continuations: how many are compared.
+        length: their most steps.
+
+    Returns:
+        What was found. A check that fails says what is missing; an error of the environment fails its check.
+
+    Raises:
+        MissingModel: no adapter knows the environment; the message says what to implement.
+        PgtsError: it cannot be made, or cannot be walked in.
+    """
+    if min(continuations, length) < 1:
+        raise PgtsError(f"continuations is {continuations} and length is {length}; both must be at least 1")
+    first = make_env(env)
+    space, continuous = first.action_space, isinstance(first.action_space, spaces.Box)
+    actions = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if continuous else list(all_actions(space))
+    random = numpy_stream(seed, "check_model")
+    setup = Setup(env_name(first), lambda: make_env(env), adapter_for(first), actions, random)
+    try:
+        walks = walks_of(setup, continuations, length)
+    except Exception as error:
+        raise PgtsError(f"{setup.name} fails in random walks with seed {seed}: {_told(error)}") from error
+    tried = _Tried()
+    repeated = functools.cache(lambda: replays(setup, walks))
+    checks = (
+        _check("answers", lambda: _answers(setup, walks, tried)),
+        _check("restore", lambda: _restore(walks, repeated())),
+        _check("merge", lambda: _merge(walks, repeated()), needed=False),
+        _check("chance", lambda: _chance(setup, walks)),
+        _check("untouched", lambda: _untouched(setup, length)),
+    )
+    return Report(setup.name, setup.adapter.name, len(actions), tried.random_share, checks, _cost(setup, walks))
+
+
+def _check(name: str, check: Callable[[], str], *, needed: bool = True) -> Check:
+    """The answer of one check; whatever the environment raises is an answer too."""
+    try:
+        return Check(name, needed, True, check())
+    except Exception as error:
+        return Check(name, needed, False, str(error) if isinstance(error, _Missing) else _told(error))
+
+
+def _told(error: Exception) -> str:
+    return str(error) if isinstance(error, PgtsError) else f"{type(error).__name__}: {error}"
+
+
+def _answers(setup: Setup, walks: Sequence[Walk], tried: _Tried) -> str:
+    """Ask a model for some actions in each state."""
+    model = setup.model()
+    state_N = torch.tensor([model.number(walk.start) for walk in walks]).repeat_interleave(_ACTIONS_TRIED)
+    action_N = torch.from_numpy(setup.random.integers(len(setup.actions), size=len(state_N)))
+    random_N = model.is_random(state_N, action_N)
+    tried.random_share = float(random_N.double().mean())
+    return f"{len(random_N)} (state, action) asked, {tried.random_share:.0%} of them decided by chance"
+
+
+def _restore(walks: Sequence[Walk], repeated: Sequence[Walk]) -> str:
+    for walk, other in zip(walks, repeated, strict=True):
+        if walk.seen != other.seen:
+            pairs = zip(walk.seen, other.seen, strict=False)
+            step = next((k for k, (seen, now) in enumerate(pairs) if seen != now), min(len(walk.seen), len(other.seen)))
+            raise _Missing(
+                f"a restored state goes on differently at step {step + 1}: get_state misses something that step reads "
+                "or changes, or step draws from elsewhere than self.np_random"
+            )
+    steps = sum(len(walk.seen) for walk in walks)
+    return f"{len(walks)} continuations of {steps} steps in all are the same, bit for bit"
+
+
+def _merge(walks: Sequence[Walk], repeated: Sequence[Walk]) -> str:
+    """The snapshots of those walks that went on the same."""
+    pairs = [(walk, other) for walk, other in zip(walks, repeated, strict=True) if walk.seen == other.seen]
+    off = sum((walk.start.key, *walk.states) != (other.start.key, *other.states) for walk, other in pairs)
+    if off:
+        raise _Missing(
+            f"equal states gave different bytes in {off} of {len(pairs)} continuations, so a search merges fewer of "
+            "them: let get_state return bytes that are made in one way"
+        )
+    return "equal states gave equal bytes"
+
+
+def _chance(setup: Setup, walks: Sequence[Walk]) -> str:
+    """A look for generators that a search does not own, and what another key changes."""
+    env = setup.fresh()
+    for name, value in vars(env).items():
+        if isinstance(value, _GENERATORS) and value is not env.np_random:
+            raise _Missing(f"attribute {name} is a generator of its own: draw from self.np_random only")
+    differ = 0
+    for walk in walks:
+        setup.adapter.set_state(env, walk.start.data)
+        restored = _stable_key(setup, env)
+        setup.adapter.seed(env, setup.number())
+        if _stable_key(setup, env) != restored:
+            raise _Missing(
+                "get_state returns the generator too, and a search would foresee what will be drawn: leave it out"
+            )
+        before = _global_generators()
+        differ += again(setup, env, replace(walk, key=setup.number())).seen != walk.seen
+        if moved := [name for name, state in _global_generators().items() if state != before[name]]:
+            raise _Missing(f"step draws from the global generator of {moved[0]}: draw from self.np_random only")
+    return f"of the key alone; {differ} of {len(walks)} continuations differ under another key"
+
+
+def _stable_key(setup: Setup, env: Any) -> bytes | None:
+    """The key of a snapshot; None if another one, taken at once, has another."""
+    key = setup.adapter.get_state(env).key
+    return key if setup.adapter.get_state(env).key == key else None
+
+
+def _global_generators() -> dict[str, str]:
+    """The states of the generators that all programs share."""
+    numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
+    states = {
+        "random": random.getstate(),
+        "numpy": (numpy_state["state"]["key"].tobytes(), numpy_state["state"]["pos"]),
+        "torch": torch.get_rng_state().tolist(),
+    }
+    return {name: repr(state) for name, state in states.items()}
+
+
+def _untouched(setup: Setup, length: int) -> str:
+    """Two real environments live the same life; one is searched from."""
+    real, twin = setup.make(), setup.make()
+    seed, actions = setup.number(), [setup.action() for _ in range(2 * length)]
+    for env in (real, twin):
+        env.reset(seed=seed)
+    lives = live(real, actions[:length]), live(twin, actions[:length])
+    before = _stable_key(setup, real.unwrapped), repr(generator_state(real.unwrapped))
+    model = setup.model()
+    frontier_N = model.roots([real])
+    for level in range(_LEVELS):
+        state_N = frontier_N[:_WIDTH].repeat_interleave(len(setup.actions))
+        action_N = torch.arange(len(setup.actions)).repeat(len(frontier_N[:_WIDTH]))
+        key_N = draw_keys(len(state_N), generator=stream(seed, "untouched", level))
+        drawn = model.sample(state_N, action_N, key_N=key_N)
+        frontier_N = drawn.next_state_N[drawn.discount_N > 0].unique()
+    after = _stable_key(setup, real.unwrapped), repr(generator_state(real.unwrapped))
+    if before != after:
+        raise _Missing("a search changes the real environment: instances share something, or get_state changes its own")
+    lives = lives[0] + live(real, actions[length:]), lives[1] + live(twin, actions[length:])
+    if lives[0] != lives[1]:
+        raise _Missing("a real environment goes on differently after a search: it shares something with the model's")
+    return f"a search of {model.simulator_steps} steps left a real environment as it was, bit for bit"
+
+
+def _cost(setup: Setup, walks: Sequence[Walk]) -> Cost:
+    """Each part of a call on its own, on one thread."""
+    env = setup.fresh()
+    times = []
+    for n in range(_TIMED_CALLS):
+        walk, action = walks[n % len(walks)], setup.action()
+        begin = time.perf_counter()
+        setup.adapter.set_state(env, walk.start.data)
+        setup.adapter.seed(env, n)
+        restored = time.perf_counter()
+        env.step(action)
+        stepped = time.perf_counter()
+        setup.adapter.get_state(env)
+        times.append((restored - begin, stepped - restored, time.perf_counter() - stepped))
+    restore, step, snapshot = (1e6 * np.median(times, axis=0)).tolist()
+    return Cost(restore, step, snapshot, int(np.median([len(walk.start.key) for walk in walks])))

@@ -1,0 +1,216 @@
+"""Numbers for states that are vectors: equal rows get the same number, whatever their hash says."""
+
+from collections.abc import Callable
+from typing import Literal, final
+
+import torch
+from jaxtyping import Int, Num
+from torch import Tensor
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.seeding import mix
+
+Merge = Literal["auto"] | bool
+"""Whether equal rows get one number: True, False, or as long as it pays."""
+
+Hash = Callable[[Tensor], Tensor]
+"""Rows of bits, int64 [N, D], to int64 [N]. A bad one costs time and no more."""
+
+_EMPTY = torch.iinfo(torch.int64).max
+_LEAST_SLOTS = 1024
+_BITS = {
+    torch.float16: torch.int16,
+    torch.bfloat16: torch.int16,
+    torch.float32: torch.int32,
+    torch.float64: torch.int64,
+}
+
+_JUDGED_AFTER = 4096
+"""How many rows are asked about before it is judged whether they recur."""
+
+_PAYS, _PAYS_AGAIN = 1.01, 1.05
+"""How often rows recur on average where looking them up goes on, and where it is taken up again."""
+
+_SAMPLE_BITS = 4
+"""While rows are not looked up, those whose hash begins with so many zeros are."""
+
+
+def hash_rows(bits_ND: Int[Tensor, "N D"]) -> Int[Tensor, "N"]:
+    """64 bits of each row: its product with a fixed vector of odd numbers, mixed (`seeding.mix`).
+
+    Multilinear hashing (Lemire and Kaser 2014) with SplitMix64 as finaliser: one round however long the row.
+    """
+    odd_D = mix(torch.arange(bits_ND.shape[1], device=bits_ND.device), 0) | 1
+    return mix((bits_ND * odd_D).sum(-1), 0)
+
+
+@final
+class Numbering:
+    """Numbers 0, 1, 2, ... for the distinct rows of all tensors seen so far, in the order of their first appearance.
+
+    An open-addressing hash table with linear probing (Knuth, TAOCP 6.4), at most half full, that takes a whole tensor
+    at once: in each round every row that is still looking visits one slot, and of those that find it empty the first
+    one takes it. Two rows count as equal only when all their numbers are, so a collision costs a round and never an
+    error. A call costs O(N) for N rows however many are known, growth spread over the calls that cause it.
+
+    Where rows do not recur, looking for them buys nothing. With `merge` "auto" rows are given numbers of their own,
+    unseen, once a few thousand of them have recurred less than 1.01 times on average. One row in 16 is looked up all
+    the same, chosen by its hash, so that rows equal to it are chosen too: when these recur all rows are looked up
+    again, after one call that lists what was missed. A row that got several numbers is then known by the first one.
+
+    Args:
+        num_columns: D.
+        dtype: of the rows: floating, where -0.0 equals 0.0, or an integer type.
+        device: where rows and table lie.
+        merge: whether equal rows get one number. False: never; every row asked about is a new one.
+        hash: which slot a row visits first.
+    """
+
+    def __init__(
+        self,
+        num_columns: int,
+        *,
+        dtype: torch.dtype,
+        device: torch.device | str = "cpu",
+        merge: Merge = "auto",
+        hash: Hash = hash_rows,
+    ) -> None:
+        if merge not in ("auto", True, False):
+            raise PgtsError(f"merge is {merge!r}; it must be 'auto', True or False")
+        self._merge, self._hash = merge, hash
+        self._rows = torch.empty(0, num_columns, dtype=dtype, device=device)
+        self.clear()
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def device(self) -> torch.device:
+        return self._rows.device
+
+    @property
+    def capacity(self) -> int:
+        """How many rows there is room for before memory grows."""
+        return len(self._rows)
+
+    @property
+    def merging(self) -> bool:
+        """Whether all rows are looked up at present."""
+        return self._merging
+
+    def clear(self) -> None:
+        """Forget all rows and give their memory back."""
+        self._count = self._listed = self._asked = self._new = 0
+        self._merging = self._merge is not False
+        self._rows = self._rows.new_empty(0, self._rows.shape[1])
+        self._slots = self._empty_slots(_LEAST_SLOTS)
+
+    def rows(self, number_N: Int[Tensor, "N"]) -> Num[Tensor, "N D"]:
+        """The rows with these numbers."""
+        return self._rows[number_N]
+
+    # What is kept must be ordinary tensors even if the caller is in inference mode.
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def number(self, row_ND: Num[Tensor, "N D"]) -> Int[Tensor, "N"]:
+        """The number of each row; rows not seen before get the next ones.
+
+        Raises:
+            PgtsError: the rows have another width or dtype than told, or one is not a number (naming it).
+        """
+        row_ND = self._checked(row_ND)
+        first, last = self._count, self._count + len(row_ND)
+        self._make_room(last)
+        self._rows[first:last] = row_ND
+        # Row i is new, with the number `first + i`, unless an equal one is found.
+        fresh_N = torch.arange(first, last, device=self.device)
+        if self._merge is False:
+            self._count = last
+            return fresh_N
+        hash_N = self._hashed(row_ND)
+        looking_L = fresh_N
+        if not self._merging:
+            looking_L = fresh_N[hash_N >> (64 - _SAMPLE_BITS) == 0]
+        found_L, slot_L = self._look_up(looking_L, hash_N[looking_L - first])
+        new_N = torch.ones_like(fresh_N, dtype=torch.bool)
+        new_N[looking_L - first] = found_L == looking_L
+        # The new ones move together, to the least numbers that are free.
+        number_N = first - 1 + new_N.cumsum(0)
+        own = torch.nonzero(found_L == looking_L).flatten()
+        self._slots[slot_L[own]] = number_N[looking_L[own] - first]
+        new = torch.nonzero(new_N).flatten()
+        self._rows[first : first + len(new)] = row_ND[new]
+        self._count, self._listed = first + len(new), self._listed + len(own)
+        at_L = (found_L - first).clamp(min=0)
+        number_N[looking_L - first] = torch.where(found_L < first, found_L, number_N[at_L])
+        if self._merge == "auto":
+            self._judge(len(looking_L), len(own))
+        return number_N
+
+    def _judge(self, asked: int, new: int) -> None:
+        """Give up looking rows up, or take it up again, by how often those that were looked up have recurred."""
+        self._asked += asked
+        self._new += new
+        if self._asked < (_JUDGED_AFTER if self._merging else _JUDGED_AFTER >> _SAMPLE_BITS):
+            return
+        if self._merging:
+            self._merging = self._asked > _PAYS * self._new
+        elif self._asked > _PAYS_AGAIN * self._new:
+            self._merging = True
+            self._list(torch.arange(self._count, device=self.device), 2 * self._count)
+        self._asked = self._new = 0
+
+    def _checked(self, row_ND: Tensor) -> Tensor:
+        """The rows without -0.0."""
+        D, dtype = self._rows.shape[1], self._rows.dtype
+        if row_ND.ndim != 2 or row_ND.shape[1] != D or row_ND.dtype != dtype:
+            raise PgtsError(f"the rows are {row_ND.dtype} {tuple(row_ND.shape)}; they must be {dtype} [N, {D}]")
+        if not dtype.is_floating_point:
+            return row_ND
+        bad_N = row_ND.isnan().any(-1)
+        if bool(bad_N.any()):
+            n = int(torch.nonzero(bad_N)[0, 0])
+            raise PgtsError(f"row {n} is {row_ND[n].tolist()}; what is not a number equals nothing")
+        return row_ND + 0.0
+
+    def _hashed(self, row_ND: Tensor) -> Int[Tensor, "N"]:
+        return self._hash((row_ND.view(_BITS[row_ND.dtype]) if row_ND.dtype in _BITS else row_ND).long())
+
+    def _empty_slots(self, count: int) -> Tensor:
+        return torch.full((count,), _EMPTY, dtype=torch.int64, device=self.device)
+
+    def _make_room(self, count: int) -> None:
+        """Memory for so many rows, or for twice as many as before."""
+        if count > len(self._rows):
+            more = self._rows.new_empty(max(count, 2 * len(self._rows)), self._rows.shape[1])
+            more[: self._count] = self._rows[: self._count]
+            self._rows = more
+
+    def _list(self, number_L: Tensor, num_slots: int) -> None:
+        """A table of at least so many slots that lists these rows."""
+        self._slots = self._empty_slots(max(_LEAST_SLOTS, 1 << (num_slots - 1).bit_length()))
+        self._listed = 0
+        found_L, _ = self._look_up(number_L, self._hashed(self._rows[number_L]))
+        self._listed = int((found_L == number_L).sum())
+
+    def _look_up(self, looking_L: Tensor, hash_L: Tensor) -> tuple[Tensor, Tensor]:
+        """For each of these rows in memory the number of the first one that equals it, and its slot; rows that equal
+        none before them are listed. The caller counts them."""
+        needed = 2 * (self._listed + len(looking_L))
+        if needed > len(self._slots):
+            self._list(self._slots[self._slots != _EMPTY], needed)
+        last_slot = len(self._slots) - 1
+        found_L, at_L = torch.empty_like(looking_L), torch.empty_like(looking_L)
+        index, slot_L = torch.arange(len(looking_L), device=self.device), hash_L & last_slot
+        while len(looking_L):
+            here_L = self._slots.index_select(0, slot_L)
+            free = torch.nonzero(here_L == _EMPTY).flatten()
+            if len(free):  # of the rows that find a slot empty the first one takes it
+                free_slot = slot_L[free]
+                self._slots.scatter_reduce_(0, free_slot, looking_L[free], "amin")
+                here_L[free] = self._slots[free_slot]
+            equal_L = (self._rows.index_select(0, here_L) == self._rows.index_select(0, looking_L)).all(-1)
+            equal, others = torch.nonzero(equal_L).flatten(), torch.nonzero(~equal_L).flatten()
+            found_L[index[equal]], at_L[index[equal]] = here_L[equal], slot_L[equal]
+            index, looking_L, slot_L = index[others], looking_L[others], (slot_L[others] + 1) & last_slot
+        return found_L, at_L

@@ -1,0 +1,266 @@
+"""A simulator as a model: its states are snapshots, numbered as they are met, equal ones alike."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.errors import PgtsError, RandomOutcomes
+from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.environments import EnvSource, all_actions, make_env, wrong_answer
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, env_name, generator_state
+
+_KEY_OF_CERTAINTY = 0
+"""Outcomes that are listed draw nothing; this is what they would draw from."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """What an action gave. random: it may give something else under another key."""
+
+    reward: float
+    discount: float
+    child: int
+    random: bool
+
+
+@final
+class SimulatorModel(EnumeratingModel, SamplingModel):
+    """An instance of a Gymnasium environment that answers what may follow a state and an action.
+
+    The instance belongs to the model alone, without wrappers: time limits end no episode here, and nothing that the
+    model is asked touches the environment that an agent acts in. Chance comes from the keys of the search, so a search
+    cannot foresee what that environment will draw. A transition that draws nothing is asked of the simulator once.
+
+    Args:
+        env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
+        gamma: discount in [0, 1] of an outcome that ends no episode; truncation does not end it.
+        actions: the actions, in the order of their numbers. Default: all of a discrete space; for a continuous one see
+            `grid_actions` and `sampled_actions`.
+        action_repeat: how often an action is taken in one outcome, as in `TensorModel`.
+        adapter: takes and restores snapshots. Default: the one for the environment's family.
+        observe: what to remember of an observation, for `observations`; an array, or None for nothing. Default: all.
+        highest_value: an upper bound of v*, where one is known.
+        device, dtype: of the answers.
+
+    Raises:
+        MissingModel: no adapter knows the environment.
+        PgtsError: it cannot be made, gamma is no discount, its actions cannot be listed, or action_repeat is below 1,
+            or above 1 beside a highest value.
+    """
+
+    def __init__(
+        self,
+        env: EnvSource,
+        *,
+        gamma: float,
+        actions: Sequence[Any] | None = None,
+        action_repeat: int = 1,
+        adapter: SnapshotAdapter | None = None,
+        observe: Callable[[Any], Any] | None = None,
+        highest_value: float = math.inf,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        if not 0 <= gamma <= 1:
+            raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
+        if action_repeat < 1:
+            raise PgtsError(f"action_repeat is {action_repeat}; it must be at least 1")
+        if action_repeat > 1 and highest_value < math.inf:
+            raise PgtsError(f"highest_value is {highest_value}; under repeated actions no bound of v* stays one")
+        self.action_repeat = action_repeat
+        made = make_env(env)
+        self.name = env_name(made)
+        self.env: Any = made.unwrapped
+        self.adapter = adapter or adapter_for(made)
+        self.actions = list(all_actions(self.env.action_space) if actions is None else actions)
+        if not self.actions:
+            raise PgtsError("actions is empty; a model needs at least one")
+        self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value
+        self.device, self.dtype = torch.empty(0, device=device).device, dtype
+        self.simulator_steps = 0
+        """How often the simulator was stepped."""
+        self._observe = observe
+        self.env.reset(seed=0)  # to have a state at all, which the first snapshot replaces
+        self.generation = -1
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all states. Their numbers mean nothing from here on: numbering begins anew."""
+        self.generation += 1
+        self.num_states = 0
+        self._snapshots: list[Snapshot] = []
+        self._observations: list[Any] = []
+        self._number: dict[bytes, int] = {}
+        self._sure: dict[tuple[int, int], _Step] = {}
+        self._known_worlds: list[Any] = []
+
+    def root(self, env: gymnasium.Env, observation: Any = None) -> int:
+        """The number of the state that another instance of this environment is in. Nothing of that instance changes.
+
+        Args:
+            env: wrapped or not; it has been reset.
+            observation: what it shows there, without wrappers; needed only by critics that read observations.
+
+        Raises:
+            PgtsError: it is another environment, or has another map or other constants than the model's.
+        """
+        base: Any = env.unwrapped
+        if not any(base is known for known in self._known_worlds):
+            if not self.adapter.same_world(base, self.env):
+                raise PgtsError(
+                    f"{env_name(env)} is not the environment that the model was made from ({self.name}): its class, "
+                    "map or constants differ; make both with the same arguments"
+                )
+            self._known_worlds.append(base)
+        return self.number(self.adapter.get_state(base), observation)
+
+    def roots(self, envs: Iterable[gymnasium.Env], observations: Iterable[Any] | None = None) -> Int[Tensor, "B"]:
+        """`root` of each of several instances."""
+        pairs = zip(envs, itertools.repeat(None) if observations is None else observations, strict=False)
+        return torch.tensor([self.root(*pair) for pair in pairs], dtype=torch.int64, device=self.device)
+
+    def number(self, snapshot: Snapshot, observation: Any = None) -> int:
+        """The number of a state: a new one if no equal state was met before."""
+        number = self._number.setdefault(snapshot.key, self.num_states)
+        if number == self.num_states:
+            self.num_states += 1
+            self._snapshots.append(snapshot)
+            self._observations.append(None)
+        if self._observations[number] is None and observation is not None:
+            self._observations[number] = self._observe(observation) if self._observe else observation
+        return number
+
+    def snapshot(self, state: int) -> Snapshot:
+        """The snapshot behind the number of a state."""
+        self._check("state", state, self.num_states)
+        return self._snapshots[state]
+
+    def observations(self, state_N: Int[Tensor, "N"]) -> np.ndarray:
+        """What `observe` made of what the environment shows in each state, stacked: [N, ...].
+
+        Without `observe` that is [N, *shape] of a Box, [N] of a Discrete space, and `gymnasium.spaces.flatten` of any
+        other, in the dtype of the space.
+
+        Raises:
+            PgtsError: one of them is not known, because a root was given without it; or it cannot be flattened.
+        """
+        rows = []
+        for state in state_N.tolist():
+            self._check("state", state, self.num_states)
+            if self._observations[state] is None:
+                raise PgtsError(
+                    f"{self.name}: the observation of state {state} was not given, or `observe` made it None"
+                )
+            rows.append(self._observations[state])
+        space = self.env.observation_space
+        if self._observe is None and not isinstance(space, spaces.Box | spaces.Discrete):
+            try:
+                rows = [spaces.flatten(space, row) for row in rows]
+            except NotImplementedError:
+                raise PgtsError(f"{self.name}: {space} cannot be flattened: give `observe`") from None
+        return np.asarray(rows)
+
+    def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
+        """The one outcome of each (state, action), in an environment that is not random there.
+
+        Raises:
+            RandomOutcomes: chance decides what follows.
+            PgtsError: the environment fails, see `sample`.
+        """
+        steps = []
+        for state, action in itertools.product(state_N.tolist(), range(self.num_actions)):
+            step = self._step(state, action, _KEY_OF_CERTAINTY)
+            if step.random:
+                raise RandomOutcomes(
+                    f"{self.name} is random in state {state} under action {action}: its outcomes cannot be listed; "
+                    "search it by `sampled`, or make a TabularModel of it if it has a table P"
+                )
+            steps.append(step)
+        reward_N, discount_N, child_N = self._answer(steps)
+        shape = len(state_N), self.num_actions
+        return Outcomes(
+            reward_N.view(shape),
+            torch.ones(*shape, 1, dtype=self.dtype, device=self.device),
+            discount_N.view(*shape, 1),
+            child_N.view(*shape, 1),
+            self.num_states,
+        )
+
+    def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
+        """One outcome of each (state, action): restore the state, seed the generator by the key, step.
+
+        Raises:
+            PgtsError: no such state or action; or the environment raises, or answers with a reward or an observation
+                that is not finite or does not fit its space: naming environment, state, action and key.
+        """
+        asked = zip(state_N.tolist(), action_N.tolist(), key_N.tolist(), strict=True)
+        return Transitions(*self._answer([self._step(*one) for one in asked]))
+
+    def is_random(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
+        """Whether chance decides what follows each (state, action). The simulator is asked; raises as `sample`."""
+        asked = zip(state_N.tolist(), action_N.tolist(), strict=True)
+        return torch.tensor([self._step(*pair, _KEY_OF_CERTAINTY).random for pair in asked], device=self.device)
+
+    def _answer(self, steps: Sequence[_Step]) -> tuple[Tensor, Tensor, Tensor]:
+        """Rewards, discounts and children."""
+        return (
+            torch.tensor([step.reward for step in steps], dtype=self.dtype, device=self.device),
+            torch.tensor([step.discount for step in steps], dtype=self.dtype, device=self.device),
+            torch.tensor([step.child for step in steps], dtype=torch.int64, device=self.device),
+        )
+
+    def _step(self, state: int, action: int, key: int) -> _Step:
+        """What follows; from memory where it is sure."""
+        if (state, action) in self._sure:
+            return self._sure[state, action]
+        self._check("state", state, self.num_states)
+        self._check("action", action, self.num_actions)
+        taken = self.actions[action]
+        try:
+            self.adapter.set_state(self.env, self._snapshots[state].data)
+            total, discount, random = 0.0, 1.0, False
+            for _ in range(self.action_repeat):
+                observation, reward, terminated, drew = self._stepped(taken, None if random else key)
+                total, random = total + discount * reward, random or drew
+                discount *= 0.0 if terminated else self.gamma
+                if terminated:
+                    break
+            child = self.number(self.adapter.get_state(self.env), observation)
+        except Exception as error:
+            what = str(error) if type(error) is PgtsError else f"{type(error).__name__}: {error}"
+            raise PgtsError(
+                f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}: {what}"
+            ) from error
+        step = _Step(total, discount, child, random)
+        if not random:
+            self._sure[state, action] = step
+        return step
+
+    def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, bool, bool]:
+        """Observation, reward, end, and whether chance decided, of one step. The generator is seeded by the key, where
+        there is one; later draws of the same outcome go on from it."""
+        known = self.adapter.is_random(self.env, taken)
+        if known is not False and key is not None:
+            self.adapter.seed(self.env, key)
+        before = generator_state(self.env) if known is None else None
+        observation, reward, terminated, _, _ = self.env.step(taken)
+        self.simulator_steps += 1
+        drew = generator_state(self.env) != before if known is None else known
+        reward = float(reward)
+        if wrong := wrong_answer(self.env.observation_space, observation, reward):
+            raise PgtsError(wrong)
+        return observation, reward, bool(terminated), drew
+
+    def _check(self, what: str, number: int, count: int) -> None:
+        if not 0 <= number < count:
+            raise PgtsError(f"{self.name}: {what} {number} does not exist; there are {count}, from 0 on")

@@ -1,0 +1,271 @@
+"""Snapshots of simulators: all that their next step depends on, except chance, which belongs to the search.
+
+An adapter takes a snapshot of an environment and puts it back, bit for bit. The generator of the environment is no part
+of a snapshot: a search that restored it would foresee what the environment is about to draw. What only rendering reads
+is no part of it either, and neither is the clock of a `TimeLimit` wrapper, because models live on `env.unwrapped`; a
+clock that the environment itself keeps (MiniGrid, ALE) is.
+
+An environment of your own needs no adapter, but two methods:
+
+    def get_state(self):          # all that step reads or changes, except self.np_random: bytes, or what pickles
+        return self.position, self.fuel
+
+    def set_state(self, state):
+        self.position, self.fuel = state
+
+and draws chance from `self.np_random` only. States with equal bytes are one node of a search: bytes of your own making
+merge surest.
+"""
+
+import pickle
+import struct
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, final, runtime_checkable
+
+import gymnasium
+import numpy as np
+
+from pgts_torch.errors import MissingModel
+
+_MASK = 2**64 - 1
+_ODD = 0x9E3779B97F4A7C15
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """A state of a simulator.
+
+    key: equal for equal states.   data: what `SnapshotAdapter.set_state` takes; often the key itself.
+    """
+
+    key: bytes
+    data: Any
+
+
+class SnapshotAdapter(ABC):
+    """Takes and restores the states of one environment, which is `unwrapped`.
+
+    Attributes:
+        name: of the family of environments.
+    """
+
+    name: str
+
+    @abstractmethod
+    def get_state(self, env: Any) -> Snapshot:
+        """The state of `env`, or of another instance of its class; nothing of it changes."""
+
+    @abstractmethod
+    def set_state(self, env: Any, data: Any) -> None:
+        """Give `env` the state whose `Snapshot.data` this is."""
+
+    def seed(self, env: Any, key: int) -> None:
+        """Whatever `env` draws from here on is a function of the 64 bits of `key`; its state stays as it is."""
+        reseed(env, key)
+
+    def is_random(self, env: Any, action: Any) -> bool | None:
+        """Whether chance decides what follows `action` in the present state; None: see whether the step draws."""
+        return None
+
+    def obstacle(self, env: Any) -> str:
+        """Why this instance cannot be restored after all; empty where it can."""
+        return ""
+
+    def same_world(self, env: Any, own: Any) -> bool:
+        """Whether what is no part of a snapshot, as maps and constants, is the same in both instances."""
+        return type(env) is type(own)
+
+
+def reseed(env: Any, key: int) -> None:
+    """Give `env` a generator of its own for each key; a new one only where the present one is no PCG64.
+
+    The 64 bits are stretched to the 128 of PCG64 by SplitMix64 (Steele, Lea and Flood 2014), as in `seeding.mix`: a
+    fifth of what `numpy.random.default_rng(key)` costs.
+    """
+    generator = env.np_random
+    if type(generator.bit_generator) is not np.random.PCG64:
+        generator = env.np_random = np.random.Generator(np.random.PCG64(0))
+    high, low = _avalanche((key + _ODD) & _MASK), _avalanche((key + 2 * _ODD) & _MASK)
+    generator.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": high << 64 | low, "inc": _ODD},
+        "has_uint32": 0,
+        "uinteger": 0,
+    }
+
+
+def generator_state(env: Any) -> Mapping[str, Any]:
+    """The state of the generator of `env`: unchanged if and only if nothing was drawn from it."""
+    return env.np_random.bit_generator.state
+
+
+def _avalanche(x: int) -> int:
+    x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
+    x = ((x ^ (x >> 27)) * 0x94D049BB133111EB) & _MASK
+    return x ^ (x >> 31)
+
+
+@runtime_checkable
+class Restorable(Protocol):
+    """An environment that answers for its own state; see the head of this file."""
+
+    def get_state(self) -> Any: ...
+
+    def set_state(self, state: Any) -> None: ...
+
+
+@final
+class OwnState(SnapshotAdapter):
+    """For environments with the two methods of `Restorable`."""
+
+    name = "get_state and set_state of its own"
+
+    def get_state(self, env: Any) -> Snapshot:
+        state = env.get_state()
+        data = state if type(state) is bytes else pickle.dumps((state,), protocol=5)
+        # A prefix tells a state that is bytes from one that is pickled.
+        return Snapshot((b"b" if data is state else b"p") + data, (data is state, data))
+
+    def set_state(self, env: Any, data: Any) -> None:
+        is_bytes, content = data
+        env.set_state(content if is_bytes else pickle.loads(content)[0])
+
+
+@final
+class ToyText(SnapshotAdapter):
+    """FrozenLake, CliffWalking and Taxi: the state, and whether Taxi's passenger may still change his mind."""
+
+    name = "toy text"
+
+    def get_state(self, env: Any) -> Snapshot:
+        key = struct.pack("<q?", env.s, vars(env).get("fickle_step", False))
+        return Snapshot(key, key)
+
+    def set_state(self, env: Any, data: Any) -> None:
+        env.s, fickle = struct.unpack("<q?", data)
+        if "fickle_step" in vars(env):
+            env.fickle_step = fickle
+
+    def is_random(self, env: Any, action: Any) -> bool | None:
+        # These environments draw a number even where one outcome is sure.
+        fickle = vars(env).get("fickle_step", False)
+        return fickle or len({row[1:] for row in env.P[env.s][action] if row[0] > 0}) > 1
+
+    def same_world(self, env: Any, own: Any) -> bool:
+        return type(env) is type(own) and env.P == own.P
+
+
+@final
+class Blackjack(SnapshotAdapter):
+    """The two hands. The suit of the dealer's card is for rendering."""
+
+    name = "toy text"
+
+    def get_state(self, env: Any) -> Snapshot:
+        key = bytes(env.player) + b"|" + bytes(env.dealer)
+        return Snapshot(key, key)
+
+    def set_state(self, env: Any, data: Any) -> None:
+        player, dealer = data.split(b"|")
+        env.player, env.dealer = list(player), list(dealer)
+
+    def same_world(self, env: Any, own: Any) -> bool:
+        return type(env) is type(own) and (env.natural, env.sab) == (own.natural, own.sab)
+
+
+@final
+class ClassicControl(SnapshotAdapter):
+    """CartPole, Acrobot, MountainCar and Pendulum: the vector `state`, in its dtype, and CartPole's mark of an end."""
+
+    name = "classic control"
+
+    def get_state(self, env: Any) -> Snapshot:
+        state = np.asarray(env.state)
+        beyond = vars(env).get("steps_beyond_terminated")
+        key = struct.pack("<cq", state.dtype.char.encode(), -1 if beyond is None else beyond) + state.tobytes()
+        return Snapshot(key, key)
+
+    def set_state(self, env: Any, data: Any) -> None:
+        char, beyond = struct.unpack_from("<cq", data)
+        env.state = np.frombuffer(data, char.decode(), offset=9).copy()
+        if "steps_beyond_terminated" in vars(env):
+            env.steps_beyond_terminated = None if beyond < 0 else beyond
+
+    def same_world(self, env: Any, own: Any) -> bool:
+        return type(env) is type(own) and _constants(env) == _constants(own)
+
+
+def _constants(env: Any) -> dict[str, Any]:
+    """The plain attributes of an environment of classic control; those of rendering and of its state are left out."""
+    left_out = {"steps_beyond_terminated", "last_u", "render_mode", "isopen", "_np_random_seed"}
+    plain = (bool, int, float, str, np.floating)
+    return {name: value for name, value in vars(env).items() if isinstance(value, plain) and name not in left_out}
+
+
+_TOY_TEXT = "gymnasium.envs.toy_text"
+_CLASSIC = "gymnasium.envs.classic_control"
+
+
+def _minigrid() -> SnapshotAdapter:
+    from pgts_torch.models.snapshots_extra import MiniGrid
+
+    return MiniGrid()
+
+
+def _ale() -> SnapshotAdapter:
+    from pgts_torch.models.snapshots_extra import Ale
+
+    return Ale()
+
+
+def _mujoco() -> SnapshotAdapter:
+    from pgts_torch.models.snapshots_extra import Mujoco
+
+    return Mujoco()
+
+
+ADAPTERS: dict[tuple[str, str], Callable[[], SnapshotAdapter]] = {
+    (f"{_TOY_TEXT}.frozen_lake", "FrozenLakeEnv"): ToyText,
+    (f"{_TOY_TEXT}.cliffwalking", "CliffWalkingEnv"): ToyText,
+    (f"{_TOY_TEXT}.taxi", "TaxiEnv"): ToyText,
+    (f"{_TOY_TEXT}.blackjack", "BlackjackEnv"): Blackjack,
+    (f"{_CLASSIC}.cartpole", "CartPoleEnv"): ClassicControl,
+    (f"{_CLASSIC}.acrobot", "AcrobotEnv"): ClassicControl,
+    (f"{_CLASSIC}.mountain_car", "MountainCarEnv"): ClassicControl,
+    (f"{_CLASSIC}.continuous_mountain_car", "Continuous_MountainCarEnv"): ClassicControl,
+    (f"{_CLASSIC}.pendulum", "PendulumEnv"): ClassicControl,
+    ("minigrid.minigrid_env", "MiniGridEnv"): _minigrid,
+    ("ale_py.env", "AtariEnv"): _ale,
+    ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv"): _mujoco,
+}
+"""The families by (module, class); subclasses belong to them. A module that nothing has imported has no instances."""
+
+
+def adapter_for(env: gymnasium.Env) -> SnapshotAdapter:
+    """An adapter for this environment. Its own two methods come before what is known of its family.
+
+    Raises:
+        MissingModel: it has neither; the message says what to implement.
+    """
+    base = env.unwrapped
+    if isinstance(base, Restorable):
+        return OwnState()
+    for (module, name), make in ADAPTERS.items():
+        if module in sys.modules and isinstance(base, getattr(sys.modules[module], name)):
+            adapter = make()
+            if why := adapter.obstacle(base):
+                raise MissingModel(f"{env_name(env)} cannot be restored: {why}")
+            return adapter
+    raise MissingModel(
+        f"{env_name(env)} cannot be restored: give {type(base).__name__} the methods get_state(self), which returns "
+        "all that step reads or changes except self.np_random (bytes, or what pickles), and set_state(self, state), "
+        "which puts it back"
+    )
+
+
+def env_name(env: gymnasium.Env) -> str:
+    """The id of an environment, or the name of its class where it has none."""
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__

@@ -1,0 +1,159 @@
+"""Models whose states are vectors and whose actions have one outcome: simulators written in torch."""
+
+from abc import abstractmethod
+
+import torch
+from jaxtyping import Float, Int, Num
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.errors import PgtsError
+from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.numbering import Merge, Numbering
+
+
+class TensorModel(EnumeratingModel, SamplingModel):
+    """Deterministic dynamics over vectors of D numbers. A subclass gives `step`; this class numbers the states as it
+    meets them, equal ones alike, so that a search merges them.
+
+    Memory grows with every new state until `clear`.
+
+    With `action_repeat` k > 1 an outcome is what comes of taking the same action k times, so that a reward far ahead
+    comes into the sight of a search of little depth:
+
+        r = sum_{i<k} gamma_0 ... gamma_{i-1} r_i,    discount = gamma_0 ... gamma_{k-1},    next state s_k
+
+    It ends early where an episode terminates (discount 0) and before a step in which the action is not allowed. T is
+    then the optimality operator T_k of the semi-MDP of these options (Sutton, Precup and Singh 1999):
+
+    - with `q_leaf` a search gives T_k^m Q^pi; with `v_leaf` it gives T_k^m Q_k, where Q_k(s, a), the value of a taken k
+      times and pi from there on, is not Q^pi;
+    - every value is that of a plan which can be followed, so with an exact critic none is above q*. But pi itself may
+      be better than each repeated action: max_a need not reach v^pi, and a gap of 0 does not put pi into Pi^m;
+    - upper bounds of v* do not stay such under T_k, so there is no certificate: `highest_value` is to be infinite.
+
+    A model call is one (state, action) however often it is repeated; `simulator_steps` counts the steps.
+
+    Args:
+        state_size: D.
+        num_actions: A.
+        state_dtype: of the vectors: floating, or int64.
+        dtype: of rewards, discounts and values.
+        device: where everything lies.
+        merge: whether equal states get one number (`Numbering`).
+        action_repeat: k, how often an action is taken in one outcome.
+
+    Raises:
+        PgtsError: action_repeat is below 1.
+    """
+
+    def __init__(
+        self,
+        state_size: int,
+        num_actions: int,
+        *,
+        state_dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+        merge: Merge = "auto",
+        action_repeat: int = 1,
+    ) -> None:
+        if action_repeat < 1:
+            raise PgtsError(f"action_repeat is {action_repeat}; it must be at least 1")
+        self._numbering = Numbering(state_size, dtype=state_dtype, device=device, merge=merge)
+        self.num_actions = num_actions
+        self.device = self._numbering.device
+        self.dtype = dtype
+        self.action_repeat = action_repeat
+        self.simulator_steps = 0
+        """How many (state, action) `step` was asked for."""
+
+    @abstractmethod
+    def step(
+        self, state_ND: Num[Tensor, "N D"], action_N: Int[Tensor, "N"]
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Num[Tensor, "N D"]]:
+        """Reward, discount and next state of each (state, action): a function of these and of nothing else.
+
+        Rewards and discounts are of the dtype of the model (`torch.where` of two Python numbers is float32), states of
+        the dtype of states. The reward is -inf where the action is not allowed. After a terminal outcome, discount 0,
+        the next state may be anything, also nan.
+        """
+
+    @property
+    def num_states(self) -> int:  # type: ignore[override]
+        return len(self._numbering)
+
+    def number(self, state_ND: Num[Tensor, "N D"]) -> Int[Tensor, "N"]:
+        """The number of each state; new ones get the next numbers.
+
+        Raises:
+            PgtsError: states of a wrong size or dtype, or with a nan (naming the row).
+        """
+        return self._numbering.number(state_ND)
+
+    def states(self, state_N: Int[Tensor, "N"]) -> Num[Tensor, "N D"]:
+        """The states with these numbers."""
+        return self._numbering.rows(state_N)
+
+    def clear(self) -> None:
+        """Forget all states and give their memory back. Their numbers mean nothing afterwards: a `Topology` over this
+        model refuses to go on, and a new one is to be made."""
+        self._numbering.clear()
+        self.generation += 1
+
+    def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
+        """The one outcome of each action, K = 1.
+
+        Raises:
+            PgtsError: `step` answers with another shape or dtype than asked for, or with a nan in a state that counts.
+        """
+        A = self.num_actions
+        action_NA = torch.arange(A, device=self.device).expand(len(state_N), A)
+        reward_N, discount_N, next_N = self._followed(state_N.repeat_interleave(A), action_NA.reshape(-1))
+        certain_NAK = torch.ones((), dtype=self.dtype, device=self.device).expand(len(state_N), A, 1)
+        return Outcomes(
+            reward_N.view(-1, A), certain_NAK, discount_N.view(-1, A, 1), next_N.view(-1, A, 1), self.num_states
+        )
+
+    def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
+        """The one outcome of each (state, action), whatever the key; raises as `outcomes` does."""
+        return Transitions(*self._followed(state_N, action_N))
+
+    @torch.no_grad()
+    def _followed(self, state_N: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Reward, discount and number of the next state; where nothing counts after an outcome, its own state."""
+        reward_N, discount_N, next_ND = self._stepped(self.states(state_N), action_N)
+        for _ in range(self.action_repeat - 1):
+            on = torch.nonzero((discount_N > 0) & (reward_N > -torch.inf)).flatten()
+            more_N, then_N, ahead_ND = self._stepped(next_ND[on], action_N[on])
+            allowed_N = more_N > -torch.inf
+            on, weight_N = on[allowed_N], discount_N[on[allowed_N]]
+            reward_N = reward_N.index_add(0, on, weight_N * more_N[allowed_N])
+            discount_N = discount_N.index_copy(0, on, weight_N * then_N[allowed_N])
+            next_ND = next_ND.index_copy(0, on, ahead_ND[allowed_N])
+        next_N = state_N.clone()
+        counts_N = (discount_N > 0) & (reward_N > -torch.inf)
+        next_N[counts_N] = self.number(next_ND[counts_N])
+        return reward_N, discount_N, next_N
+
+    def _stepped(self, state_ND: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What `step` answers, checked."""
+        self.simulator_steps += len(state_ND)
+        reward_N, discount_N, next_ND = self.step(state_ND, action_N)
+        given = tuple(reward_N.shape), tuple(discount_N.shape), tuple(next_ND.shape)
+        asked = tuple(action_N.shape), tuple(action_N.shape), tuple(state_ND.shape)
+        if given != asked:
+            raise PgtsError(f"step answered with shapes {given}; {len(action_N)} states and actions ask for {asked}")
+        if not reward_N.dtype == discount_N.dtype == self.dtype:
+            raise PgtsError(
+                f"step answered with rewards in {reward_N.dtype} and discounts in {discount_N.dtype}; "
+                f"the model speaks {self.dtype}"
+            )
+        counts_N = (discount_N > 0) & (reward_N > -torch.inf)
+        if bool((bad_N := next_ND.isnan().any(-1) & counts_N).any()):
+            n = int(torch.nonzero(bad_N)[0, 0])
+            raise PgtsError(
+                f"step leads from state {state_ND[n].tolist()} by action {int(action_N[n])} to {next_ND[n].tolist()}; "
+                "what is not a number equals nothing"
+            )
+        return reward_N, discount_N, next_ND

@@ -1,0 +1,114 @@
+"""Random walks in simulators, recorded to the bit, and walked again from a restored state."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from pgts_torch.models.simulator import SimulatorModel
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter
+
+_LONGEST_WALK = 50
+"""The most steps before a continuation begins."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all checks share."""
+
+    name: str
+    make: Callable[[], gymnasium.Env]
+    adapter: SnapshotAdapter
+    actions: Sequence[Any]
+    random: np.random.Generator
+
+    def model(self) -> SimulatorModel:
+        return SimulatorModel(self.make, gamma=1.0, actions=self.actions, adapter=self.adapter)
+
+    def fresh(self) -> Any:
+        """A new instance, without wrappers, at the start of some episode."""
+        env = self.make().unwrapped
+        env.reset(seed=self.number())
+        return env
+
+    def number(self) -> int:
+        return int(self.random.integers(2**31))
+
+    def action(self) -> Any:
+        return self.actions[int(self.random.integers(len(self.actions)))]
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A continuation: where it began, the key of its draws, what was done, what was seen and which states were met."""
+
+    start: Snapshot
+    key: int
+    actions: tuple[Any, ...]
+    seen: tuple[bytes, ...]
+    states: tuple[bytes, ...]
+
+
+def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
+    """Continuations that nothing interrupts, from states at random steps of random episodes."""
+    env = setup.fresh()
+    walks = []
+    for _ in range(count):
+        env.reset(seed=setup.number())
+        for _ in range(int(setup.random.integers(_LONGEST_WALK))):
+            start = setup.adapter.get_state(env)
+            _, _, terminated, truncated, _ = env.step(setup.action())
+            if terminated or truncated:
+                setup.adapter.set_state(env, start.data)
+                break
+        walks.append(walk_on(setup, env, setup.number(), tuple(setup.action() for _ in range(length))))
+    return walks
+
+
+def walk_on(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
+    """What these actions give from here on, up to an end."""
+    start = setup.adapter.get_state(env)
+    setup.adapter.seed(env, key)
+    seen, states = [], []
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        seen.append(bits((observation, float(reward), bool(terminated), bool(truncated))))
+        states.append(setup.adapter.get_state(env).key)
+        if terminated or truncated:
+            break
+    return Walk(start, key, actions, tuple(seen), tuple(states))
+
+
+def again(setup: Setup, env: Any, walk: Walk) -> Walk:
+    setup.adapter.set_state(env, walk.start.data)
+    return walk_on(setup, env, walk.key, walk.actions)
+
+
+def bits(value: Any) -> bytes:
+    """Every bit of an observation and what comes with it."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{value.shape}".encode() + value.tobytes()
+    if isinstance(value, dict):
+        return b"".join(str(name).encode() + bits(value[name]) for name in sorted(value, key=str))
+    if isinstance(value, tuple | list):
+        return b"".join(b"(" + bits(part) for part in value)
+    return repr(value.item() if isinstance(value, np.generic) else value).encode()
+
+
+def replays(setup: Setup, walks: Sequence[Walk]) -> list[Walk]:
+    """Each walk again, in an instance that has walked another one just before."""
+    env = setup.fresh()
+    return [again(setup, env, walk) for walk in walks]
+
+
+def live(env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
+    """What an agent sees that takes these actions; a new episode starts where one ends."""
+    seen = []
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        seen.append(bits((observation, float(reward), terminated, truncated)))
+        if terminated or truncated:
+            seen.append(bits(env.reset()[0]))
+    return seen

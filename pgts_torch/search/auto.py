@@ -1,0 +1,134 @@
+"""The search that chooses: by what the model can do, by how often paths meet, and by the budget."""
+
+import math
+from typing import final
+
+import torch
+from torch import Tensor
+
+from pgts_torch.errors import NodeBudgetExceeded, RandomOutcomes
+from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
+from pgts_torch.search.engine import SampledSearch, Search
+from pgts_torch.search.expectimax import expectimax
+from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead
+from pgts_torch.search.topology import Topology
+
+MOST_SAMPLES = 32
+
+
+@final
+class AutoSearch(Search):
+    """Picks the search by what the model can do, by how often paths meet, and by the budget; `str` says what it picked.
+
+    - Outcomes can be listed and the nodes that hold all paths fit into the budget: expectimax of full width, exact.
+    - They can be listed and do not fit: expectimax that unfolds as many states of each level as fit.
+    - They can only be drawn, or turn out to be random where they should be listed: sampled, with as many samples of
+      each action as fit if no two paths meet. Where paths met and left room, the next search draws twice as many, up
+      to 32.
+
+    Args:
+        model: what is asked.
+        max_nodes: the most nodes of one search.
+
+    Raises:
+        NodeBudgetExceeded: from a search, where even one state a level, or one sample of each action, is too much.
+    """
+
+    def __init__(self, model: Model, *, max_nodes: int = MAX_NODES) -> None:
+        super().__init__(model)
+        self.max_nodes = max_nodes
+        self._topology = Topology(model) if isinstance(model, EnumeratingModel) else None
+        self._width = max_nodes
+        self._too_deep = math.inf
+        self._samples = 0
+        self._picked = "nothing yet"
+        self.keeps_bounds = self._topology is not None
+
+    def _look(
+        self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator
+    ) -> Lookahead:
+        expansions = Leaves(self.model, depth, q_leaf, v_leaf).expansions
+        if self._topology is not None:
+            try:
+                return self._listed(root_B, depth, expansions, q_leaf, v_leaf)
+            except RandomOutcomes:
+                if not isinstance(self.model, SamplingModel):
+                    raise
+                self._topology, self.keeps_bounds = None, False
+        return self._sampled(root_B, depth, expansions, q_leaf, v_leaf, generator)
+
+    def _listed(
+        self, root_B: Tensor, depth: int, expansions: int, q_leaf: Leaf | None, v_leaf: Leaf | None
+    ) -> Lookahead:
+        topology = self._topology
+        assert topology is not None
+
+        def look(max_width: int | None) -> Lookahead:
+            return expectimax(
+                topology.model,
+                root_B,
+                depth=depth,
+                q_leaf=q_leaf,
+                v_leaf=v_leaf,
+                topology=topology,
+                max_nodes=self.max_nodes,
+                max_width=max_width,
+            )
+
+        if expansions < self._too_deep:
+            try:
+                full = look(None)
+                self._picked = f"expectimax: the model lists its outcomes, and {full.nodes} nodes hold all paths"
+                return full
+            except NodeBudgetExceeded:
+                self._too_deep = expansions
+        while True:
+            try:
+                narrow = look(self._width)
+                break
+            except NodeBudgetExceeded:
+                if self._width == 1:
+                    raise
+                self._width //= 2
+        self._picked = f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes"
+        return narrow
+
+    def _sampled(
+        self,
+        root_B: Tensor,
+        depth: int,
+        expansions: int,
+        q_leaf: Leaf | None,
+        v_leaf: Leaf | None,
+        generator: torch.Generator,
+    ) -> Lookahead:
+        roots, A = len(root_B), self.model.num_actions
+        while (
+            self._samples < MOST_SAMPLES
+            and tree_nodes(roots, A * 2 * max(self._samples, 1), expansions) <= self.max_nodes
+        ):
+            self._samples = 2 * max(self._samples, 1)
+        self._samples = max(self._samples, 1)
+        look = SampledSearch(self.model, samples=self._samples, max_nodes=self.max_nodes)(
+            root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, generator=generator
+        )
+        tree = tree_nodes(roots, A * self._samples, expansions)
+        self._picked = (
+            f"sampled, {self._samples} outcomes of each action: the model only draws, and {look.nodes} nodes hold "
+            f"{tree:.3g} paths"
+        )
+        if self._samples < MOST_SAMPLES and look.nodes * 2**expansions <= self.max_nodes:
+            self._samples *= 2
+        return look
+
+    def forget(self) -> None:
+        if self._topology is not None:
+            self._topology = Topology(self._topology.model)
+
+    def __str__(self) -> str:
+        return self._picked
+
+
+def tree_nodes(roots: int, children: int, expansions: int) -> float:
+    """Nodes of trees in which no two paths meet."""
+    return roots * sum(float(children) ** level for level in range(expansions + 1))

@@ -1,0 +1,223 @@
+"""Searches as objects: one way to look ahead in one model, with what it remembers from one search to the next."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import final
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
+from pgts_torch.search.empirical import Drawn, Share
+from pgts_torch.search.expectimax import expectimax
+from pgts_torch.search.lookahead import MAX_NODES, Leaf, Lookahead
+from pgts_torch.search.mcts import mcts
+from pgts_torch.search.sampled import sampled
+from pgts_torch.search.topology import Topology
+from pgts_torch.seeding import draw_keys
+
+DEFAULT_SAMPLES = 4
+
+
+class Search(ABC):
+    """(T^m Q)(s, .) at the roots of one model.
+
+    model_calls: how many (state, action) it has asked so far.
+    keeps_bounds: whether, with upper bounds of v* at the leaves, its values are upper bounds of q*.
+    """
+
+    keeps_bounds: bool
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.model_calls = 0
+
+    def __call__(
+        self,
+        root_B: Int[Tensor, "B"],
+        *,
+        depth: int,
+        q_leaf: Leaf | None = None,
+        v_leaf: Leaf | None = None,
+        generator: torch.Generator,
+    ) -> Lookahead:
+        """One search; the arguments are those of `expectimax`.
+
+        Args:
+            generator: drawn from only by searches that sample; equal states of it give equal searches.
+        """
+        look = self._look(root_B, depth, q_leaf, v_leaf, generator)
+        self.model_calls += look.model_calls
+        return look
+
+    @abstractmethod
+    def _look(
+        self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator
+    ) -> Lookahead: ...
+
+    @abstractmethod
+    def forget(self) -> None:
+        """Forget what was asked: the model has begun to number its states anew."""
+
+    @abstractmethod
+    def __str__(self) -> str:
+        """What it does, in a few words, and why if it chose that itself."""
+
+
+@final
+class ExpectimaxSearch(Search):
+    """`expectimax` over one topology: each (state, action) is asked once in however many searches.
+
+    Args:
+        model: lists outcomes.
+        max_nodes: the most nodes of one search.
+        max_width: the most states of a level that are unfolded. Default: all.
+    """
+
+    keeps_bounds = True
+
+    def __init__(self, model: Model, *, max_nodes: int = MAX_NODES, max_width: int | None = None) -> None:
+        super().__init__(model)
+        self._model = listing(model, "expectimax")
+        self.topology = Topology(self._model)
+        self.max_nodes, self.max_width = max_nodes, max_width
+
+    def _look(
+        self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator
+    ) -> Lookahead:
+        return expectimax(
+            self.topology.model,
+            root_B,
+            depth=depth,
+            q_leaf=q_leaf,
+            v_leaf=v_leaf,
+            topology=self.topology,
+            max_nodes=self.max_nodes,
+            max_width=self.max_width,
+        )
+
+    def forget(self) -> None:
+        self.topology = Topology(self._model)
+
+    def __str__(self) -> str:
+        return "expectimax" if self.max_width is None else f"expectimax, {self.max_width} states a level"
+
+
+@final
+class SampledSearch(Search):
+    """`sampled`, with fresh samples in each search, and without standard errors.
+
+    Args:
+        model: draws outcomes.
+        samples: outcomes of each (state, action), one number or one for each level.
+        share: what shares them, "none", "level" or "search".
+        max_nodes: the most nodes of one search.
+    """
+
+    keeps_bounds = False
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        samples: int | Sequence[int | None] = DEFAULT_SAMPLES,
+        share: Share = "level",
+        max_nodes: int = MAX_NODES,
+    ) -> None:
+        super().__init__(model)
+        self._model = drawing(model, "sampled")
+        self.samples, self.share, self.max_nodes = samples, share, max_nodes
+
+    def _look(
+        self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator
+    ) -> Lookahead:
+        return sampled(
+            self._model,
+            root_B,
+            depth=depth,
+            q_leaf=q_leaf,
+            v_leaf=v_leaf,
+            samples=self.samples,
+            share=self.share,
+            generator=generator,
+            replicates=0,
+            max_nodes=self.max_nodes,
+        )
+
+    def forget(self) -> None:
+        """It remembers nothing."""
+
+    def __str__(self) -> str:
+        return f"sampled, {self.samples} outcomes of each action, shared by {self.share}"
+
+
+@final
+class MCTSSearch(Search):
+    """`mcts` with maximum backups.
+
+    Args:
+        model: lists outcomes, or draws them.
+        simulations: of each root.
+        merge: whether paths that meet are one node.
+        samples: where the model only draws, how many outcomes of each action stand for all (default 4), anew in each
+            search; a model that lists its outcomes needs none.
+    """
+
+    def __init__(self, model: Model, *, simulations: int = 64, merge: bool = True, samples: int | None = None) -> None:
+        super().__init__(model)
+        self.simulations, self.merge = simulations, merge
+        self.keeps_bounds = isinstance(model, EnumeratingModel)
+        self.topology = Topology(model) if isinstance(model, EnumeratingModel) else None
+        if self.topology is not None and samples is not None:
+            raise PgtsError(f"samples is {samples}; {type(model).__name__} lists its outcomes, none need be drawn")
+        self.samples = DEFAULT_SAMPLES if samples is None else samples
+        if self.samples < 1:
+            raise PgtsError(f"samples is {samples}; it must be at least 1")
+
+    def _look(
+        self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator
+    ) -> Lookahead:
+        topology, calls_each = self.topology, 1
+        if topology is None:
+            key = draw_keys(1, generator=generator).to(self.model.device)
+            topology = Topology(Drawn(drawing(self.model, "mcts"), samples=self.samples, key=key))
+            calls_each = self.samples
+        look = mcts(
+            topology.model,
+            root_B,
+            depth=depth,
+            q_leaf=q_leaf,
+            v_leaf=v_leaf,
+            simulations=self.simulations,
+            merge=self.merge,
+            topology=topology,
+            generator=generator,
+        )
+        return replace(look, model_calls=look.model_calls * calls_each)
+
+    def forget(self) -> None:
+        if self.topology is not None:
+            self.topology = Topology(self.topology.model)
+
+    def __str__(self) -> str:
+        drawn = "" if self.topology is not None else f", {self.samples} drawn outcomes of each action"
+        return f"mcts, {self.simulations} simulations{', merged' if self.merge else ''}{drawn}"
+
+
+def listing(model: Model, kind: str) -> EnumeratingModel:
+    """The model, if it lists outcomes; else MissingModel."""
+    if not isinstance(model, EnumeratingModel):
+        raise MissingModel(
+            f"the search {kind!r} needs a model that lists its outcomes; {type(model).__name__} does not"
+        )
+    return model
+
+
+def drawing(model: Model, kind: str) -> SamplingModel:
+    """The model, if it draws outcomes; else MissingModel."""
+    if not isinstance(model, SamplingModel):
+        raise MissingModel(f"the search {kind!r} needs a model that draws outcomes; {type(model).__name__} does not")
+    return model

@@ -1,0 +1,176 @@
+"""Lookahead of bounded width: the states on which most rests are unfolded, the critic values the others."""
+
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes, backup
+from pgts_torch.errors import NodeBudgetExceeded, PgtsError
+from pgts_torch.search.lookahead import Leaves, Lookahead, check_states, check_vector
+from pgts_torch.search.topology import Topology, counting
+
+
+@torch.no_grad()
+def pruned(
+    leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_width: int, max_nodes: int
+) -> Lookahead:
+    """(T^m Q)(s, .) at the roots, where at most W states of each level below the roots are unfolded further.
+
+    A level with more states keeps those of the highest priority; the critic's v stands for what follows the others:
+
+        priority(n) = reach(n) (v(n) - min v),     the minimum taken over the states of the level,
+
+    how much of the value of a plan rests on n. reach(n) is the discounted probability with which the plan meets n, from
+    1 at every root: the sum of reach(s) pi(a|s) p gamma over all (s, a) of the level above that lead to n, where
+
+        pi(a|s) ~ exp(-(max_b q1(s, b) - q1(s, a)) / t),     q1 = r + sum p gamma v,     t = mean of max_b q1 - q1
+
+    over all pairs so far. So a state that several paths or roots share counts for each of them, one behind a bad action
+    counts little, and neither the zero nor the unit of rewards matters. Equal priorities: the higher reach first, then
+    the lower state number.
+
+    Optimistic planning (Hren and Munos 2008; Busoniu and Munos 2012) orders by reach(n) (U - v(n)), U an upper bound of
+    values. It may return to what it left; here what is kept for what might be there prunes what is there, and that
+    order is no better than an arbitrary one. Beam search orders by v(n): as good where outcomes are nearly certain,
+    worse for the best value where they spread, and for a batch, of which it serves the roots near high values.
+
+    The batch shares the width: W bounds a level of all roots together, which are always all unfolded. With W at least
+    as large as the largest level the result is that of the full lookahead. pruned is 1 at a pruned state, 0 at the
+    last level and max_a sum p gamma pruned(child) at one that is unfolded. The critic is asked once for each level
+    below the roots; the model at most (roots + W (levels - 1)) A times.
+
+    Args:
+        leaves: the critic, and how many levels are unfolded.
+        topology: what is known of the model; this search adds to it.
+        root_B: states of the model, int64.
+        max_width: W >= 1.
+        max_nodes: the most nodes, summed over levels, pruned ones included.
+
+    Raises:
+        PgtsError: a bad width, roots that are no states, critic values of a wrong shape or not finite.
+        NodeBudgetExceeded: more than `max_nodes` would be needed.
+    """
+    if isinstance(max_width, bool) or not isinstance(max_width, int) or max_width < 1:
+        raise PgtsError(f"max_width is {max_width!r}; it must be a whole number of at least 1")
+    check_vector(root_B)
+    check_states(root_B, topology.model.num_states)
+    calls_before = topology.model_calls
+    roots, row_B = torch.unique(root_B, return_inverse=True)
+    nodes_per_level = [len(roots)]
+    _check_budget(nodes_per_level, max_nodes)
+    if leaves.expansions == 0:
+        q_NA = leaves.q(roots)
+        pruned_NA = torch.zeros_like(q_NA)
+    else:
+        levels, v_C = _unfold(leaves, topology, roots, max_width, max_nodes, nodes_per_level)
+        q_NA, pruned_NA = _fold(levels, v_C)
+    q_BA = q_NA[row_B]
+    return Lookahead(
+        q_BA,
+        stderr_BA=torch.zeros((), dtype=q_BA.dtype, device=q_BA.device).expand(q_BA.shape),
+        pruned_BA=pruned_NA[row_B],
+        model_calls=topology.model_calls - calls_before,
+        critic_calls=leaves.calls,
+        nodes_per_level=tuple(nodes_per_level),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """The N distinct states of one level, of which M are unfolded.
+
+    v_N: the critic's values; those of the unfolded states give way to what is found below them.
+    kept_M: the positions of the unfolded ones among the N.
+    step: outcomes of the M in terms of positions in the next level.
+    """
+
+    v_N: Float[Tensor, "N"]
+    kept_M: Int[Tensor, "M"]
+    step: Outcomes
+
+
+def _unfold(
+    leaves: Leaves, topology: Topology, roots: Tensor, max_width: int, max_nodes: int, nodes_per_level: list[int]
+) -> tuple[list[_Level], Float[Tensor, "C"]]:
+    """The levels from the roots down, and the critic's values below the last of them."""
+    plan = _Plan(roots, topology.model.dtype)
+    frontier, v_N = roots, torch.zeros_like(plan.reach_N)
+    kept_M = _all(roots)
+    levels: list[_Level] = []
+    while len(levels) < leaves.expansions and len(kept_M):
+        step, children = topology.step(frontier[kept_M])
+        levels.append(_Level(v_N, kept_M, step))
+        nodes_per_level.append(len(children))
+        _check_budget(nodes_per_level, max_nodes)
+        v_N = leaves.v(children) if len(children) else v_N[:0]
+        frontier, kept_M = children, _all(children)
+        if len(children) and len(levels) < leaves.expansions:
+            plan.descend(levels[-1], v_N)
+            if len(children) > max_width:
+                kept_M = _highest(plan.reach_N * (v_N / 2 - v_N.amin() / 2), plan.reach_N, max_width)
+    return levels, v_N
+
+
+def _fold(levels: list[_Level], v_C: Float[Tensor, "C"]) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
+    """q of all actions of the roots, and how much of it rests on pruned states."""
+    pruned_C = torch.zeros_like(v_C)
+    for level in reversed(levels):
+        step = level.step
+        if step.num_children == 0:  # everything ends here
+            q_MA, pruned_MA = step.reward_NA, torch.zeros_like(step.reward_NA)
+        else:
+            q_MA = backup(step, v_C)
+            pruned_MA = torch.where(step.reward_NA > -torch.inf, step.expected(pruned_C), 0.0)
+        v_C = level.v_N.index_copy(0, level.kept_M, q_MA.amax(-1))
+        pruned_C = torch.ones_like(v_C).index_copy_(0, level.kept_M, pruned_MA.amax(-1))
+    return q_MA, pruned_MA
+
+
+@final
+class _Plan:
+    """The plan that takes better actions more often, as it meets one level after the other."""
+
+    def __init__(self, roots: Int[Tensor, "N"], dtype: torch.dtype) -> None:
+        self.reach_N: Float[Tensor, "N"] = torch.ones(len(roots), dtype=dtype, device=roots.device)
+        self._mean_regret, self._pairs = torch.zeros((), dtype=dtype, device=roots.device), 0
+
+    def descend(self, level: _Level, v_C: Float[Tensor, "C"]) -> None:
+        """On to the next level, whose states the critic values at v."""
+        step = level.step
+        # Halves, here and in the priority: the difference of the largest numbers is a number still.
+        half_MA = backup(step, v_C) / 2
+        regret_MA = half_MA.amax(-1, keepdim=True) - half_MA
+        self._average(regret_MA[regret_MA.isfinite()])
+        scale = self._mean_regret.clamp(min=torch.finfo(regret_MA.dtype).tiny)
+        flow_MA = torch.softmax(-regret_MA / scale, -1) * self.reach_N[level.kept_M].unsqueeze(-1)
+        weight_MAK = (step.prob_NAK * step.discount_NAK).masked_fill(~counting(step), 0.0)
+        self.reach_N = torch.zeros_like(v_C).scatter_add_(
+            0, step.child_NAK.flatten(), (flow_MA.unsqueeze(-1) * weight_MAK).flatten()
+        )
+
+    def _average(self, regret_P: Float[Tensor, "P"]) -> None:
+        before, self._pairs = self._pairs, self._pairs + len(regret_P)
+        self._mean_regret = self._mean_regret * (before / self._pairs) + (regret_P / self._pairs).sum()
+
+
+def _all(state_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+    return torch.arange(len(state_N), device=state_N.device)
+
+
+def _highest(priority_N: Float[Tensor, "N"], reach_N: Float[Tensor, "N"], count: int) -> Int[Tensor, "M"]:
+    """The positions of the highest priorities, ascending; of equal ones those of higher reach, then the first."""
+    by_reach_N = reach_N.sort(descending=True, stable=True).indices
+    order_N = by_reach_N[priority_N[by_reach_N].sort(descending=True, stable=True).indices]
+    return order_N[:count].sort().values
+
+
+def _check_budget(nodes_per_level: list[int], max_nodes: int) -> None:
+    nodes = sum(nodes_per_level)
+    if nodes > max_nodes:
+        raise NodeBudgetExceeded(
+            f"the lookahead has {nodes} nodes on levels 0 to {len(nodes_per_level) - 1}; max_nodes is {max_nodes}: "
+            "lower the depth or the width, ask for fewer roots or raise the budget"
+        )

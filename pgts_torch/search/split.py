@@ -1,0 +1,129 @@
+"""How simulations are shared among the actions of a node and among the outcomes of an action.
+
+Both follow one principle: as if they were given one by one, without news from those under way.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Rule = Literal["gumbel", "puct", "uct"]
+
+_VISITS, _SCALE = 50.0, 0.1
+"""c_visit and c_scale of sigma, as in mctx."""
+
+_TIE = 1e-8
+"""Values that differ by less than this share of them are ties: rounding must not choose."""
+
+_GRID = 2.0**20
+"""Deficits that are equal in units of 1 / _GRID are ties, for the same reason."""
+
+
+@final
+@dataclass(frozen=True)
+class Selection:
+    """Which actions simulations take.
+
+        gumbel:  pi'(a) (N + b) - N_a,   pi' ~ P exp(sigma(q))   (Danihelka et al. 2022, Sec. 5)
+        puct:    q~(a) + c P(a) sqrt(1 + N) / (1 + N_a)          (Rosin 2011, Silver et al. 2017)
+        uct:     q~(a) + c sqrt(log(1 + N) / (1 + N_a))          (Kocsis and Szepesvari 2006)
+
+    Each simulation takes the action with the largest number and adds to its N_a; with puct and uct also to N, while b
+    is how many there are. q~ is q on the scale on which the values of the actions lie between -1 and 0.
+    """
+
+    rule: Rule
+    exploration: float
+
+    def split(
+        self,
+        budget_N: Float[Tensor, "N"],
+        *,
+        q_NA: Float[Tensor, "N A"],
+        visits_NA: Float[Tensor, "N A"],
+        prior_NA: Float[Tensor, "N A"],
+        shut_NA: Float[Tensor, "N A"],
+        most_NA: Float[Tensor, "N A"] | None,
+    ) -> Float[Tensor, "N A"]:
+        """How many of the simulations of a node each action gets: none where it is shut (-inf), at most `most_NA`."""
+        if self.rule == "gumbel":
+            policy_NA = prior_NA.double() * sigma(q_NA, visits_NA).exp_()
+            policy_NA /= policy_NA.sum(1, keepdim=True).clamp_min_(torch.finfo(torch.float64).tiny)
+            total_N1 = visits_NA.sum(1).add_(budget_N).unsqueeze(1)
+            return apportion(policy_NA.mul_(total_N1).sub_(visits_NA).add_(shut_NA), budget_N, most_NA)
+        limit_NA = None if most_NA is None else visits_NA + most_NA
+        q_NA, given_NA = scaled(q_NA).add_(shut_NA), visits_NA.clone()
+        for given in range(int(budget_N.amax())):
+            total_N1, next_NA = given_NA.sum(1, keepdim=True), given_NA + 1
+            if self.rule == "puct":
+                bonus_NA = (total_N1 + 1).sqrt_() / next_NA * prior_NA
+            else:
+                bonus_NA = (total_N1.log1p() / next_NA).sqrt_()
+            score_NA = bonus_NA.mul_(self.exploration).add_(q_NA)
+            if limit_NA is not None:
+                score_NA.masked_fill_(given_NA >= limit_NA, -torch.inf)
+            best_N1, a_N1 = score_NA.max(1, keepdim=True)
+            takes_N1 = (budget_N > given).unsqueeze(1) & (best_N1 > -torch.inf)
+            given_NA.scatter_add_(1, a_N1, takes_N1.to(given_NA.dtype))
+        return given_NA - visits_NA
+
+
+def sigma(q_NA: Float[Tensor, "N A"], visits_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
+    """(c_visit + max_a N_a) c_scale q~(a): values grow into logits as visits confirm them (Danihelka et al. 2022)."""
+    return scaled(q_NA) * visits_NA.amax(1, keepdim=True).add_(_VISITS).mul_(_SCALE)
+
+
+def scaled(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
+    """Values on the scale on which the best action of a node has 0 and the worst that is allowed -1."""
+    high_N1 = q_NA.amax(1, keepdim=True)
+    low_N1 = q_NA.amin(1, keepdim=True)
+    if not math.isfinite(low_N1.amin()):
+        low_N1 = torch.where(q_NA > -torch.inf, q_NA, high_N1).amin(1, keepdim=True)
+    span_N1 = (high_N1 - low_N1).add_(high_N1.abs(), alpha=_TIE).clamp_min_(torch.finfo(q_NA.dtype).tiny)
+    return (q_NA - high_N1).div_(span_N1)
+
+
+def apportion(
+    deficit_NK: Float[Tensor, "N K"], budget_N: Float[Tensor, "N"], most_NK: Float[Tensor, "N K"] | None = None
+) -> Float[Tensor, "N K"]:
+    """So many units a row, each in turn to the place with the largest deficit, which falls by 1; none to -inf.
+
+    That is water-filling: with the level mu for which sum_k max(0, d_k - mu) = b every place gets the whole part of
+    max(0, d_k - mu), and what is left goes to the largest fractions. mu = max_i (d_(1) + .. + d_(i) - b) / i over the
+    deficits in descending order, as in the projection on a simplex (Held, Wolfe and Crowder 1974).
+
+    Of equal places the first has precedence. b = 1 is the argmax.
+
+    Args:
+        deficit_NK: every row has a place that is not -inf.
+        budget_N: whole numbers.
+        most_NK: the most that a place takes; what no place takes is not handed out.
+    """
+    K = deficit_NK.shape[1]
+    if K == 1:
+        given_NK = budget_N.unsqueeze(1)
+        return given_NK if most_NK is None else given_NK.minimum(most_NK)
+    place_K = torch.arange(K, dtype=deficit_NK.dtype, device=deficit_NK.device)
+    sharp_NK = deficit_NK.mul(_GRID).round_().sub_(place_K, alpha=1 / _GRID).div_(_GRID)
+    if int(budget_N.amax()) == 1:
+        return torch.zeros_like(sharp_NK).scatter_(1, sharp_NK.argmax(1, keepdim=True), budget_N.unsqueeze(1))
+    mu_NK = sharp_NK.sort(1, descending=True).values.cumsum(1).sub_(budget_N.unsqueeze(1)).div_(place_K + 1)
+    filled_NK = sharp_NK.sub_(mu_NK.amax(1, keepdim=True)).clamp_min_(0)
+    given_NK = filled_NK.floor()
+    left_N1 = (budget_N - given_NK.sum(1)).unsqueeze(1)
+    order_NK = filled_NK.sub_(given_NK).sort(1, descending=True).indices
+    given_NK.scatter_add_(1, order_NK, (place_K < left_N1).to(given_NK.dtype))
+    if most_NK is None or not bool((given_NK > most_NK).any()):
+        return given_NK
+    given_NK = given_NK.minimum(most_NK)
+    left_N = budget_N - given_NK.sum(1)
+    free_NK = (deficit_NK > -torch.inf) & (given_NK < most_NK)
+    at_N = ((left_N > 0) & free_NK.any(1)).nonzero().squeeze(1)
+    if len(at_N):
+        rest_NK = (deficit_NK - given_NK).masked_fill_(~free_NK, -torch.inf)
+        given_NK[at_N] += apportion(rest_NK[at_N], left_N[at_N], (most_NK - given_NK)[at_N])
+    return given_NK

@@ -1,0 +1,185 @@
+"""Networks: what they are made of, what they see, and that nothing global is touched."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from pgts_torch.agent import networks
+from pgts_torch.agent.networks import CNN, MLP, Encoder, Network, RunningNorm
+from pgts_torch.errors import PgtsError
+from pgts_torch.seeding import stream
+
+VECTORS = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+STATES = spaces.Discrete(5)
+VIEWS = spaces.Box(0, 255, (7, 7, 3), np.uint8)
+
+
+def network(description, space, *, outputs: int = 2, seed: int = 0) -> Network:
+    generator = stream(seed, "network")
+    return Network(description.trunk(space, generator=generator), outputs, gain=0.5, generator=generator)
+
+
+def views(count: int, seed: int = 0) -> torch.Tensor:
+    return torch.randint(0, 256, (count, 7, 7, 3), generator=stream(seed, "views"), dtype=torch.uint8)
+
+
+def test_an_mlp_is_the_formula_of_its_weights():
+    net = network(MLP(hidden=(4, 6), activation="tanh"), VECTORS)
+    x_ND = torch.randn(5, 3, generator=stream(0, "x"), dtype=torch.float64)
+    weights = [value.double() for value in net.parameters()]
+    h = (x_ND @ weights[0].T + weights[1]).tanh()
+    h = (h @ weights[2].T + weights[3]).tanh()
+    torch.testing.assert_close(net.evaluate(x_ND).double(), h @ weights[4].T + weights[5], atol=1e-5, rtol=0)
+    assert not torch.allclose(
+        network(MLP(hidden=(4, 6), activation="relu"), VECTORS).evaluate(x_ND), net.evaluate(x_ND)
+    )
+
+
+@pytest.mark.parametrize(("description", "space"), [(MLP(), VECTORS), (MLP((8,)), STATES), (CNN(), VIEWS)])
+def test_weights_start_orthogonal_with_gain_sqrt_2_and_the_last_layer_with_its_own(description, space):
+    net = network(description, space)
+    layers = [layer for layer in net.modules() if isinstance(layer, torch.nn.Linear | torch.nn.Conv2d)]
+    for layer, gain in zip(layers, [math.sqrt(2)] * (len(layers) - 1) + [0.5], strict=True):
+        rows = layer.weight.detach().flatten(1)
+        gram = rows @ rows.T if rows.shape[0] <= rows.shape[1] else rows.T @ rows
+        torch.testing.assert_close(gram, gain**2 * torch.eye(len(gram)), atol=1e-5, rtol=0)
+        assert not layer.bias.any()
+
+
+@pytest.mark.parametrize(("description", "space"), [(MLP(), VECTORS), (CNN(), VIEWS)])
+def test_weights_are_drawn_from_the_given_stream_and_torch_s_own_generator_is_left_alone(description, space):
+    before = torch.get_rng_state()
+    first, same, other = (network(description, space, seed=seed).plain_state() for seed in (0, 0, 1))
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(torch.equal(value, same[name]) for name, value in first.items())
+    assert not any(torch.equal(value, other[name]) for name, value in first.items() if name.endswith("weight"))
+
+
+def test_states_are_seen_as_one_hot_rows():
+    net = network(MLP(hidden=()), STATES)
+    output_ND = net.evaluate(torch.tensor([4, 0, 4]))
+    expected_ND = net.head.weight.T[[4, 0, 4]] + net.head.bias
+    torch.testing.assert_close(output_ND, expected_ND.detach())
+    assert torch.equal(net.encode(torch.tensor([2])), torch.tensor([[0.0, 0, 1, 0, 0]]))
+
+
+def test_images_are_scaled_and_their_channels_come_first():
+    image_N = views(2)
+    input_N = network(CNN(), VIEWS).encode(image_N)
+    assert input_N.dtype == torch.float32
+    torch.testing.assert_close(input_N[1, 2, 3, 4], image_N[1, 3, 4, 2] / 255)
+    torch.testing.assert_close(network(CNN(scale=10), VIEWS).encode(image_N), input_N * 25.5)
+    floats = spaces.Box(0, 1, (7, 7, 3), np.float32)
+    assert torch.equal(network(CNN(), floats).encode(image_N / 2).permute(0, 2, 3, 1), image_N / 2)
+
+
+def test_the_default_convolutions_of_a_minigrid_view_leave_4_by_4_by_64():
+    net = network(CNN(), VIEWS)
+    assert net.trunk.layers[:7](net.encode(views(3))).shape == (3, 64 * 4 * 4)
+    assert net.evaluate(views(3)).shape == (3, 2)
+    wide = network(
+        CNN(channels=(8, 8), kernel_size=4, stride=2, hidden=(5,)), spaces.Box(0, 255, (40, 30, 1), np.uint8)
+    )
+    assert wide.trunk.layers[:5](torch.zeros(1, 1, 40, 30)).shape == (1, 8 * 8 * 6)
+
+
+def test_what_a_network_says_of_a_row_does_not_depend_on_how_many_are_asked_at_once(monkeypatch):
+    net, x_ND = network(MLP(), VECTORS), torch.randn(10, 3, generator=stream(0, "x"))
+    whole_ND = net.evaluate(x_ND)
+    monkeypatch.setattr(networks, "_MOST_INPUTS", 3 * 64)
+    torch.testing.assert_close(net.evaluate(x_ND), whole_ND)
+
+
+def test_running_statistics_are_those_of_all_rows_absorbed():
+    norm = RunningNorm(3)
+    x_ND = torch.randn(100, 3, generator=stream(0, "x"), dtype=torch.float64) * torch.tensor([1.0, 50, 1e-3]) + 1e4
+    assert torch.equal(norm(x_ND), x_ND)
+    for piece in x_ND.split([1, 60, 39]):
+        norm.absorb(piece)
+    expected_ND = (x_ND - x_ND.mean(0)) / x_ND.std(0, correction=0)
+    torch.testing.assert_close(norm(x_ND)[:, :2], expected_ND[:, :2])
+    # The third feature moves by a ten-millionth of its size: it is centred and not blown up.
+    assert norm(x_ND)[:, 2].abs().max() < 0.01
+
+
+def test_normalised_observations_are_clipped_at_10():
+    norm = RunningNorm(1)
+    norm.absorb(torch.tensor([[-1.0], [1.0]]))
+    torch.testing.assert_close(norm(torch.tensor([[9.0], [50.0], [-50.0]])).flatten().tolist(), [9.0, 10.0, -10.0])
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_observations_that_are_not_finite_spoil_no_statistics(value):
+    norm = RunningNorm(2)
+    norm.absorb(torch.tensor([[-1.0, 0.0], [1.0, 3.0]]))
+    before = {name: buffer.clone() for name, buffer in norm.named_buffers()}
+    with pytest.raises(PgtsError, match=rf"mean of the observations is \[1.0, {value}\]"):
+        norm.absorb(torch.tensor([[1.0, value]]))
+    assert all(torch.equal(buffer, before[name]) for name, buffer in norm.named_buffers())
+
+
+def test_each_channel_of_an_image_has_statistics_of_its_own():
+    encoder = Encoder(VIEWS, normalize=True)
+    image_N = views(20) // torch.tensor([1, 2, 50], dtype=torch.uint8)
+    encoder.absorb(image_N)
+    input_N = encoder(image_N)
+    torch.testing.assert_close(input_N.mean((0, 2, 3)), torch.zeros(3), atol=1e-4, rtol=0)
+    torch.testing.assert_close(input_N.std((0, 2, 3)), torch.ones(3), atol=1e-3, rtol=0)
+
+
+def test_asking_a_network_changes_no_statistics():
+    net = network(MLP(normalize=True), VECTORS)
+    x_ND = torch.randn(10, 3, generator=stream(0, "x"))
+    before = net.plain_state()
+    net.evaluate(x_ND)
+    assert all(torch.equal(value, before[name]) for name, value in net.plain_state().items())
+    net.trunk.encoder.absorb(x_ND)
+    assert not torch.equal(net.plain_state()["trunk.encoder.norm.mean_D"], before["trunk.encoder.norm.mean_D"])
+
+
+def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_changes_nothing():
+    first, second = (network(MLP(normalize=True), VECTORS, seed=seed) for seed in (0, 1))
+    x_ND = torch.randn(10, 3, generator=stream(0, "x")) * 7
+    first.trunk.encoder.absorb(x_ND)
+    state, before = first.plain_state(), second.plain_state()
+    for wrong in [
+        {},
+        state | {"head.bias": torch.zeros(3)},
+        state | {"more": torch.zeros(1)},
+        {name: value for name, value in state.items() if name != "trunk.encoder.norm.count"},
+    ]:
+        with pytest.raises(PgtsError, match=r"is None|head.bias is \(3,\)|more belongs to another network"):
+            second.take_over(wrong)
+    assert all(torch.equal(value, before[name]) for name, value in second.plain_state().items())
+    second.take_over(state)
+    assert torch.equal(first.evaluate(x_ND), second.evaluate(x_ND))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: MLP(hidden=(64, 0)), r"hidden is \(64, 0\)"),
+        (lambda: MLP(hidden=64), "hidden is 64"),
+        (lambda: MLP(activation="gelu"), "activation is 'gelu'"),
+        (lambda: CNN(channels=[16, 2.5]), r"channels is \[16, 2.5\]"),
+        (lambda: CNN(scale=0), "scale is 0"),
+        (lambda: network(MLP(), VIEWS), "use a cnn"),
+        (lambda: network(CNN(), VECTORS), "use an mlp"),
+        (lambda: network(CNN(kernel_size=5), VIEWS), "too small"),
+        (lambda: network(MLP(normalize=True), STATES), "states are numbers without a scale"),
+        (lambda: network(MLP(), spaces.MultiDiscrete([2, 3])), "observations are MultiDiscrete"),
+        (lambda: network(MLP(), spaces.Discrete(3, start=1)), "observations are Discrete"),
+        (lambda: network(MLP(), VECTORS).evaluate(torch.zeros(2, 4)), r"shape \(4,\); it must be \(3,\)"),
+    ],
+)
+def test_what_no_network_can_be_made_of_or_see_is_refused(make, message):
+    with pytest.raises(PgtsError, match=message):
+        make()
+
+
+def test_lists_of_sizes_are_taken_as_they_stand_in_a_configuration():
+    assert MLP(hidden=[64, 64]) == MLP()
+    assert CNN(channels=[16, 32, 64], hidden=[128]) == CNN()

@@ -1,0 +1,277 @@
+"""Policies and critics of networks: what they answer, what they learn, and that they can be taken up again."""
+
+import math
+
+import pytest
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from pgts_torch.agent import saving
+from pgts_torch.agent.advantages import gae, score_function
+from pgts_torch.agent.critics import MonteCarlo, TDLambda
+from pgts_torch.agent.networks import CNN, MLP
+from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.neural_updates import GradientUpdate
+from pgts_torch.agent.policies import SimplexPolicy
+from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Rollout
+from pgts_torch.errors import PgtsError
+from pgts_torch.seeding import stream
+from pgts_torch.tabular import exact, random_mdp
+from tests.agent.helpers import experience, following
+from tests.support import random_policy
+
+VECTORS = spaces.Box(-math.inf, math.inf, (3,))
+STATES = spaces.Discrete(6)
+MDP = random_mdp(6, 2, gamma=0.5, start=None)
+POINTS_SD = torch.randn(7, 3, generator=stream(0, "points"))
+
+
+def by_hand(reward: float = 1.0, observe=lambda state_N: state_N) -> Rollout:
+    """Three episodes of rewards 1, 2, 4 (times `reward`) with discounts 0.5: the first is cut after three steps, the
+    second terminates in its third, the third is cut after two. States 0, 1, 2, 3 follow each other."""
+    column = reward * torch.tensor([[1.0], [2.0], [4.0]], dtype=torch.float64).expand(3, 3)
+    discount_TB = torch.full((3, 3), 0.5, dtype=torch.float64)
+    discount_TB[2, 1] = 0.0
+    alive_TB = torch.tensor([[1, 1, 1], [1, 1, 1], [1, 1, 0]], dtype=torch.bool)
+    survival_TB = torch.tensor([[1, 1, 1], [1, 1, 0], [1, 0, 0]], dtype=torch.float64)
+    state_TB = torch.arange(3)[:, None].expand(3, 3)
+    return Rollout(
+        state_TB, state_TB % 2, column, discount_TB, state_TB + 1, alive_TB, column, survival_TB, observe=observe
+    )
+
+
+def tabular_critic(value_S: list[float] | Tensor, **options) -> NetworkCritic:
+    """A critic whose v or Q is a table, with these entries."""
+    value_SD = torch.as_tensor(value_S, dtype=torch.float32)
+    critic = NetworkCritic(spaces.Discrete(len(value_SD)), 2, network=MLP(hidden=()), **options)
+    weight_DS = value_SD.reshape(len(value_SD), -1).T
+    critic.network.take_over({"head.weight": weight_DS, "head.bias": torch.zeros(len(weight_DS))})
+    return critic
+
+
+def test_a_policy_is_the_softmax_of_its_network_and_nearly_uniform_at_first():
+    policy = NetworkPolicy(VECTORS, 5, seed=1)
+    probs_NA = policy.probs(POINTS_SD)
+    assert probs_NA.dtype == torch.float32
+    assert not probs_NA.requires_grad
+    torch.testing.assert_close(probs_NA, policy.network(POINTS_SD).softmax(-1).detach())
+    torch.testing.assert_close(probs_NA, torch.full((7, 5), 0.2), atol=0.02, rtol=0)
+    assert (probs_NA != 0.2).any()
+
+
+def test_a_policy_starts_from_its_seed_alone_and_torch_s_own_generator_is_left_alone():
+    before = torch.get_rng_state()
+    first, same, other = (NetworkPolicy(VECTORS, 5, seed=seed) for seed in (1, 1, 2))
+    critic = NetworkCritic(VECTORS, 5, seed=1)
+    critic.fit(first, by_hand(observe=POINTS_SD.__getitem__), generator=stream(0, "critic"))
+    first.sample(POINTS_SD, generator=stream(0, "sample"))
+    assert torch.equal(torch.get_rng_state(), before)
+    assert torch.equal(first.probs(POINTS_SD), same.probs(POINTS_SD))
+    assert not torch.equal(first.probs(POINTS_SD), other.probs(POINTS_SD))
+
+
+def test_a_policy_survives_the_round_trip_through_a_file(tmp_path):
+    policy, other = (NetworkPolicy(VECTORS, 5, network=MLP((8,), normalize=True), seed=seed) for seed in (1, 2))
+    policy.network.trunk.encoder.absorb(100 * POINTS_SD)
+    saving.write(tmp_path / "policy", policy.state_dict())
+    other.load_state_dict(saving.read(tmp_path / "policy"))
+    assert torch.equal(policy.probs(POINTS_SD), other.probs(POINTS_SD))
+    with pytest.raises(PgtsError, match=r"head.weight is \(5, 8\)"):
+        NetworkPolicy(VECTORS, 4, network=MLP((8,), normalize=True)).load_state_dict(policy.state_dict())
+
+
+@pytest.mark.parametrize("horizon", [FixedHorizon(3), GeometricHorizon()])
+@pytest.mark.parametrize("method", [MonteCarlo(), TDLambda(0.9)])
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_a_critic_converges_to_the_values_of_a_policy_that_stands_still(target, method, horizon):
+    # A fit sees about 1300 targets in each state, 330 or more for each action, of a spread of about 0.8: the tolerances
+    # are 4 standard errors; of all 72 comparisons one would fail with probability 0.005.
+    pi_SA = (random_policy(MDP, seed=1) + 0.5) / 2
+    critic = NetworkCritic(
+        STATES, 2, network=MLP(hidden=()), target=target, method=method, learning_rate=0.03, minibatch_size=1024
+    )
+    losses = []
+    for seed in range(8):
+        made = experience(MDP, pi_SA, horizon, episodes=4000, seed=seed)
+        losses.append(critic.fit(following(pi_SA), made, generator=stream(seed, "critic")))
+    truth, states = exact.evaluate(MDP, pi_SA), torch.arange(6)
+    torch.testing.assert_close(critic.v(states).double(), truth.v_S, atol=0.09, rtol=0)
+    if target == "q":
+        torch.testing.assert_close(critic.q(states).double(), truth.q_SA, atol=0.18, rtol=0)
+    assert losses[-1]["value"] < losses[0]["value"]
+    assert losses[-1]["explained_variance"] > 0.05 > losses[0]["explained_variance"]
+    assert (truth.v_S - truth.v_S.mean()).abs().max() > 0.25
+    assert (truth.q_SA - truth.v_S[:, None]).abs().max() > 0.25
+
+
+@pytest.mark.parametrize(
+    ("method", "expected"),
+    [
+        # v(s_{t+1}) is 10: r + 5, and r alone where the episode terminated. The third episode was over in state 2.
+        (TDLambda(0.0), [6.0, 7.0, 9.0, 4.0]),
+        # With a survival of 1: all rewards, and 10 where the first episode was cut.
+        (MonteCarlo(), [17.0, 16.0, 14.0, 4.0]),
+    ],
+)
+def test_what_was_cut_is_bootstrapped_and_what_terminated_is_not(method, expected):
+    made = by_hand()
+    target_TB = tabular_critic([10.0] * 4, method=method)._targets(made)
+    torch.testing.assert_close([*target_TB[:, 0].tolist(), float(target_TB[2, 1])], expected)
+    blind_TB = tabular_critic([0.0] * 4, method=method)._targets(made)
+    assert blind_TB[2, 1] == target_TB[2, 1]
+    assert blind_TB[2, 0] != target_TB[2, 0]
+
+
+@pytest.mark.parametrize("lambda_", [0.0, 0.7, 1.0])
+def test_generalised_advantages_follow_their_own_recursion(lambda_):
+    made = by_hand()
+    v_S = torch.tensor([3.0, -1.0, 5.0, 10.0], dtype=torch.float64)
+    v_TB, next_v_TB = v_S[made.state_TB], v_S[made.next_state_TB]
+    advantage_TB = gae(made, v_TB, next_v_TB, lambda_)
+    for b, (length, ended) in enumerate([(3, False), (3, True), (2, False)]):
+        following_advantage = 0.0
+        for t in reversed(range(length)):
+            discount = 0.0 if ended and t == length - 1 else 0.5
+            delta = float(made.reward_TB[t, b]) + discount * float(v_S[t + 1]) - float(v_S[t])
+            following_advantage = delta + discount * lambda_ * following_advantage
+            assert float(advantage_TB[t, b]) == pytest.approx(following_advantage), (t, b)
+
+
+def test_generalised_advantages_are_those_computed_by_hand():
+    made = by_hand()
+    zero_TB, ten_TB = torch.zeros(3, 3, dtype=torch.float64), torch.full((3, 3), 10.0, dtype=torch.float64)
+    # lambda = 1 and v = 10: all rewards and 10 where the episode was cut, less 10.
+    expected = [1 + 0.5 * (2 + 0.5 * 9) - 10, 1 + 0.5 * (2 + 0.5 * 4) - 10, 4.5 - 10]
+    torch.testing.assert_close(gae(made, ten_TB, ten_TB, 1.0)[0].tolist(), expected)
+    torch.testing.assert_close(gae(made, zero_TB, zero_TB, 0.0), made.reward_TB)
+
+
+def test_the_estimate_from_one_action_has_the_mean_of_the_advantages_of_all():
+    pi_NA, advantage_NA = torch.tensor([[0.2, 0.5, 0.3]]), torch.tensor([[1.0, -2.0, 4.0]], dtype=torch.float64)
+    mean_NA = sum(float(pi_NA[0, a]) * score_function(torch.tensor([a]), advantage_NA[:, a], pi_NA) for a in range(3))
+    torch.testing.assert_close(mean_NA, advantage_NA)
+
+
+def test_only_actions_that_were_taken_are_learned():
+    critic = tabular_critic(torch.zeros(4, 2), target="q", learning_rate=0.1, normalize_returns=False)
+    before_SA = critic.q(torch.arange(4))
+    critic.fit(following(torch.full((4, 2), 0.5, dtype=torch.float64)), by_hand(), generator=stream(0, "critic"))
+    # States 0, 1, 2 with the actions 0, 1, 0; a bias of its own goes with each action.
+    step_SA = critic.q(torch.arange(4)) - before_SA - critic.network.head.bias.detach()
+    assert (step_SA != 0).tolist() == [[True, False], [False, True], [True, False], [False, False]]
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_values_are_in_reward_units_whatever_the_unit_is(unit):
+    # v of a tabular network after the same fits, but for float32.
+    values = []
+    for scale in (1.0, unit):
+        critic = tabular_critic([0.0] * 4, learning_rate=0.02, num_epochs=30, method=TDLambda(0.0))
+        for k in range(10):
+            critic.fit(following(torch.ones(4, 2) / 2), by_hand(scale), generator=stream(k, "critic"))
+        values.append(critic.v(torch.arange(3)) / scale)
+    torch.testing.assert_close(values[1], values[0], rtol=0.01, atol=0.01)
+    assert values[0][1] > 1
+
+
+def test_a_new_scale_of_the_targets_leaves_learned_values_where_they_were():
+    critic = NetworkCritic(VECTORS, 2, seed=1, polyak=0.5)
+    critic.fit(following(torch.ones(4, 2) / 2), by_hand(observe=POINTS_SD.__getitem__), generator=stream(0, "c"))
+    before_N, lagging_N = critic.v(POINTS_SD), critic._v(critic._target_network, POINTS_SD)
+    before = critic._mean, critic._scale
+    critic._rescale(torch.tensor([1000.0, 3000.0]))
+    assert critic._mean == pytest.approx((before[0] + 2000) / 2)
+    assert critic._scale > 100 * before[1]
+    torch.testing.assert_close(critic.v(POINTS_SD), before_N, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(critic._v(critic._target_network, POINTS_SD), lagging_N, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("polyak", "target_period"), [(0.25, 1), (1.0, 2), (0.25, 3)])
+def test_a_target_network_lags_behind(polyak, target_period):
+    options = {"polyak": polyak, "target_period": target_period, "normalize_returns": False}
+    critic = tabular_critic([0.0] * 4, learning_rate=0.1, **options)
+    critic._target_network.take_over(critic.network.plain_state())
+    lagging_S, states = critic.v(torch.arange(4)), torch.arange(4)
+    for k in range(1, 7):
+        critic.fit(following(torch.ones(4, 2) / 2), by_hand(), generator=stream(k, "critic"))
+        if k % target_period == 0:
+            lagging_S = lagging_S + polyak * (critic.v(states) - lagging_S)
+        torch.testing.assert_close(critic._v(critic._target_network, states), lagging_S)
+    assert not torch.allclose(lagging_S, torch.zeros(4))
+
+
+def test_a_policy_and_a_critic_can_share_a_trunk():
+    space = spaces.Box(0, 255, (7, 7, 3))
+    policy = NetworkPolicy(space, 2, network=CNN(normalize=True, hidden=(16,)))
+    critic = NetworkCritic(space, 2, network=policy.network.trunk)
+    alone = NetworkCritic(space, 2, network=CNN(normalize=True, hidden=(16,)))
+    images_S = torch.randint(0, 256, (4, 7, 7, 3), generator=stream(0, "images")).float()
+    made, states = by_hand(observe=images_S.__getitem__), torch.arange(3)
+    generator, encoder = stream(0, "test"), policy.network.trunk.encoder
+    update = GradientUpdate()
+    for k in range(2):
+        before_NA = policy.probs(images_S)
+        for each in (critic, alone):
+            each.fit(policy, made, generator=generator)
+        assert not torch.equal(policy.probs(images_S), before_NA)
+        # 49 places a picture: the first 8 visits are seen at once by whoever comes first, later ones by the policy.
+        assert float(encoder.norm.count) == 49 * (8 + 3 * k)
+        assert float(alone.network.trunk.encoder.norm.count) == 49 * 8 * (k + 1)
+        update(policy, images_S[states], torch.zeros(3, 2), torch.ones(3), generator=generator)
+    before_S = alone.v(images_S)
+    update(policy, images_S[states], torch.eye(3)[:, :2], torch.ones(3), generator=generator)
+    assert torch.equal(alone.v(images_S), before_S)
+
+
+@pytest.mark.parametrize(("target", "polyak"), [("v", 1.0), ("q", 0.5)])
+def test_a_saved_critic_goes_on_bit_for_bit(target, polyak, tmp_path):
+    options = {"network": MLP((8,), normalize=True), "target": target, "polyak": polyak}
+    critics = [NetworkCritic(VECTORS, 2, seed=seed, **options) for seed in (1, 2)]
+    made, policy = by_hand(observe=POINTS_SD.__getitem__), NetworkPolicy(VECTORS, 2)
+    critics[0].fit(policy, made, generator=stream(0, "critic"))
+    saving.write(tmp_path / "critic", critics[0].state_dict())
+    critics[1].load_state_dict(saving.read(tmp_path / "critic"))
+    for k in range(3):
+        losses = [critic.fit(policy, made, generator=stream(k, "critic")) for critic in critics]
+        assert losses[0] == losses[1]
+    assert torch.equal(critics[0].v(POINTS_SD), critics[1].v(POINTS_SD))
+    assert not torch.equal(critics[0].v(POINTS_SD), NetworkCritic(VECTORS, 2, target="v", seed=1).v(POINTS_SD))
+    with pytest.raises(PgtsError, match="the state of a network critic has"):
+        critics[0].load_state_dict({"network": critics[0].state_dict()["network"]})
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_targets_that_are_not_finite_teach_nothing(value):
+    critic, made = tabular_critic([1.0, 2.0, 3.0, 4.0]), by_hand()
+    made.reward_TB.data = made.reward_TB.clone()
+    made.reward_TB[1, 1] = value
+    before = critic.state_dict()["network"]
+    with pytest.raises(PgtsError, match="a target of the critic is not finite"):
+        critic.fit(following(torch.ones(4, 2) / 2), made, generator=stream(0, "critic"))
+    assert torch.equal(critic.state_dict()["network"]["head.weight"], before["head.weight"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"target": "u"}, "target is 'u'"),
+        ({"polyak": 0.0}, "polyak is 0.0"),
+        ({"target_period": 0}, "target_period is 0"),
+        ({"num_epochs": 0}, "num_epochs is 0"),
+        ({"minibatch_size": 0}, "minibatch_size is 0"),
+        ({"learning_rate": -1.0}, "learning_rate is -1.0"),
+        ({"max_grad_norm": 0.0}, "max_grad_norm is 0.0"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(PgtsError, match=message):
+        NetworkCritic(VECTORS, 2, **options)
+
+
+def test_a_critic_that_lacks_what_it_is_asked_for_says_so():
+    with pytest.raises(PgtsError, match="learns v"):
+        NetworkCritic(VECTORS, 2).q(POINTS_SD)
+    with pytest.raises(PgtsError, match="no policy yet"):
+        NetworkCritic(VECTORS, 2, target="q").v(POINTS_SD)
+    assert isinstance(following(torch.ones(2, 2) / 2), SimplexPolicy)

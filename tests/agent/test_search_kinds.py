@@ -1,0 +1,79 @@
+"""Every kind of search serves the algorithm."""
+
+import math
+
+import pytest
+import torch
+
+from pgts_torch import PGTS
+from pgts_torch.errors import PgtsError
+from pgts_torch.tabular import exact
+
+LEFT = {"type": "softmax", "init": {"type": "biased", "action": 0, "probability": 0.99}}
+SEARCHES = [
+    "auto",
+    {"type": "expectimax", "max_width": 3},
+    {"type": "sampled", "samples": 2},
+    {"type": "mcts", "simulations": 12, "merge": False},
+]
+
+
+def trained(search, depth: int) -> float:
+    model = PGTS(
+        "pgts/Ladder-v0",
+        depth=depth,
+        search=search,
+        policy=LEFT,
+        critic="exact",
+        update={"type": "softmax", "step_size": 3.0},
+        num_envs=8,
+    ).learn(20_000)
+    return exact.evaluate(model.mdp, model.policy.table()).J / exact.optimal(model.mdp).J
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=str)
+def test_every_search_climbs_the_ladder_that_a_shallow_one_cannot(search):
+    assert trained(search, 4) > 0.95
+    assert trained(search, 2) < 0.05
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=str)
+def test_a_lookahead_does_not_depend_on_what_was_looked_at_before(search):
+    model = PGTS("pgts/Random-v0", depth=2, search=search, num_envs=4, seed=3)
+    model.iterate()
+    first = model.lookahead(torch.tensor([0, 3])).q_BA
+    model.lookahead(torch.tensor([1, 2, 4]), depth=1)
+    torch.testing.assert_close(model.lookahead(torch.tensor([0, 3])).q_BA, first, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=str)
+def test_a_model_is_saved_with_its_search_and_trains_on_alike(search, tmp_path):
+    made = PGTS("pgts/Random-v0", depth=2, search=search, num_envs=4, seed=3)
+    made.iterate()
+    made.save(tmp_path / "model.pt")
+    loaded = PGTS.load(tmp_path / "model.pt")
+    torch.testing.assert_close(loaded.iterate().look.q_BA, made.iterate().look.q_BA, rtol=0, atol=0)
+
+
+def test_samples_prove_nothing_but_a_narrow_search_does():
+    def certificate(search) -> float:
+        return PGTS("pgts/Ladder-v0", depth=6, search=search, policy=LEFT, critic="exact").iterate().certificate
+
+    full, narrow = certificate("expectimax"), certificate({"type": "expectimax", "max_width": 1})
+    mdp = PGTS("pgts/Ladder-v0", policy=LEFT).mdp
+    missing = exact.optimal(mdp).J - exact.evaluate(mdp, PGTS("pgts/Ladder-v0", policy=LEFT).policy.table()).J
+    assert missing <= full <= narrow < math.inf
+    assert certificate("sampled") == math.inf
+
+
+@pytest.mark.parametrize(
+    ("search", "message"),
+    [
+        ("breadth", "search is 'breadth'; it must be one of auto, expectimax, sampled, mcts"),
+        ({"type": "auto", "max_width": 3}, "search 'auto' does not take these options: \\['max_width'\\]"),
+        ({"type": "mcts", "samples": 3}, "search 'mcts' does not take"),
+    ],
+)
+def test_a_search_that_does_not_exist_or_an_option_that_it_does_not_heed_is_refused(search, message):
+    with pytest.raises(PgtsError, match=message):
+        PGTS("pgts/Ladder-v0", search=search)

@@ -1,0 +1,364 @@
+"""A simulator as a model: the truth of tables where there are some, each question asked once, chance in the keys."""
+
+import copy
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import scipy.stats
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models import SimulatorModel, TabularModel
+from pgts_torch.models.environments import all_actions, grid_actions, make_env, sampled_actions
+from pgts_torch.models.snapshots import generator_state
+from pgts_torch.search import Topology, expectimax, sampled
+from pgts_torch.seeding import draw_keys, stream
+from pgts_torch.tabular import TabularMDP, exact
+from tests.models.corridors import Bare, Broken, Corridor
+from tests.support import outcomes_of
+
+DRAWS = 400
+FALSE_ALARM = 1e-6
+"""Probability with which a right model fails a test of frequencies, had its seed not been fixed."""
+
+
+def standing_in(id: str, state: int, **kwargs: Any) -> gymnasium.Env:
+    env = gymnasium.make(id, **kwargs)
+    env.reset(seed=0)
+    env.unwrapped.s = state
+    return env
+
+
+def table_of(env: gymnasium.Env, gamma: float) -> TabularMDP:
+    return TabularMDP.from_gymnasium(env, gamma)
+
+
+def every_state(id: str, model: SimulatorModel, count: int) -> Tensor:
+    """The model's numbers of the environment's states 0, 1, 2, ..."""
+    return model.roots([standing_in(id, s) for s in range(count)], range(count))
+
+
+def zeros(state_N: Tensor) -> Tensor:
+    return torch.zeros(len(state_N), dtype=torch.float64)
+
+
+def keys(count: int, seed: int = 0) -> Tensor:
+    return draw_keys(count, generator=stream(seed, "keys"))
+
+
+# The truth
+
+
+@pytest.mark.parametrize(("id", "states"), [("CliffWalking-v1", [36, 24, 13, 0, 35]), ("Taxi-v4", [1, 123, 328, 499])])
+@pytest.mark.parametrize("depth", [0, 3, 4])
+def test_expectimax_sees_in_a_simulator_what_it_sees_in_the_table(id, states, depth):
+    env = gymnasium.make(id)
+    truth = TabularModel(table_of(env, 0.9))
+    model = SimulatorModel(id, gamma=0.9)
+    root_B = model.roots([standing_in(id, s) for s in states])
+    seen = expectimax(model, root_B, depth=depth, v_leaf=zeros)
+    expected = expectimax(truth, torch.tensor(states), depth=depth, v_leaf=zeros)
+    torch.testing.assert_close(seen.q_BA, expected.q_BA, rtol=1e-12, atol=1e-12)
+    assert seen.nodes_per_level == expected.nodes_per_level  # it merges what the table merges
+    other = expectimax(truth, torch.tensor(states), depth=depth + 1, v_leaf=zeros)
+    assert not torch.allclose(other.q_BA, expected.q_BA)
+
+
+def test_a_search_without_end_meets_each_state_of_the_cliff_once():
+    model = SimulatorModel("CliffWalking-v1", gamma=0.9)
+    env = gymnasium.make("CliffWalking-v1")
+    observation, _ = env.reset()
+    expectimax(model, model.roots([env], [observation]), depth=60, v_leaf=zeros)
+    assert model.num_states == 48 - 10  # nobody stands on the cliff
+    states = model.observations(torch.arange(model.num_states)).tolist()
+    assert sorted(states) == [*range(37), 47]
+
+
+def test_drawn_outcomes_have_the_frequencies_of_the_table():
+    id = "FrozenLake-v1"
+    mdp, model = table_of(gymnasium.make(id), 0.9), SimulatorModel(id, gamma=0.9)
+    number_S = every_state(id, model, 16)
+    statistic, freedom = 0.0, 0
+    for s, a in [(0, 0), (6, 2), (14, 2), (14, 1), (10, 3)]:
+        drawn = model.sample(number_S[s].expand(DRAWS), torch.full((DRAWS,), a), key_N=keys(DRAWS, 16 * a + s))
+        seen = list(zip(model.observations(drawn.next_state_N).tolist(), drawn.discount_N.tolist(), strict=True))
+        expected = outcomes_of(mdp, s, a)
+        assert set(seen) <= set(expected)
+        statistic += sum((seen.count(what) - DRAWS * p) ** 2 / (DRAWS * p) for what, p in expected.items())
+        freedom += len(expected) - 1
+    assert scipy.stats.chi2.sf(statistic, freedom) > FALSE_ALARM
+
+
+def test_a_plan_over_sampled_outcomes_is_not_clairvoyant_while_one_outcome_each_would_be():
+    # The best policy is out of the lake in 9 steps with probability 0.029. Ten outcomes each leave an optimistic bias.
+    env = reset(gymnasium.make("FrozenLake-v1"), 0)
+    mdp = table_of(env, 1.0)
+    best = exact.lookahead(mdp, mdp.outcomes.reward_NA, 8)[0].max().item()
+    seen = {}
+    for samples in (1, 10):
+        model = SimulatorModel("FrozenLake-v1", gamma=1.0)
+        look = sampled(
+            model,
+            model.roots([env]),
+            depth=8,
+            v_leaf=zeros,
+            samples=samples,
+            generator=stream(0, "plan"),
+            share="level",
+        )
+        seen[samples] = look.q_BA.max().item()
+    assert best == pytest.approx(0.0293, abs=1e-4)
+    assert best / 2 < seen[10] < 0.15
+    assert seen[1] == 1
+
+
+def test_truncation_keeps_the_discount_and_termination_ends_it():
+    pytest.importorskip("minigrid")
+    model = SimulatorModel("MiniGrid-Empty-5x5-v0", gamma=0.9)
+    env = make_env("MiniGrid-Empty-5x5-v0")
+    env.reset(seed=0)
+    env.unwrapped.step_count = env.unwrapped.max_steps - 1
+    late = model.outcomes(model.roots([env]))
+    assert late.discount_NAK.flatten().tolist() == [0.9] * 7
+    end = SimulatorModel(lambda: Corridor(slip=0.0), gamma=0.9)
+    corridor = Corridor()
+    corridor.reset(seed=0)
+    corridor.position = 3
+    assert end.outcomes(end.roots([corridor])).discount_NAK.flatten().tolist() == [0.9, 0.0]
+
+
+# Calls
+
+
+def test_a_search_asks_the_simulator_once_for_each_state_and_action():
+    model = SimulatorModel("CliffWalking-v1", gamma=0.9)
+    root_B = model.roots([standing_in("CliffWalking-v1", 36), standing_in("CliffWalking-v1", 36)])
+    topology = Topology(model)
+    first = expectimax(model, root_B, depth=4, v_leaf=zeros, topology=topology)
+    assert model.simulator_steps == first.model_calls < first.nodes * 4
+    again = expectimax(model, root_B, depth=4, v_leaf=zeros, topology=topology)
+    fresh = expectimax(model, root_B, depth=4, v_leaf=zeros)
+    assert (again.model_calls, fresh.model_calls) == (0, first.model_calls)
+    assert model.simulator_steps == first.model_calls  # what is sure is remembered by the model itself
+    state_N, action_N = torch.zeros(9, dtype=torch.int64), torch.zeros(9, dtype=torch.int64)
+    model.sample(state_N, action_N, key_N=keys(9))
+    assert model.simulator_steps == first.model_calls
+
+
+def test_what_chance_decides_is_asked_for_every_key():
+    model = SimulatorModel(Corridor, gamma=0.9)
+    root = model.root(reset(Corridor(), 0))
+    model.sample(torch.full((50,), root), torch.ones(50, dtype=torch.int64), key_N=keys(50))
+    assert model.simulator_steps == 50
+    assert model.num_states == 3  # where it began, and one step to either side
+
+
+def reset(env: gymnasium.Env, seed: int) -> gymnasium.Env:
+    env.reset(seed=seed)
+    return env
+
+
+@pytest.mark.parametrize("id", ["FrozenLake-v1", "CartPole-v1", "Blackjack-v1"])
+def test_an_outcome_is_a_function_of_state_action_and_key_alone(id):
+    model, other = SimulatorModel(id, gamma=0.9), SimulatorModel(id, gamma=0.9)
+    global_before = np.random.get_state()[1].copy(), torch.get_rng_state()  # noqa: NPY002
+    envs = [reset(gymnasium.make(id), seed) for seed in range(6)]
+    state_N, action_N, key_N = model.roots(envs).repeat(4), torch.arange(24) % model.num_actions, keys(24)
+    drawn = model.sample(state_N, action_N, key_N=key_N)
+    order_N = torch.randperm(24, generator=stream(0, "order"))
+    reordered = other.sample(other.roots(envs).repeat(4)[order_N], action_N[order_N], key_N=key_N[order_N])
+    assert torch.equal(reordered.reward_N, drawn.reward_N[order_N])
+    assert np.array_equal(
+        other.observations(reordered.next_state_N), model.observations(drawn.next_state_N)[order_N.numpy()]
+    )
+    if id != "CartPole-v1":
+        assert not torch.equal(model.sample(state_N, action_N, key_N=keys(24, 1)).next_state_N, drawn.next_state_N)
+    assert np.array_equal(np.random.get_state()[1], global_before[0])  # noqa: NPY002
+    assert torch.equal(torch.get_rng_state(), global_before[1])
+
+
+@pytest.mark.parametrize("id", ["FrozenLake-v1", "Taxi-v4", "Acrobot-v1"])
+def test_a_search_leaves_the_environment_it_starts_from_bit_identical(id, monkeypatch):
+    env, twin = reset(gymnasium.make(id), 3), reset(gymnasium.make(id), 3)
+    before = generator_state(env.unwrapped), repr(vars(env.unwrapped))
+    model = SimulatorModel(id, gamma=0.9)
+    monkeypatch.setattr(copy, "deepcopy", lambda *_: pytest.fail("deepcopy"))
+    sampled(model, model.roots([env]), depth=2, v_leaf=zeros, samples=2, generator=stream(0, "search"))
+    assert model.simulator_steps > 10
+    assert (generator_state(env.unwrapped), repr(vars(env.unwrapped))) == before
+    for action in [0, 1, 2, 1, 0, 2]:
+        (seen, *rest), (expected, *other) = env.step(action), twin.step(action)
+        assert np.array_equal(seen, expected)
+        assert rest[:3] == other[:3]
+
+
+# Observations, forgetting, devices
+
+
+def test_observations_are_those_of_the_environment_and_wait_for_those_of_roots():
+    model = SimulatorModel("CartPole-v1", gamma=0.9)
+    env = gymnasium.make("CartPole-v1")
+    observation, _ = env.reset(seed=2)
+    root_B = model.roots([env])
+    with pytest.raises(PgtsError, match="CartPole-v1: the observation of state 0 was not given"):
+        model.observations(root_B)
+    assert torch.equal(model.roots([env], [observation]), root_B)
+    child = int(model.outcomes(root_B).child_NAK[0, 1, 0])
+    after, *_ = env.step(1)
+    seen = model.observations(torch.tensor([0, child]))
+    assert seen.dtype == np.float32
+    assert np.array_equal(seen, np.stack([observation, after]))
+    assert model.root(env) == child
+
+
+def test_observe_decides_what_is_remembered():
+    pytest.importorskip("minigrid")
+    model = SimulatorModel("MiniGrid-Empty-5x5-v0", gamma=0.9, observe=lambda seen: seen["image"])
+    env = make_env("MiniGrid-Empty-5x5-v0")
+    observation, _ = env.reset(seed=0)
+    model.outcomes(model.roots([env], [observation]))
+    assert model.observations(torch.arange(3)).shape == (3, 7, 7, 3)
+    whole = SimulatorModel("MiniGrid-Empty-5x5-v0", gamma=0.9)
+    with pytest.raises(PgtsError, match="cannot be flattened: give `observe`"):
+        whole.observations(whole.roots([env], [observation]))
+    cards = SimulatorModel("Blackjack-v1", gamma=1.0)
+    assert cards.observations(cards.roots([reset(gymnasium.make("Blackjack-v1"), 0)], [(12, 3, 0)])).shape == (1, 45)
+
+
+def test_a_model_forgets_on_request_and_says_so():
+    model = SimulatorModel("CliffWalking-v1", gamma=0.9)
+    root_B = model.roots([standing_in("CliffWalking-v1", 36)])
+    topology = Topology(model)
+    expectimax(model, root_B, depth=2, v_leaf=zeros, topology=topology)
+    assert model.num_states > 4
+    model.clear()
+    assert (model.num_states, model.generation) == (0, 1)
+    assert model.roots([standing_in("CliffWalking-v1", 3)]).tolist() == [0]
+    with pytest.raises(PgtsError):
+        expectimax(model, root_B, depth=2, v_leaf=zeros, topology=topology)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_model_speaks_its_dtype_and_keeps_the_bound_it_is_given(dtype):
+    model = SimulatorModel("CliffWalking-v1", gamma=0.9, dtype=dtype, highest_value=0.0)
+    root_B = model.roots([standing_in("CliffWalking-v1", 36)])
+    answer, drawn = model.outcomes(root_B), model.sample(root_B, root_B, key_N=keys(1))
+    for tensor in (answer.reward_NA, answer.prob_NAK, answer.discount_NAK, drawn.reward_N, drawn.discount_N):
+        assert tensor.dtype == model.dtype == dtype
+    assert (model.highest_value, SimulatorModel(Corridor, gamma=1.0).highest_value) == (0.0, math.inf)
+
+
+# Actions
+
+
+def test_actions_are_all_of_a_discrete_space_in_its_own_numbers():
+    assert SimulatorModel(Corridor, gamma=1.0).actions == [5, 6]
+    several = list(all_actions(spaces.MultiDiscrete([2, 3], start=[1, 0])))
+    assert [action.tolist() for action in several] == [[1, 0], [1, 1], [1, 2], [2, 0], [2, 1], [2, 2]]
+
+
+def test_continuous_actions_are_a_grid_or_a_sample():
+    space = spaces.Box(np.float32([-1, 0]), np.float32([1, 4]))
+    grid = grid_actions(space, 3)
+    assert [action.tolist() for action in grid[:4]] == [[-1, 0], [-1, 2], [-1, 4], [0, 0]]
+    assert len(grid) == 9
+    assert all(action in space for action in grid)
+    drawn = sampled_actions(space, 7, seed=1)
+    assert len(drawn) == 7
+    assert all(action in space for action in drawn)
+    assert np.array_equal(sampled_actions(space, 7, seed=1), drawn)
+    assert not np.array_equal(sampled_actions(space, 7, seed=2), drawn)
+    model = SimulatorModel("Pendulum-v1", gamma=0.9, actions=grid_actions(spaces.Box(-2, 2, (1,)), 5))
+    env = reset(gymnasium.make("Pendulum-v1"), 0)
+    reward_A = model.outcomes(model.roots([env])).reward_NA[0]
+    assert reward_A[4].item() == env.step(np.float32([2.0]))[1]
+
+
+# Refusals
+
+
+def slippery() -> SimulatorModel:
+    model = SimulatorModel("FrozenLake-v1", gamma=0.9)
+    model.roots([standing_in("FrozenLake-v1", 0)])
+    return model
+
+
+ZERO = torch.zeros(1, dtype=torch.int64)
+REFUSALS = {
+    "FrozenLake-v1 is random in state 0 under action 0: its outcomes cannot be listed; search it by `sampled`": (
+        lambda: slippery().outcomes(ZERO)
+    ),
+    "FrozenLake-v1: state 1 does not exist; there are 1, from 0 on": lambda: slippery().outcomes(ZERO + 1),
+    "FrozenLake-v1: state -1 does not exist": lambda: slippery().sample(ZERO - 1, ZERO, key_N=ZERO),
+    "FrozenLake-v1: action 4 does not exist": lambda: slippery().sample(ZERO, ZERO + 4, key_N=ZERO),
+    "gamma is 1.5; it must be in": lambda: SimulatorModel("FrozenLake-v1", gamma=1.5),
+    "gamma is nan; it must be in": lambda: SimulatorModel("FrozenLake-v1", gamma=math.nan),
+    "actions is empty": lambda: SimulatorModel("FrozenLake-v1", gamma=0.9, actions=[]),
+    "Corridor has no spec to make another instance from: give a function": lambda: SimulatorModel(
+        Corridor(), gamma=1.0
+    ),
+    "the actions of Box.* cannot be listed: give some, as grid_actions": lambda: SimulatorModel(
+        "Pendulum-v1", gamma=1.0
+    ),
+    "Discrete.2. is no bounded Box": lambda: grid_actions(spaces.Discrete(2), 2),
+    "Box.* is no bounded Box": lambda: sampled_actions(spaces.Box(-np.inf, 1, (2,)), 2, seed=0),
+    "per_dimension is 1": lambda: grid_actions(spaces.Box(0, 1, (2,)), 1),
+    "per_dimension is 3; .* at most 10,000 actions in 9 dimensions": lambda: grid_actions(spaces.Box(0, 1, (9,)), 3),
+    "count is 0": lambda: sampled_actions(spaces.Box(0, 1, (2,)), 0, seed=0),
+    "Nope-v0 cannot be made: Environment `Nope` doesn't exist": lambda: make_env("Nope-v0"),
+    "CartPole-v1 is not the environment that the model was made from .FrozenLake-v1.": (
+        lambda: slippery().root(reset(gymnasium.make("CartPole-v1"), 0))
+    ),
+    "FrozenLake-v1 is not the environment .* map or constants differ": (
+        lambda: slippery().root(standing_in("FrozenLake-v1", 0, map_name="8x8"))
+    ),
+}
+
+
+@pytest.mark.parametrize("message", REFUSALS)
+def test_a_mistake_is_named(message):
+    with pytest.raises(PgtsError, match=message):
+        REFUSALS[message]()
+
+
+def test_other_constants_are_another_environment():
+    model, env = SimulatorModel("CartPole-v1", gamma=0.9), reset(gymnasium.make("CartPole-v1"), 0)
+    assert model.root(env) == 0
+    heavy = reset(gymnasium.make("CartPole-v1"), 0)
+    heavy.unwrapped.gravity = 20.0
+    with pytest.raises(PgtsError, match="constants differ"):
+        model.root(heavy)
+
+
+def test_an_environment_without_an_adapter_is_refused():
+    with pytest.raises(MissingModel, match="Bare cannot be restored: give Bare the methods get_state"):
+        SimulatorModel(Bare, gamma=0.9)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("raises", "ZeroDivisionError: division by zero"),
+        ("reward", "the reward is nan"),
+        ("observation", r"the observation is \[nan, 1.0\]; it must be finite"),
+        ("shape", r"the observation has shape \(1,\); \(2,\) is declared"),
+        ("arity", r"ValueError: not enough values to unpack"),
+    ],
+)
+def test_an_environment_that_fails_is_named_with_state_action_and_key(fault, message):
+    model = SimulatorModel(lambda: Broken(fault), gamma=0.9)
+    broken = reset(Broken(fault), 0)
+    broken.position = 1
+    state_N, key_N = model.roots([broken]), torch.tensor([77])
+    assert model.sample(state_N, torch.tensor([0]), key_N=key_N).reward_N.item() == pytest.approx(1.9)
+    with pytest.raises(
+        PgtsError, match=rf"^Broken failed in state 0 under action 1 \(6\) with key 77: {message}"
+    ) as raised:
+        model.sample(state_N, torch.tensor([1]), key_N=key_N)
+    assert raised.value.__cause__ is not None
+    assert model.sample(state_N, torch.tensor([0]), key_N=key_N).discount_N.item() == 0.9

@@ -1,0 +1,182 @@
+"""What every search promises, whatever its way: the same arguments, the same truth, the same refusals."""
+
+from collections.abc import Callable
+
+import gymnasium
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.errors import PgtsError
+from pgts_torch.models import EnumeratingModel, SimulatorModel, TabularModel
+from pgts_torch.search import Lookahead, expectimax, mcts, sampled
+from pgts_torch.seeding import stream
+from pgts_torch.tabular import TabularMDP, exact, ladder
+from tests.search.models import some_q, some_v
+from tests.support import mdps, zoo
+
+Engine = Callable[..., Lookahead]
+
+
+def complete_samples(model, root_B, **kwargs) -> Lookahead:
+    return sampled(model, root_B, samples=[None], generator=stream(0, "contract"), replicates=0, **kwargs)
+
+
+ENGINES: dict[str, Engine] = {
+    "expectimax": expectimax,
+    "pruned": lambda *args, **kwargs: expectimax(*args, max_width=10_000, **kwargs),
+    "sampled": complete_samples,
+    "mcts, tree": lambda *args, **kwargs: mcts(*args, simulations=5_000, **kwargs),
+    "mcts, graph": lambda *args, **kwargs: mcts(*args, simulations=5_000, merge=True, **kwargs),
+}
+"""Each search with a budget that leaves nothing out."""
+
+every_engine = pytest.mark.parametrize("engine", ENGINES.values(), ids=ENGINES)
+
+
+@every_engine
+@given(mdp=mdps(max_states=4, max_actions=2, max_outcomes=2), depth=st.integers(0, 3), seed=st.integers(0, 99))
+def test_a_search_that_leaves_nothing_out_is_exact_for_both_kinds_of_leaves(engine, mdp, depth, seed):
+    root_B = torch.arange(mdp.num_states).flip(0)
+    q_SA, v_S = some_q(mdp, seed), some_v(mdp, seed)
+    look = engine(TabularModel(mdp), root_B, depth=depth, q_leaf=lambda s: q_SA[s])
+    torch.testing.assert_close(look.q_BA, exact.lookahead(mdp, q_SA, depth)[root_B])
+    one_step_SA = exact.lookahead(mdp, v_S.unsqueeze(-1).expand(-1, mdp.num_actions), 1)
+    look = engine(TabularModel(mdp), root_B, depth=depth, v_leaf=lambda s: v_S[s])
+    torch.testing.assert_close(look.q_BA, exact.lookahead(mdp, one_step_SA, depth)[root_B])
+    assert float(look.pruned_BA.abs().max()) == 0
+    assert look.nodes == sum(look.nodes_per_level)
+    assert 0 < look.model_calls
+
+
+@every_engine
+@pytest.mark.parametrize("depth", [0, 1, 4])
+def test_without_slack_in_the_discount_nothing_after_the_first_reward_counts(engine, depth):
+    mdp = zoo("garnet")
+    blind = TabularMDP(
+        Outcomes(
+            mdp.outcomes.reward_NA,
+            mdp.outcomes.prob_NAK,
+            torch.zeros_like(mdp.outcomes.discount_NAK),
+            mdp.outcomes.child_NAK,
+            mdp.num_states,
+        ),
+        mdp.start_S,
+    )
+    v_S = some_v(mdp)
+    look = engine(TabularModel(blind), torch.tensor([3, 9]), depth=depth, v_leaf=lambda s: v_S[s])
+    assert torch.equal(look.q_BA, mdp.outcomes.reward_NA[[3, 9]])
+    seeing = (
+        engine(TabularModel(mdp), torch.tensor([3, 9]), depth=depth, v_leaf=lambda s: v_S[s]) if depth < 4 else look
+    )
+    assert depth == 4 or not torch.allclose(seeing.q_BA, look.q_BA)
+
+
+class Cage(EnumeratingModel):
+    """Two states; action 1 is allowed in state 0 alone, and pays enormously there."""
+
+    num_states, num_actions = 2, 2
+    device, dtype = torch.device("cpu"), torch.float64
+
+    def __init__(self, pay: float) -> None:
+        self.pay = pay
+
+    def outcomes(self, state_N: Tensor) -> Outcomes:
+        shape = len(state_N), 2, 1
+        reward_NA = torch.tensor([[1.0, self.pay], [2.0, -torch.inf]], dtype=torch.float64)[state_N]
+        child_NAK = torch.tensor([0, 1]).view(1, 2, 1).expand(shape)
+        ones = torch.ones(shape, dtype=torch.float64)
+        return Outcomes(reward_NA, ones, 0.5 * ones, child_NAK, 2)
+
+
+@every_engine
+@pytest.mark.parametrize("pay", [3.0, 1e300, -1e300])
+def test_an_action_that_is_not_allowed_is_minus_infinity_and_never_the_best(engine, pay):
+    if engine is complete_samples:
+        engine = expectimax  # the cage cannot draw
+    look = engine(Cage(pay), torch.tensor([1, 0]), depth=1, v_leaf=lambda s: torch.zeros(len(s), dtype=torch.float64))
+    best_of_0 = max(1.0, pay)
+    expected = [[2 + best_of_0 / 2, -torch.inf], [1 + best_of_0 / 2, pay + 0.5 * 2]]
+    torch.testing.assert_close(look.q_BA, torch.tensor(expected, dtype=torch.float64))
+
+
+@every_engine
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_critic_that_does_not_answer_with_numbers_is_named_by_the_state(engine, bad):
+    v_S = torch.zeros(5, dtype=torch.float64)
+    v_S[2] = bad
+    with pytest.raises(PgtsError, match=f"state 2 is {bad}"):
+        engine(TabularModel(ladder(5)), torch.tensor([0]), depth=3, v_leaf=lambda s: v_S[s])
+
+
+@every_engine
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"depth": -1}, "depth is -1"),
+        ({"root_B": torch.tensor([5])}, r"root_B\[0\] is 5; states are 0 to 4"),
+        ({"root_B": torch.tensor([], dtype=torch.int64)}, "at least one state"),
+        ({"q_leaf": lambda s: torch.zeros(len(s), 2)}, "exactly one of q_leaf and v_leaf"),
+        ({"v_leaf": None}, "exactly one of q_leaf and v_leaf"),
+        ({"v_leaf": lambda s: torch.zeros(len(s), 3)}, "answered with shape"),
+    ],
+)
+def test_bad_questions_are_refused(engine, changed, message):
+    asked = {"root_B": torch.tensor([0]), "depth": 2, "v_leaf": lambda s: torch.zeros(len(s), dtype=torch.float64)}
+    asked |= changed
+    with pytest.raises(PgtsError, match=message):
+        engine(TabularModel(ladder(5)), asked.pop("root_B"), **asked)
+
+
+BUDGETS: dict[str, Engine] = {
+    "expectimax": expectimax,
+    "pruned": lambda *args, **kwargs: expectimax(*args, max_width=3, **kwargs),
+    "mcts, tree": lambda *args, **kwargs: mcts(*args, simulations=20, **kwargs),
+    "mcts, graph": lambda *args, **kwargs: mcts(*args, simulations=20, merge=True, **kwargs),
+}
+"""Searches that see a part, and list outcomes."""
+
+
+@pytest.mark.parametrize("engine", BUDGETS.values(), ids=BUDGETS)
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_no_planner_beats_the_optimum_on_the_lake(engine, share):
+    """With leaves at or below v* no value exceeds q*; a planner that foresaw the slips would."""
+    mdp = zoo("FrozenLake")
+    optimum = exact.optimal(mdp)
+    root_B = torch.arange(mdp.num_states)
+    look = engine(TabularModel(mdp), root_B, depth=6, v_leaf=lambda s: (1 - share) * optimum.v_S[s])
+    assert bool((look.q_BA <= optimum.q_SA + 1e-12).all())
+    foreseen = engine(TabularModel(mdp), root_B, depth=6, v_leaf=lambda s: optimum.v_S[s] + 0.1)
+    assert bool((foreseen.q_BA > optimum.q_SA + 1e-3).any())
+
+
+@pytest.mark.parametrize("kind", ["expectimax", "sampled", "mcts"])
+def test_searching_leaves_the_environment_and_its_generator_as_they_are(kind):
+    def searched(look: bool) -> list[tuple[int, float, bool]]:
+        env = gymnasium.make("FrozenLake-v1")
+        observation, _ = env.reset(seed=3)
+        model = TabularModel(TabularMDP.from_gymnasium(env, 0.9))
+        simulator = SimulatorModel(env, gamma=0.9)
+        made = []
+        for _ in range(30):
+            if look:
+                ask = {"depth": 2, "v_leaf": lambda s: torch.zeros(len(s), dtype=torch.float64)}
+                if kind == "sampled":
+                    root_B = simulator.roots([env], [observation])
+                    sampled(simulator, root_B, samples=2, generator=stream(0, "look"), **ask)
+                else:
+                    root_B = torch.tensor([observation])
+                    expectimax(model, root_B, **ask) if kind == "expectimax" else mcts(
+                        model, root_B, simulations=8, **ask
+                    )
+            observation, reward, terminated, truncated, _ = env.step(len(made) % 4)
+            made.append((int(observation), float(reward), terminated))
+            if terminated or truncated:
+                observation, _ = env.reset()
+        made.append((int(env.unwrapped.np_random.integers(10**9)), 0.0, False))
+        return made
+
+    assert searched(True) == searched(False)

@@ -1,0 +1,193 @@
+"""Searches as objects: what they remember, and how the automatic one chooses."""
+
+import gymnasium
+import pytest
+import torch
+from torch import Tensor
+
+from pgts_torch.errors import MissingModel, NodeBudgetExceeded, PgtsError
+from pgts_torch.models import EnumeratingModel, SamplingModel, SimulatorModel, TabularModel, Transitions
+from pgts_torch.search import Lookahead, sampled
+from pgts_torch.search.auto import AutoSearch
+from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
+from pgts_torch.seeding import stream
+from pgts_torch.tabular import TabularMDP, exact, ladder, random_mdp
+from tests.search.models import some_v, watched
+from tests.support import zoo
+
+
+class DrawingModel(SamplingModel):
+    """A tabular model that does not list its outcomes."""
+
+    def __init__(self, mdp: TabularMDP) -> None:
+        self._model = TabularModel(mdp)
+        self.num_states, self.num_actions = mdp.num_states, mdp.num_actions
+        self.device, self.dtype = self._model.device, self._model.dtype
+
+    def sample(self, state_N: Tensor, action_N: Tensor, *, key_N: Tensor) -> Transitions:
+        return self._model.sample(state_N, action_N, key_N=key_N)
+
+
+GARNET = random_mdp(200, 3, branching=4, seed=5)
+ROOTS = torch.tensor([7, 3, 3, 150])
+
+
+def look(search: Search, depth: int = 3, seed: int = 0) -> Lookahead:
+    v_S = some_v(GARNET)
+    return search(ROOTS, depth=depth, v_leaf=lambda s: v_S[s], generator=stream(seed, "search"))
+
+
+def truth(depth: int = 3) -> Tensor:
+    v_S = some_v(GARNET)
+    weight_SAK = GARNET.outcomes.prob_NAK * GARNET.outcomes.discount_NAK
+    q_SA = GARNET.outcomes.reward_NA + (weight_SAK * v_S[GARNET.outcomes.child_NAK]).sum(-1)
+    return exact.lookahead(GARNET, q_SA, depth)[ROOTS]
+
+
+@pytest.mark.parametrize("make", [ExpectimaxSearch, AutoSearch, lambda model: MCTSSearch(model, simulations=100_000)])
+def test_a_search_that_can_see_everything_is_exact_and_asks_nothing_twice(make):
+    search = make(TabularModel(GARNET))
+    first, second = look(search), look(search, seed=1)
+    torch.testing.assert_close(first.q_BA, truth())
+    assert torch.equal(first.q_BA, second.q_BA)
+    assert search.model_calls == first.model_calls > 0
+    assert second.model_calls == 0
+    assert not torch.allclose(first.q_BA, truth(2))
+
+
+def test_a_sampled_search_is_the_function_of_that_name_and_counts_its_calls():
+    search = SampledSearch(DrawingModel(GARNET), samples=3, share="search")
+    v_S = some_v(GARNET)
+    expected = sampled(
+        TabularModel(GARNET),
+        ROOTS,
+        depth=3,
+        v_leaf=lambda s: v_S[s],
+        samples=3,
+        share="search",
+        generator=stream(0, "search"),
+        replicates=0,
+    )
+    first, again, other = look(search), look(search), look(search, seed=1)
+    assert torch.equal(first.q_BA, expected.q_BA)
+    assert torch.equal(first.q_BA, again.q_BA)
+    assert not torch.equal(first.q_BA, other.q_BA)
+    assert search.model_calls == first.model_calls + again.model_calls + other.model_calls
+
+
+def test_where_all_paths_fit_the_automatic_search_looks_at_all_of_them_and_says_so():
+    search = AutoSearch(TabularModel(GARNET))
+    assert str(search) == "nothing yet"
+    nodes = look(search).nodes
+    assert str(search) == f"expectimax: the model lists its outcomes, and {nodes} nodes hold all paths"
+    assert search.keeps_bounds
+
+
+def test_where_they_do_not_fit_it_keeps_to_the_budget_and_asks_nothing_twice():
+    model = watched(GARNET)
+    search = AutoSearch(model, max_nodes=300)
+    first = look(search)
+    assert first.nodes <= 300
+    assert float(first.pruned_BA.max()) > 0
+    assert "states a level: all paths need more than 300 nodes" in str(search)
+    calls = len(model.calls)
+    assert torch.equal(look(search).q_BA, first.q_BA)
+    assert len(model.calls) == calls
+    assert len(model.asked) == len(set(model.asked))
+    # A shallower search fits, and is exact.
+    torch.testing.assert_close(look(search, depth=0).q_BA, truth(0))
+    assert str(search).startswith("expectimax: ")
+
+
+def test_a_model_that_only_draws_is_sampled_and_more_often_where_paths_met():
+    search = AutoSearch(DrawingModel(ladder(5)), max_nodes=400)
+    samples = []
+    for seed in range(6):
+        search(torch.tensor([0]), depth=3, v_leaf=torch.zeros_like, generator=stream(seed, "search"))
+        samples.append(int(str(search).split()[1]))
+        assert "the model only draws" in str(search)
+    # 2 actions and 2 samples on 4 levels: 341 nodes if no two paths met; the Ladder has 5 states.
+    assert samples[0] == 2
+    assert samples == sorted(samples)
+    assert samples[-1] > 2
+    assert not search.keeps_bounds
+
+
+def test_the_samples_of_a_model_in_which_paths_rarely_meet_stay_within_the_budget():
+    search = AutoSearch(DrawingModel(random_mdp(5000, 4, branching=50, seed=2)), max_nodes=2_000)
+    for seed in range(5):
+        root_B = torch.arange(3)
+        seen = search(
+            root_B,
+            depth=2,
+            v_leaf=lambda s: torch.zeros(len(s), dtype=torch.float64),
+            generator=stream(seed, "search"),
+        )
+        assert seen.nodes <= 2_000
+
+
+@pytest.mark.parametrize("model", [TabularModel(GARNET), DrawingModel(GARNET)])
+def test_a_budget_that_is_too_small_for_anything_is_an_error(model):
+    with pytest.raises(NodeBudgetExceeded):
+        look(AutoSearch(model, max_nodes=2))
+
+
+def test_a_tree_search_of_a_model_that_only_draws_is_one_of_what_was_drawn():
+    """With enough simulations it is the sampled lookahead with one set of samples for each state."""
+    search = MCTSSearch(DrawingModel(GARNET), simulations=100_000, samples=2)
+    v_S = some_v(GARNET)
+    expected = sampled(
+        TabularModel(GARNET),
+        ROOTS,
+        depth=3,
+        v_leaf=lambda s: v_S[s],
+        samples=2,
+        share="search",
+        generator=stream(0, "search"),
+        replicates=0,
+    )
+    seen = look(search)
+    torch.testing.assert_close(seen.q_BA, expected.q_BA)
+    assert seen.model_calls <= expected.model_calls
+    assert not torch.equal(look(search, seed=1).q_BA, seen.q_BA)
+    assert not search.keeps_bounds
+    assert str(search) == "mcts, 100000 simulations, merged, 2 drawn outcomes of each action"
+    with pytest.raises(PgtsError, match="samples is 2; TabularModel lists its outcomes"):
+        MCTSSearch(TabularModel(GARNET), samples=2)
+
+
+class ListingModel(EnumeratingModel):
+    """A tabular model that does not draw."""
+
+    def __init__(self, mdp: TabularMDP) -> None:
+        self._model = TabularModel(mdp)
+        self.num_states, self.num_actions = mdp.num_states, mdp.num_actions
+        self.device, self.dtype = self._model.device, self._model.dtype
+
+    def outcomes(self, state_N: Tensor):
+        return self._model.outcomes(state_N)
+
+
+@pytest.mark.parametrize(
+    ("make", "model", "message"),
+    [
+        (ExpectimaxSearch, DrawingModel, "'expectimax' needs a model that lists its outcomes; DrawingModel does not"),
+        (SampledSearch, ListingModel, "'sampled' needs a model that draws outcomes; ListingModel does not"),
+    ],
+)
+def test_a_search_asks_for_what_its_model_can_do(make, model, message):
+    with pytest.raises(MissingModel, match=message):
+        make(model(zoo("ladder")))
+
+
+def test_a_simulator_that_turns_out_to_be_random_is_sampled():
+    env = gymnasium.make("FrozenLake-v1")
+    observation, _ = env.reset(seed=0)
+    for slippery, picked in ((True, "sampled, "), (False, "expectimax: ")):
+        made = gymnasium.make("FrozenLake-v1", is_slippery=slippery)
+        made.reset(seed=0)
+        model = SimulatorModel(made, gamma=0.9)
+        search = AutoSearch(model, max_nodes=10_000)
+        search(model.roots([made], [observation]), depth=2, v_leaf=torch.zeros_like, generator=stream(0, "search"))
+        assert str(search).startswith(picked)
+        assert search.keeps_bounds is not slippery
