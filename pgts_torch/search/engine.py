@@ -156,7 +156,7 @@ class SampledSearch(Search):
 
 @final
 class MCTSSearch(Search):
-    """`mcts` with maximum backups.
+    """`mcts` with maximum backups, and with uniform priors: those of the policy would look where it goes already.
 
     Args:
         model: lists outcomes, or draws them.

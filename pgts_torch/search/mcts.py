@@ -74,9 +74,8 @@ def mcts(
         exploration: c of "puct" and "uct". Default: 1.25.
         wave: the most simulations of one action of a root (with root="rule": of the root) that are under way before
             values are backed up. 1 is the ordinary search, one simulation after another. Default: a whole round of
-            sequential halving (with root="rule": as many as before it together), which is several times faster; with
-            64 and more simulations the mean error of the best value was up to 12 % larger on a Garnet, and up to twice
-            as large on a 10 x 10 grid.
+            sequential halving (with root="rule": as many as before it together): several times faster, and a little
+            less right with as many simulations.
         prior: the policy, states [N] to probabilities [N, A]. Default: uniform.
         backup: "max", or for comparison "mean": q(n, a) = (q_0 + sum_i G_i) / (1 + N_a) over the critic's first
             estimate q_0 and the returns G_i seen, which does not converge to T^m Q; its `pruned_BA` is inf.

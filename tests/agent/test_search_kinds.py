@@ -25,9 +25,10 @@ def trained(search, depth: int) -> float:
         search=search,
         policy=LEFT,
         critic="exact",
-        update={"type": "softmax", "step_size": 3.0},
+        update={"type": "softmax", "step_size": 10.0},
         num_envs=8,
-    ).learn(20_000)
+        horizon={"type": "fixed", "length": 30},
+    ).learn(6_000)
     return exact.evaluate(model.mdp, model.policy.table()).J / exact.optimal(model.mdp).J
 
 
@@ -71,7 +72,8 @@ def test_samples_prove_nothing_but_a_narrow_search_does():
     [
         ("breadth", "search is 'breadth'; it must be one of auto, expectimax, sampled, mcts"),
         ({"type": "auto", "max_width": 3}, "search 'auto' does not take these options: \\['max_width'\\]"),
-        ({"type": "mcts", "samples": 3}, "search 'mcts' does not take"),
+        ({"type": "mcts", "share": "level"}, "search 'mcts' does not take"),
+        ({"type": "mcts", "samples": 3}, "TabularModel lists its outcomes"),
     ],
 )
 def test_a_search_that_does_not_exist_or_an_option_that_it_does_not_heed_is_refused(search, message):
