@@ -137,7 +137,9 @@ class _Seen:
         return observation if self.key is None else observation[self.key]
 
     def encode(self, observation: Any) -> Tensor:
-        part = self.part(observation)
+        return self.encode_part(self.part(observation))
+
+    def encode_part(self, part: Any) -> Tensor:
         if isinstance(self.space, spaces.Discrete):
             return _states(part, int(self.space.n)).to(self.device)
         array = np.asarray(part)
@@ -186,7 +188,7 @@ class SimulatedWorld(World):
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """What the simulator showed in these states."""
-        return self._seen.encode(self._model.observations(state_N))
+        return self._seen.encode_part(self._model.observations(state_N))
 
     def forget(self) -> bool:
         """All snapshots: their number grows with every search, and few of them return."""

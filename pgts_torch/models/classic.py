@@ -110,11 +110,22 @@ class ClassicModel(TensorModel):
         return ""
 
     def read(self, env: gymnasium.Env) -> Float[Tensor, "D"]:
-        """The state that an instance is in.
+        """The state that an instance is in, in the dtype of states and on the device of the model.
 
         Raises:
             PgtsError: it is another environment, has other constants than those read at first, or was not reset.
         """
+        return self._vectors([env])[0]
+
+    def roots(self, envs: Sequence[gymnasium.Env]) -> Int[Tensor, "B"]:
+        """The numbers of the states that several instances are in; raises as `read` does."""
+        return self.number(self._vectors(envs))
+
+    def _vectors(self, envs: Sequence[gymnasium.Env]) -> Tensor:
+        rows = np.array([self._state_of(env) for env in envs], dtype=np.float64)
+        return torch.from_numpy(rows).to(self.device, self.dtype)
+
+    def _state_of(self, env: gymnasium.Env) -> Any:
         base: Any = env.unwrapped
         if not any(base is known for known in self._same):
             if why := self.obstacle(env):
@@ -125,11 +136,7 @@ class ClassicModel(TensorModel):
             self._same.append(base)
         if base.state is None:
             raise PgtsError(f"{env_name(env)} was not reset: it is in no state")
-        return torch.tensor(np.asarray(base.state, dtype=np.float64), dtype=self.dtype)
-
-    def roots(self, envs: Sequence[gymnasium.Env]) -> Int[Tensor, "B"]:
-        """The numbers of the states that several instances are in; raises as `read` does."""
-        return self.number(torch.stack([self.read(env) for env in envs]).to(self.device))
+        return base.state
 
     @final
     def step(

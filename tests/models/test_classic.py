@@ -11,6 +11,7 @@ from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv, MountainCarE
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
+from pgts_torch.models import TensorModel
 from pgts_torch.models.classic import CLASSIC, Acrobot, CartPole, MountainCar, Pendulum, dynamics_of, with_torques
 from pgts_torch.search import expectimax
 from pgts_torch.seeding import numpy_stream
@@ -228,6 +229,24 @@ def test_a_repeated_action_brings_a_sparse_goal_into_sight_at_the_price_of_its_s
         assert (model.simulator_steps == look.model_calls) == (k == 1)
     assert sight[1] == -210.0
     assert sight[12] > -120
+
+
+class Stairs(TensorModel):
+    """Action 0 climbs a step, for a reward of 1, and is not allowed on step 2; action 1 stays."""
+
+    def step(self, state_ND: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        climbs_N = action_N == 0
+        reward_N = climbs_N.double().masked_fill(climbs_N & (state_ND[:, 0] == 2), -math.inf)
+        return reward_N, torch.full_like(reward_N, 0.5), state_ND + climbs_N.double().unsqueeze(-1)
+
+
+def test_a_repetition_ends_before_a_step_in_which_the_action_is_not_allowed():
+    model = Stairs(1, 2, state_dtype=torch.float64, dtype=torch.float64, action_repeat=4)
+    answer = model.outcomes(model.number(torch.tensor([[0.0], [1.0], [2.0], [3.0]], dtype=torch.float64)))
+    assert answer.reward_NA[:, 0].tolist() == [1.5, 1.0, -math.inf, 1.875]
+    assert answer.discount_NAK[[0, 1, 3], 0, 0].tolist() == [0.25, 0.5, 0.0625]
+    assert model.states(answer.child_NAK[:, 0, 0])[:, 0].tolist() == [2.0, 2.0, 2.0, 7.0]
+    assert answer.discount_NAK[:, 1, 0].tolist() == [0.0625] * 4
 
 
 # What is refused

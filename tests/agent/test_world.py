@@ -1,0 +1,371 @@
+"""Worlds: which one an environment gets, that states and observations belong together, and that all of them learn."""
+
+from collections.abc import Callable
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from torch import Tensor
+
+from pgts_torch import PGTS
+from pgts_torch.agent import world as worlds
+from pgts_torch.agent.rollout import FixedHorizon, rollout
+from pgts_torch.agent.world import DynamicsWorld, PlainWorld, SimulatedWorld, TabularWorld, World, make_world
+from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models import SimulatorModel, with_torques
+from pgts_torch.seeding import draw_keys, stream
+from tests.agent.helpers import same_bits
+
+KEYWORDS = {"num_envs": 3, "gamma": None, "observation_key": None, "plain": False, "device": "cpu"}
+
+DYNAMICS = ["CartPole-v1", "Acrobot-v1", "MountainCar-v0", "Pendulum-v1"]
+
+
+class Cart(gymnasium.envs.classic_control.CartPoleEnv):
+    """CartPole, but for all that can be known about a subclass it may do anything."""
+
+
+class Parts(gymnasium.Env):
+    """Shows a dictionary; it can be restored."""
+
+    action_space = spaces.Discrete(2)
+    observation_space = spaces.Dict({"place": spaces.Discrete(9), "map": spaces.Box(0, 1, (2, 2))})
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = 0
+        return self.shown(), {}
+
+    def step(self, action):
+        self.place = min(self.place + action, 8)
+        return self.shown(), 1.0, self.place == 8, False, {}
+
+    def shown(self) -> dict[str, object]:
+        return {"place": self.place, "map": np.full((2, 2), self.place / 8, np.float32)}
+
+    def get_state(self):
+        return self.place
+
+    def set_state(self, state):
+        self.place = state
+
+
+class Unknown(gymnasium.Env):
+    """Nothing is known of it."""
+
+    observation_space, action_space = spaces.Box(-1, 1, (2,)), spaces.Discrete(2)
+
+
+class Together(VectorEnv):
+    """Copies that cannot be told apart."""
+
+    num_envs, metadata = 3, {"autoreset_mode": AutoresetMode.DISABLED}
+    single_observation_space, single_action_space = Unknown.observation_space, Unknown.action_space
+
+
+def copies_of(make: Callable[[], gymnasium.Env], num_envs: int = 3) -> SyncVectorEnv:
+    return SyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+
+
+def world_of(env: str | VectorEnv, **options) -> World:
+    if env == "Pendulum-v1":
+        options = {"wrappers": [with_torques]} | options
+    return make_world(env, **KEYWORDS | options)
+
+
+WORLDS = {
+    "tabular": lambda: world_of("pgts/Ladder-v0"),
+    "tabular, from P": lambda: world_of("FrozenLake-v1"),
+    "simulated": lambda: world_of(copies_of(Cart)),
+    "simulated, by parts": lambda: world_of(copies_of(Parts), observation_key="map"),
+    "plain": lambda: world_of("CartPole-v1", plain=True),
+    **{name: lambda name=name: world_of(name) for name in DYNAMICS},
+}
+
+
+def walked(world: World, steps: int) -> tuple[list[Tensor], list[Tensor]]:
+    """What the copies show, encoded, and the numbers of their states, in each step of a random walk."""
+    observation, _ = world.env.reset(seed=1)
+    seen, numbers = [world.encode(observation)], [world.number(world.env, observation)]
+    for action_B in torch.randint(world.num_actions, (steps, 3), generator=stream(0, "walk")):
+        observation, _, over, *_ = world.env.step(action_B.numpy())
+        seen.append(world.encode(observation))
+        numbers.append(world.number(world.env, observation))
+        if over.any():
+            world.env.reset(options={"reset_mask": over})
+    return seen, numbers
+
+
+# Which world
+
+
+@pytest.mark.parametrize(
+    ("make", "kind"),
+    [
+        (lambda: world_of("pgts/Grid-v0"), TabularWorld),
+        (lambda: world_of("Taxi-v4"), TabularWorld),
+        (lambda: world_of("pgts/Grid-v0", plain=True), TabularWorld),
+        *((lambda name=name: world_of(name), DynamicsWorld) for name in DYNAMICS),
+        (lambda: world_of(copies_of(Cart)), SimulatedWorld),
+        (lambda: world_of("CartPole-v1", plain=True), PlainWorld),
+        (lambda: world_of(copies_of(Unknown), plain=True), PlainWorld),
+    ],
+)
+def test_what_can_be_asked_about_an_environment_decides_its_world(make, kind):
+    world = make()
+    assert type(world) is kind
+    assert (world.model is None) == (kind is PlainWorld)
+    assert (world.mdp is None) == (kind is not TabularWorld)
+
+
+def test_changed_constants_are_honoured_and_must_be_the_same_in_all_copies():
+    world = world_of("CartPole-v1", sutton_barto_reward=True)
+    world.env.reset(seed=0)
+    assert float(world.model.outcomes(world.number(world.env, None)).reward_NA.max()) == 0.0
+    copies = world_of("CartPole-v1").env
+    copies.envs[1].unwrapped.gravity = 1.6
+    copies.reset(seed=0)
+    with pytest.raises(PgtsError, match=r"CartPole-v1 has gravity = 1\.6; the model's is 9\.8"):
+        world_of(copies).number(copies, None)
+
+
+def test_actions_are_those_of_the_copies_also_in_a_simulator():
+    def mirrored() -> gymnasium.Env:
+        return gymnasium.wrappers.TransformAction(Cart(), lambda a: 1 - a, spaces.Discrete(2))
+
+    following = []
+    for world in (world_of(copies_of(Cart)), world_of(copies_of(mirrored))):
+        observation, _ = world.env.reset(seed=3)
+        answer = world.model.outcomes(world.number(world.env, observation)[:1])
+        following.append(world.observe(answer.child_NAK[0, :, 0]))
+    assert torch.equal(following[0], following[1].flip(0))
+    assert not torch.equal(following[0], following[1])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: world_of("FrozenLake-v1", action_repeat=2), "action_repeat is 2; in a table it must be 1"),
+        (lambda: world_of("CartPole-v1", plain=True, action_repeat=2), "action_repeat is 2; without a model it must"),
+        (lambda: world_of("CartPole-v1", action_repeat=0), "action_repeat is 0; it must be at least 1"),
+        (lambda: world_of("CartPole-v1", observation_key="x"), "they have no part 'x'"),
+        (lambda: world_of("CartPole-v1", plain=True, observation_key="x"), "they have no part 'x'"),
+        (lambda: world_of(copies_of(Parts)), "observations are dictionaries of .*: say which part"),
+        (lambda: world_of(copies_of(Parts), observation_key="x"), "no part 'x'; they have"),
+        (lambda: world_of(gymnasium.make("CartPole-v1")), "it must be a Gymnasium id or a VectorEnv"),
+        (lambda: world_of(SyncVectorEnv([Cart])), "the environment resets by"),
+        (lambda: make_world("Pendulum-v1", **KEYWORDS), "the actions of Pendulum-v1 are Box"),
+        (lambda: world_of("CartPole-v1", num_envs=0), "num_envs is 0"),
+        (lambda: world_of("NoSuch-v0"), "NoSuch-v0 cannot be made"),
+    ],
+)
+def test_what_does_not_make_a_world_is_refused_by_name(make, message):
+    with pytest.raises(PgtsError, match=message):
+        make()
+
+
+def test_an_environment_that_cannot_be_restored_needs_a_model():
+    with pytest.raises(MissingModel, match="give Unknown the methods get_state"):
+        world_of(copies_of(Unknown))
+    with pytest.raises(MissingModel, match="a simulator needs a SyncVectorEnv of them"):
+        world_of(Together())
+
+
+# States and observations
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_a_numbered_state_is_observed_as_the_copies_showed_it(kind):
+    world = WORLDS[kind]()
+    seen, numbers = walked(world, 6)
+    for k, (seen_B, number_B) in enumerate(zip(seen, numbers, strict=True)):
+        observed_B = world.observe(number_B)
+        assert observed_B.dtype == seen_B.dtype
+        # Just after a reset Acrobot takes its sines in float32.
+        rounded = kind == "Acrobot-v1" and k == 0
+        torch.testing.assert_close(observed_B, seen_B, rtol=0, atol=1e-7 if rounded else 0)
+    assert not torch.equal(world.observe(numbers[0]), seen[6])
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_after_forgetting_numbers_begin_anew_except_where_a_state_is_its_number(kind):
+    world = WORLDS[kind]()
+    _, first = walked(world, 3)
+    forgot = world.forget()
+    assert forgot == (not isinstance(world, TabularWorld))
+    seen, second = walked(world, 3)
+    assert all(torch.equal(*pair) for pair in zip(first, second, strict=True))
+    assert torch.equal(world.observe(second[1]), seen[1]) or kind == "Acrobot-v1"
+    _, third = walked(world, 3)
+    assert torch.equal(third[0], first[0]) != isinstance(world, PlainWorld)
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_observations_that_the_environment_cannot_make_are_refused(kind):
+    world = WORLDS[kind]()
+    if isinstance(world.observation_space, spaces.Discrete):
+        wrong = [(np.array([0.5]), "states are integers"), (np.array([999]), "state 999 does not exist")]
+    else:
+        shape = world.observation_space.shape
+        wrong = [
+            (np.full((2, *shape), np.nan, np.float32), "an observation is not finite"),
+            (np.zeros((2, *shape, 5), np.float32), "an observation has shape"),
+        ]
+    for observation, message in wrong:
+        given = {"map": observation} if "parts" in kind else observation
+        with pytest.raises(PgtsError, match=message):
+            world.encode(given)
+
+
+# Dynamics in torch and the simulator are the same world
+
+
+def by_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worlds, "dynamics_of", lambda env: None)
+
+
+@pytest.mark.parametrize("repeat", [1, 3])
+@pytest.mark.parametrize("name", DYNAMICS)
+def test_dynamics_and_simulator_answer_alike(name, repeat, monkeypatch):
+    answers = []
+    for simulate in (False, True):
+        if simulate:
+            by_simulator(monkeypatch)
+        world = world_of(name, action_repeat=repeat)
+        assert isinstance(world, SimulatedWorld) == simulate
+        observation, _ = world.env.reset(seed=5)
+        state_B = world.number(world.env, observation)
+        for _ in range(2):
+            answer = world.model.outcomes(state_B)
+            state_B = answer.child_NAK.flatten().unique()
+        answers.append((answer.reward_NA, answer.discount_NAK, world.observe(answer.child_NAK.flatten())))
+    for first, second in zip(*answers, strict=True):
+        torch.testing.assert_close(first, second, rtol=1e-12, atol=1e-12)
+    assert float(answers[0][1].max()) == pytest.approx(0.99**repeat)
+
+
+def test_a_simulator_repeats_random_actions_as_the_key_says():
+    model = SimulatorModel("FrozenLake-v1", gamma=0.9, action_repeat=3)
+    env = gymnasium.make("FrozenLake-v1")
+    env.reset(seed=0)
+    state_N, action_N = torch.full((300,), model.root(env)), torch.full((300,), 1)
+    key_N = draw_keys(300, generator=stream(0, "keys"))
+    first, second = (model.sample(state_N, action_N, key_N=key_N) for _ in range(2))
+    assert torch.equal(first.next_state_N, second.next_state_N)
+    flipped = model.sample(state_N.flip(0), action_N, key_N=key_N.flip(0))
+    assert torch.equal(flipped.next_state_N.flip(0), first.next_state_N)
+    places = {int.from_bytes(model.snapshot(s).key[:8], "little") for s in first.next_state_N.unique().tolist()}
+    assert max(places) >= 9  # three rows down
+    assert {5} <= places  # a hole, where the repetition ends
+    assert sorted(set(first.discount_N.tolist())) == pytest.approx([0.0, 0.9**3])
+
+
+@pytest.mark.parametrize("depth", [0, 2])
+def test_an_iteration_is_the_same_bit_for_bit_whether_dynamics_or_a_simulator_is_asked(depth, monkeypatch):
+    fast = cartpole(depth=depth)
+    by_simulator(monkeypatch)
+    slow = cartpole(depth=depth)
+    assert isinstance(fast.world, DynamicsWorld)
+    assert isinstance(slow.world, SimulatedWorld)
+    for _ in range(2):
+        first, second = fast.iterate(), slow.iterate()
+        assert torch.equal(first.experience.reward_TB, second.experience.reward_TB)
+        assert torch.equal(first.look.q_BA, second.look.q_BA)
+        assert first.losses == second.losses
+    assert same_weights(fast, slow)
+
+
+# Training
+
+
+def cartpole(**kwargs) -> PGTS:
+    short = {"depth": 2, "num_envs": 3, "seed": 7, "horizon": {"type": "fixed", "length": 15}}
+    return PGTS("CartPole-v1", **short | kwargs)
+
+
+def same_weights(first: PGTS, second: PGTS) -> bool:
+    pairs = [(first.state_dict()[part], second.state_dict()[part]) for part in ("policy", "critic")]
+    return all(same_values(*pair) for pair in pairs)
+
+
+def same_values(first: object, second: object) -> bool:
+    if isinstance(first, Tensor):
+        return torch.equal(first, second)
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same_values(first[name], second[name]) for name in first)
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(same_values, first, second))
+    return first == second
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("kwargs", [{}, {"action_repeat": 3}, {"depth": "adaptive", "max_depth": 2}])
+def test_training_with_a_lookahead_is_reproducible_and_a_loaded_model_goes_on_bit_for_bit(kwargs, tmp_path):
+    whole, twin, other = cartpole(**kwargs), cartpole(**kwargs), cartpole(seed=8, **kwargs)
+    for model in (whole, twin, other):
+        model.iterate()
+    assert same_weights(whole, twin)
+    assert not same_weights(whole, other)
+    whole.save(tmp_path / "model.pt")
+    loaded = PGTS.load(tmp_path / "model.pt")
+    for _ in range(2):
+        first, second = whole.iterate(), loaded.iterate()
+        assert same_bits(first.experience, second.experience)
+        assert torch.equal(first.look.q_BA, second.look.q_BA)
+        assert first.losses == second.losses
+        assert first.model_calls == second.model_calls
+    assert same_weights(whole, loaded)
+    assert not same_weights(whole, twin)
+
+
+def test_each_iteration_numbers_anew():
+    model = cartpole()
+    for k in range(3):
+        seen = model.iterate()
+        assert model.world.model.generation == k + 1
+        assert seen.experience.state_TB[0].tolist() == [0, 1, 2]
+        assert model.world.model.num_states <= 3 * 16 * (1 + 2 + 4 + 8)
+
+
+def test_repeated_actions_prove_nothing_and_single_ones_do():
+    assert cartpole().iterate().certificate < 100
+    assert cartpole(action_repeat=2).iterate().certificate == torch.inf
+
+
+def test_a_pendulum_is_swung_by_torques_from_a_list():
+    model = PGTS(
+        "Pendulum-v1",
+        depth=2,
+        num_envs=2,
+        horizon={"type": "fixed", "length": 5},
+        env_kwargs={"wrappers": [with_torques]},
+    )
+    assert isinstance(model.world, DynamicsWorld)
+    assert model.iterate().look.q_BA.shape == (10, 5)
+    assert model.predict(np.zeros((4, 3), np.float32)).shape == (4,)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_cartpole_is_learned_with_a_lookahead_of_two_steps_and_not_without_training():
+    model = PGTS("CartPole-v1", depth=2, num_envs=8, seed=0, horizon={"type": "fixed", "length": 200})
+
+    def mean_length() -> float:
+        model.world.forget()
+        made = rollout(
+            model.world,
+            model.make_copies(24),
+            model.policy,
+            FixedHorizon(200),
+            seed=1,
+            names=("test",),
+            generator=stream(1, "test"),
+        )
+        return made.num_steps / made.num_episodes
+
+    untrained = mean_length()
+    model.learn(3_000)
+    assert untrained < 35
+    assert mean_length() > 2 * untrained
