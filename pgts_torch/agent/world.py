@@ -17,7 +17,8 @@ from torch import Tensor
 
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import Model
-from pgts_torch.models.classic import ClassicModel, base_actions, dynamics_of
+from pgts_torch.models.classic import ClassicModel, dynamics_of
+from pgts_torch.models.environments import base_actions, changing_wrapper
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import adapter_for
 from pgts_torch.models.tabular import TabularModel, tabular_truth
@@ -313,7 +314,13 @@ def make_world(
     copies = make_vector_env(env, num_envs, gamma=gamma, **kwargs) if isinstance(env, str) else env
     check_vector_env(copies)
     discount = DEFAULT_GAMMA if gamma is None else gamma
-    if observation_key is None and isinstance(copies.single_observation_space, spaces.Discrete):
+    wrapper = changing_wrapper(copies.envs[0]) if isinstance(copies, SyncVectorEnv) else ""
+    if wrapper and not plain:
+        raise MissingModel(
+            f"{env_name(copies)} is wrapped in {wrapper}, which may change what a step gives, and a model only knows "
+            "the environment inside: leave it out, or make it part of an environment with get_state and set_state"
+        )
+    if observation_key is None and not wrapper and isinstance(copies.single_observation_space, spaces.Discrete):
         try:
             truth = tabular_truth(copies, gamma=discount)
         except MissingModel:
@@ -330,12 +337,13 @@ def make_world(
     if (dynamics := dynamics_of(copies.envs[0])) is not None:
         vectors = dynamics(copies.envs[0], gamma=discount, action_repeat=action_repeat, device=device)
         return DynamicsWorld(copies, vectors, observation_key=observation_key)
+    adapter = adapter_for(copies.envs[0])
     model = SimulatorModel(
         copies.env_fns[0],
         gamma=discount,
         actions=base_actions(copies.envs[0]),
         action_repeat=action_repeat,
-        adapter=adapter_for(copies.envs[0]),
+        adapter=adapter,
         observe=None if observation_key is None else lambda observation: observation[observation_key],
         device=device,
     )

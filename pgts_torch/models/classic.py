@@ -16,25 +16,16 @@ from typing import Any, final
 import gymnasium
 import numpy as np
 import torch
-from gymnasium import spaces, wrappers
+from gymnasium import spaces
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv, MountainCarEnv, PendulumEnv
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.environments import all_actions, grid_actions
+from pgts_torch.models.environments import base_actions, changing_wrapper
 from pgts_torch.models.numbering import Merge
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tensor import TensorModel
-
-_HARMLESS = (
-    wrappers.TimeLimit,
-    wrappers.OrderEnforcing,
-    wrappers.PassiveEnvChecker,
-    wrappers.RecordEpisodeStatistics,
-    gymnasium.ActionWrapper,
-)
-"""Wrappers that change neither states nor rewards; what an ActionWrapper makes of an action is read from it."""
 
 
 class ClassicModel(TensorModel):
@@ -97,9 +88,8 @@ class ClassicModel(TensorModel):
         """Why these dynamics are not those of `env`; empty where they are."""
         if type(env.unwrapped) is not cls.env_class:
             return f"it is a {type(env.unwrapped).__name__}, not a {cls.env_class.__name__}"
-        for wrapper in wrappers_of(env):
-            if not isinstance(wrapper, _HARMLESS):
-                return f"its wrapper {type(wrapper).__name__} may change what a step gives"
+        if wrapper := changing_wrapper(env):
+            return f"its wrapper {wrapper} may change what a step gives"
         if not isinstance(env.action_space, spaces.Discrete):
             return f"its actions are {env.action_space}; make them discrete, as with_torques does"
         return cls._unknown(env.unwrapped)
@@ -333,33 +323,6 @@ CLASSIC: tuple[type[ClassicModel], ...] = (CartPole, Acrobot, MountainCar, Pendu
 def dynamics_of(env: gymnasium.Env) -> Callable[..., ClassicModel] | None:
     """The class of these models whose dynamics are those of `env`; None where there is none."""
     return next((model for model in CLASSIC if not model.obstacle(env)), None)
-
-
-def with_torques(env: gymnasium.Env, count: int = 5) -> gymnasium.Env:
-    """An environment with continuous actions, as Pendulum, under `count` values of each dimension of them, evenly
-    spaced from the lowest to the highest. PgtsError as in `grid_actions`."""
-    actions = grid_actions(env.action_space, count)
-    return wrappers.TransformAction(env, actions.__getitem__, spaces.Discrete(len(actions)))
-
-
-def base_actions(env: gymnasium.Env) -> list[Any]:
-    """What each action of a discrete space becomes on its way through the action wrappers of `env`."""
-    actions = []
-    for action in all_actions(env.action_space):
-        for wrapper in wrappers_of(env):
-            if isinstance(wrapper, gymnasium.ActionWrapper):
-                action = wrapper.action(action)
-        actions.append(action)
-    return actions
-
-
-def wrappers_of(env: gymnasium.Env) -> list[gymnasium.Wrapper]:
-    """The wrappers around an environment, from the outside."""
-    found = []
-    while isinstance(env, gymnasium.Wrapper):
-        found.append(env)
-        env = env.env
-    return found
 
 
 def _wrapped(angle: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
+from gymnasium import spaces, wrappers
 from gymnasium.envs.registration import EnvSpec
 
 from pgts_torch.errors import PgtsError
@@ -17,6 +17,15 @@ from pgts_torch.seeding import numpy_stream
 
 EnvSource = str | EnvSpec | gymnasium.Env | Callable[[], gymnasium.Env]
 """What an environment can be made from: an id, a spec, another instance (by its spec) or a function."""
+
+_HARMLESS = (
+    wrappers.TimeLimit,
+    wrappers.OrderEnforcing,
+    wrappers.PassiveEnvChecker,
+    wrappers.RecordEpisodeStatistics,
+    gymnasium.ActionWrapper,
+)
+"""Wrappers that change neither states nor rewards; what an ActionWrapper makes of an action is read from it."""
 
 
 def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
@@ -129,3 +138,36 @@ def _wrong_observation(space: spaces.Space, value: Any) -> str:
     elif isinstance(space, spaces.Discrete) and not space.contains(value):
         return f"the observation is {value!r}, which is not in {space}"
     return ""
+
+
+def with_torques(env: gymnasium.Env, count: int = 5) -> gymnasium.Env:
+    """An environment with continuous actions, as Pendulum, under `count` values of each dimension of them, evenly
+    spaced from the lowest to the highest. PgtsError as in `grid_actions`."""
+    actions = grid_actions(env.action_space, count)
+    return wrappers.TransformAction(env, actions.__getitem__, spaces.Discrete(len(actions)))
+
+
+def base_actions(env: gymnasium.Env) -> list[Any]:
+    """What each action of a discrete space becomes on its way through the action wrappers of `env`."""
+    actions = []
+    for action in all_actions(env.action_space):
+        for wrapper in wrappers_of(env):
+            if isinstance(wrapper, gymnasium.ActionWrapper):
+                action = wrapper.action(action)
+        actions.append(action)
+    return actions
+
+
+def wrappers_of(env: gymnasium.Env) -> list[gymnasium.Wrapper]:
+    """The wrappers around an environment, from the outside."""
+    found = []
+    while isinstance(env, gymnasium.Wrapper):
+        found.append(env)
+        env = env.env
+    return found
+
+
+def changing_wrapper(env: gymnasium.Env) -> str:
+    """The name of a wrapper that may change observations, rewards or ends; empty where there is none."""
+    changing = (wrapper for wrapper in wrappers_of(env) if not isinstance(wrapper, _HARMLESS))
+    return next((type(wrapper).__name__ for wrapper in changing), "")

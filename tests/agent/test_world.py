@@ -1,5 +1,6 @@
 """Worlds: which one an environment gets, that states and observations belong together, and that all of them learn."""
 
+import functools
 from collections.abc import Callable
 
 import gymnasium
@@ -369,3 +370,12 @@ def test_cartpole_is_learned_with_a_lookahead_of_two_steps_and_not_without_train
     model.learn(3_000)
     assert untrained < 35
     assert mean_length() > 2 * untrained
+
+
+@pytest.mark.parametrize("env", ["CliffWalking-v1", "CartPole-v1"])
+def test_a_model_is_refused_where_a_wrapper_may_change_what_it_knows(env):
+    doubled = functools.partial(gymnasium.wrappers.TransformReward, func=lambda reward: 2 * reward)
+    with pytest.raises(MissingModel, match=f"{env} is wrapped in TransformReward"):
+        make_world(env, **KEYWORDS, wrappers=[doubled])
+    plain = make_world(env, **KEYWORDS | {"plain": True}, wrappers=[doubled])
+    assert isinstance(plain, PlainWorld)
