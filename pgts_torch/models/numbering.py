@@ -78,7 +78,8 @@ class Numbering:
         if merge not in ("auto", True, False):
             raise PgtsError(f"merge is {merge!r}; it must be 'auto', True or False")
         self._merge, self._hash = merge, hash
-        self._rows = torch.empty(0, num_columns, dtype=dtype, device=device)
+        with torch.inference_mode(False):
+            self._rows = torch.empty(0, num_columns, dtype=dtype, device=device)
         self.clear()
 
     def __len__(self) -> int:
@@ -98,6 +99,8 @@ class Numbering:
         """Whether all rows are looked up at present."""
         return self._merging
 
+    # What is kept must be ordinary tensors even if the caller is in inference mode.
+    @torch.inference_mode(False)
     def clear(self) -> None:
         """Forget all rows and give their memory back."""
         self._count = self._listed = self._asked = self._new = 0
@@ -109,7 +112,6 @@ class Numbering:
         """The rows with these numbers."""
         return self._rows[number_N]
 
-    # What is kept must be ordinary tensors even if the caller is in inference mode.
     @torch.inference_mode(False)
     @torch.no_grad()
     def number(self, row_ND: Num[Tensor, "N D"]) -> Int[Tensor, "N"]:

@@ -1,6 +1,6 @@
 """The search that chooses: by what the model can do, by how often paths meet, and by the budget."""
 
-import math
+from dataclasses import replace
 from typing import final
 
 import torch
@@ -21,10 +21,12 @@ class AutoSearch(Search):
     """Picks the search by what the model can do, by how often paths meet, and by the budget; `str` says what it picked.
 
     - Outcomes can be listed and the nodes that hold all paths fit into the budget: expectimax of full width, exact.
-    - They can be listed and do not fit: expectimax that unfolds as many states of each level as fit.
+    - They can be listed and do not fit: expectimax that unfolds as many states of each level as fit. The width is
+      halved until they do; where they left room, the next search is twice as wide. Full width is not tried again for
+      as many roots and levels as were too many the last time.
     - They can only be drawn, or turn out to be random where they should be listed: sampled, with as many samples of
       each action as fit if no two paths meet. Where paths met and left room, the next search draws twice as many, up
-      to 32.
+      to 32; one of more roots or levels begins anew, and one that turns out too large is done again with half.
 
     Args:
         model: what is asked.
@@ -38,9 +40,10 @@ class AutoSearch(Search):
         super().__init__(model)
         self.max_nodes = max_nodes
         self._topology = Topology(model) if isinstance(model, EnumeratingModel) else None
-        self._width = max_nodes
-        self._too_deep = math.inf
+        self._width = max(1, max_nodes)
+        self._too_much: tuple[int, int] | None = None
         self._samples = 0
+        self._most_asked = 0, 0
         self._picked = "nothing yet"
         self.keeps_bounds = self._topology is not None
 
@@ -62,6 +65,7 @@ class AutoSearch(Search):
     ) -> Lookahead:
         topology = self._topology
         assert topology is not None
+        calls_before = topology.model_calls
 
         def look(max_width: int | None) -> Lookahead:
             return expectimax(
@@ -75,13 +79,14 @@ class AutoSearch(Search):
                 max_width=max_width,
             )
 
-        if expansions < self._too_deep:
+        too_much = self._too_much
+        if too_much is None or len(root_B) < too_much[0] or expansions < too_much[1]:
             try:
                 full = look(None)
                 self._picked = f"expectimax: the model lists its outcomes, and {full.nodes} nodes hold all paths"
                 return full
             except NodeBudgetExceeded:
-                self._too_deep = expansions
+                self._too_much = len(root_B), expansions
         while True:
             try:
                 narrow = look(self._width)
@@ -90,8 +95,13 @@ class AutoSearch(Search):
                 if self._width == 1:
                     raise
                 self._width //= 2
-        self._picked = f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes"
-        return narrow
+        if float(narrow.pruned_BA.max()) == 0:
+            self._picked = f"expectimax: the model lists its outcomes, and {narrow.nodes} nodes hold all paths"
+        else:
+            self._picked = f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes"
+        if 2 * max(self._width, narrow.nodes) <= self.max_nodes:
+            self._width *= 2
+        return replace(narrow, model_calls=topology.model_calls - calls_before)
 
     def _sampled(
         self,
@@ -103,15 +113,24 @@ class AutoSearch(Search):
         generator: torch.Generator,
     ) -> Lookahead:
         roots, A = len(root_B), self.model.num_actions
+        if roots > self._most_asked[0] or expansions > self._most_asked[1]:
+            self._samples, self._most_asked = 0, (roots, expansions)
         while (
             self._samples < MOST_SAMPLES
             and tree_nodes(roots, A * 2 * max(self._samples, 1), expansions) <= self.max_nodes
         ):
             self._samples = 2 * max(self._samples, 1)
         self._samples = max(self._samples, 1)
-        look = SampledSearch(self.model, samples=self._samples, max_nodes=self.max_nodes)(
-            root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, generator=generator
-        )
+        while True:
+            try:
+                look = SampledSearch(self.model, samples=self._samples, max_nodes=self.max_nodes)(
+                    root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, generator=generator
+                )
+                break
+            except NodeBudgetExceeded:
+                if self._samples == 1:
+                    raise
+                self._samples //= 2
         tree = tree_nodes(roots, A * self._samples, expansions)
         self._picked = (
             f"sampled, {self._samples} outcomes of each action: the model only draws, and {look.nodes} nodes hold "

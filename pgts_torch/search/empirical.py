@@ -38,6 +38,9 @@ class Empirical(EnumeratingModel):
         key: the key of the search, shape [1].
     """
 
+    # What the calls of a `Topology` change must be ordinary tensors even if the caller is in inference mode.
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def __init__(
         self,
         model: Model,

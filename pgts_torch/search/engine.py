@@ -47,7 +47,7 @@ class Search(ABC):
         """One search; the arguments are those of `expectimax`.
 
         Args:
-            generator: drawn from only by searches that sample; equal states of it give equal searches.
+            generator: drawn from only by searches that draw outcomes or noise; equal states of it give equal searches.
         """
         look = self._look(root_B, depth, q_leaf, v_leaf, generator)
         self.model_calls += look.model_calls
@@ -162,20 +162,21 @@ class MCTSSearch(Search):
         model: lists outcomes, or draws them.
         simulations: of each root.
         merge: whether paths that meet are one node.
-        samples: where the model only draws, how many outcomes of each action stand for all (default 4), anew in each
-            search; a model that lists its outcomes needs none.
+        samples: how many drawn outcomes of each action stand for all, anew in each search. Default: all are listed, or
+            4 where the model only draws.
     """
 
     def __init__(self, model: Model, *, simulations: int = 64, merge: bool = True, samples: int | None = None) -> None:
         super().__init__(model)
         self.simulations, self.merge = simulations, merge
-        self.keeps_bounds = isinstance(model, EnumeratingModel)
-        self.topology = Topology(model) if isinstance(model, EnumeratingModel) else None
-        if self.topology is not None and samples is not None:
-            raise PgtsError(f"samples is {samples}; {type(model).__name__} lists its outcomes, none need be drawn")
-        self.samples = DEFAULT_SAMPLES if samples is None else samples
-        if self.samples < 1:
+        if samples is not None and samples < 1:
             raise PgtsError(f"samples is {samples}; it must be at least 1")
+        lists = samples is None and isinstance(model, EnumeratingModel)
+        self.keeps_bounds = lists
+        self.topology = Topology(listing(model, "mcts")) if lists else None
+        self.samples = samples or DEFAULT_SAMPLES
+        if not lists:
+            drawing(model, "mcts")
 
     def _look(
         self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator

@@ -50,8 +50,8 @@ class Lookahead:
         """Lower and upper bounds of T^m Q, as far as sampled outcomes put it in doubt: q - bias -+ z stderr.
 
         z is the normal quantile. The bounds hold with this probability where many outcomes are sampled for each (s, a)
-        (C = 32; with C = 8 rather 90 of 100 than 95) and few actions are tied within the noise: of the bias of exact
-        ties `bias_BA` sees less than half. What the critic gets wrong and what was pruned are not in them.
+        and few actions are tied within the noise, and a little less often with few samples (docs/benchmarks.md): of the
+        bias of exact ties `bias_BA` sees a part. What the critic gets wrong and what was pruned are not in them.
 
         Raises:
             PgtsError: confidence is not between 0 and 1.
@@ -75,7 +75,7 @@ class Leaves:
     Args:
         model: whose states are asked about.
         depth: m, a finite whole number of at least 0.
-        q_leaf: an estimate of Q^pi: states [N] to [N, A].
+        q_leaf: an estimate of Q^pi: states [N] to [N, A]; -inf where an action is not allowed.
         v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.
 
     Raises:
@@ -101,7 +101,7 @@ class Leaves:
         return self._asked(self._v_leaf, state_N, (len(state_N),))
 
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
-        """Q(s, .); as `v` otherwise. Only for critics of Q^pi."""
+        """Q(s, .), -inf where an action is not allowed; as `v` otherwise. Only for critics of Q^pi."""
         assert self._q_leaf is not None
         return self._asked(self._q_leaf, state_N, (len(state_N), self._model.num_actions))
 
@@ -113,7 +113,8 @@ class Leaves:
             raise PgtsError(f"the critic answered with shape {given}; {asked} leaves ask for {shape}")
         if math.isfinite(values.sum()):  # one cheap call; only a sum that overflows makes it look closer in vain
             return values
-        off = torch.nonzero(~torch.isfinite(values))
+        best_N = values if values.ndim == 1 else values.amax(-1)
+        off = torch.nonzero(~best_N.isfinite())
         if len(off):
             row = int(off[0, 0])
             value = values[row].tolist()

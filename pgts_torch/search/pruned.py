@@ -74,7 +74,7 @@ def pruned(
         pruned_BA=pruned_NA[row_B],
         model_calls=topology.model_calls - calls_before,
         critic_calls=leaves.calls,
-        nodes_per_level=tuple(nodes_per_level),
+        nodes_per_level=(*nodes_per_level, *[0] * (leaves.expansions + 1 - len(nodes_per_level))),
     )
 
 

@@ -42,7 +42,7 @@ def sampled(
         q(s, a) = 1/C sum_c [ r_c + gamma_c max_b q(s'_c, b) ]        (Kearns, Mansour and Ng 2002)
 
     All actions of all nodes are looked at. Leaves are those of `expectimax`, asked about distinct states. A sample is
-    named by (search, level, state, action, c), so the answer is the same bit for bit however the roots are split into
+    named by (search, level, state, action, c), so q is the same bit for bit however the roots are split into
     batches or ordered, as long as the generator is in the same state and the model numbers its states alike.
 
     The error falls as 1 / sqrt(C). The maxima over noisy values make the estimate too high wherever actions are nearly

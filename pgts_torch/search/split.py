@@ -57,7 +57,7 @@ class Selection:
             return apportion(policy_NA.mul_(total_N1).sub_(visits_NA).add_(shut_NA), budget_N, most_NA)
         limit_NA = None if most_NA is None else visits_NA + most_NA
         q_NA, given_NA = scaled(q_NA).add_(shut_NA), visits_NA.clone()
-        for given in range(int(budget_N.amax())):
+        for given in range(math.ceil(budget_N.amax())):
             total_N1, next_NA = given_NA.sum(1, keepdim=True), given_NA + 1
             if self.rule == "puct":
                 bonus_NA = (total_N1 + 1).sqrt_() / next_NA * prior_NA
@@ -67,7 +67,8 @@ class Selection:
             if limit_NA is not None:
                 score_NA.masked_fill_(given_NA >= limit_NA, -torch.inf)
             best_N1, a_N1 = score_NA.max(1, keepdim=True)
-            takes_N1 = (budget_N > given).unsqueeze(1) & (best_N1 > -torch.inf)
+            # In a graph a budget may end in a fraction.
+            takes_N1 = (budget_N - given).clamp_(0, 1).unsqueeze(1).masked_fill_(best_N1 == -torch.inf, 0)
             given_NA.scatter_add_(1, a_N1, takes_N1.to(given_NA.dtype))
         return given_NA - visits_NA
 

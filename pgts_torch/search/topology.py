@@ -260,6 +260,9 @@ def check_answer(model: Model, state_N: Int[Tensor, "N"], answer: Outcomes) -> N
     asked, given = (len(state_N), model.num_actions), tuple(answer.reward_NA.shape)
     if given != asked:
         raise PgtsError(f"the model answered for {given} states and actions; it was asked for {asked}")
+    for name, x in (("reward", answer.reward_NA), ("prob", answer.prob_NAK), ("discount", answer.discount_NAK)):
+        if x.dtype != model.dtype:
+            raise PgtsError(f"the model's {name} is {x.dtype}; its dtype is {model.dtype}")
     best_N = answer.reward_NA.amax(-1)
     if not bool(best_N.isfinite().all()):
         n = int(torch.nonzero(~best_N.isfinite())[0, 0])
@@ -275,6 +278,14 @@ def check_answer(model: Model, state_N: Int[Tensor, "N"], answer: Outcomes) -> N
             f"the model's probabilities of what follows state {int(state_N[n])} and action {a} sum to "
             f"{float(total_NA[n, a])}"
         )
+    for name, x_NAK in (("probability", answer.prob_NAK), ("discount", answer.discount_NAK)):
+        off_NAK = ~((x_NAK >= 0) & (x_NAK <= 1 + _TOLERANCE))
+        if bool(off_NAK.any()):
+            n, a, k = torch.nonzero(off_NAK)[0].tolist()
+            raise PgtsError(
+                f"the model's {name} of outcome {k} of state {int(state_N[n])} and action {a} is "
+                f"{float(x_NAK[n, a, k])}; it must be in [0, 1]"
+            )
     child_NAK = answer.child_NAK
     off_NAK = (child_NAK < 0) | (child_NAK >= model.num_states)
     if off_NAK.any():

@@ -24,6 +24,10 @@ _ROOM = 2**22
 """The most edges for which there is room before they are needed."""
 
 
+_DUST = 1e-6
+"""Shares of simulations below this are rounding and go nowhere."""
+
+
 @dataclass(eq=False)
 class _Step:
     """What a wave does on one level: it passes F nodes by M of their actions ("arms") and those by L outcomes.
@@ -95,8 +99,8 @@ class Tree:
 
     def plant(self, root_B: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
         """A node for each of these distinct states; it is expanded."""
+        self.valued[0] = len(root_B)
         node_B = self._add(self.known.rows(root_B), 0)
-        self.valued[0] = len(node_B)
         if self.merge:
             self.node_at[self._place(root_B, 0)] = node_B
         return node_B
@@ -208,7 +212,7 @@ class Tree:
         else:
             self._expand_tree(step, state_L)
         rest_C = step.budget_C - step.used_C
-        can_C = (rest_C > 0) & (self.shut_N.index_select(0, step.child_C) == 0)
+        can_C = (rest_C > _DUST) & (self.shut_N.index_select(0, step.child_C) == 0)
         step.on_G = can_C.nonzero().squeeze(1)
         return step, rest_C.index_select(0, step.on_G)
 

@@ -73,7 +73,7 @@ def test_samples_prove_nothing_but_a_narrow_search_does():
         ("breadth", "search is 'breadth'; it must be one of auto, expectimax, sampled, mcts"),
         ({"type": "auto", "max_width": 3}, "search 'auto' does not take these options: \\['max_width'\\]"),
         ({"type": "mcts", "share": "level"}, "search 'mcts' does not take"),
-        ({"type": "mcts", "samples": 3}, "TabularModel lists its outcomes"),
+        ({"type": "mcts", "samples": 0}, "samples is 0"),
     ],
 )
 def test_a_search_that_does_not_exist_or_an_option_that_it_does_not_heed_is_refused(search, message):

@@ -48,8 +48,8 @@ def test_a_search_that_leaves_nothing_out_is_exact_for_both_kinds_of_leaves(engi
     look = engine(TabularModel(mdp), root_B, depth=depth, v_leaf=lambda s: v_S[s])
     torch.testing.assert_close(look.q_BA, exact.lookahead(mdp, one_step_SA, depth)[root_B])
     assert float(look.pruned_BA.abs().max()) == 0
-    assert look.nodes == sum(look.nodes_per_level)
-    assert 0 < look.model_calls
+    assert len(look.nodes_per_level) == depth + 2
+    assert 0 < look.model_calls <= mdp.num_states * mdp.num_actions * (depth + 1)
 
 
 @every_engine
@@ -95,12 +95,41 @@ class Cage(EnumeratingModel):
 @every_engine
 @pytest.mark.parametrize("pay", [3.0, 1e300, -1e300])
 def test_an_action_that_is_not_allowed_is_minus_infinity_and_never_the_best(engine, pay):
-    if engine is complete_samples:
-        engine = expectimax  # the cage cannot draw
     look = engine(Cage(pay), torch.tensor([1, 0]), depth=1, v_leaf=lambda s: torch.zeros(len(s), dtype=torch.float64))
     best_of_0 = max(1.0, pay)
     expected = [[2 + best_of_0 / 2, -torch.inf], [1 + best_of_0 / 2, pay + 0.5 * 2]]
     torch.testing.assert_close(look.q_BA, torch.tensor(expected, dtype=torch.float64))
+    leaf_SA = torch.tensor([[0.0, 4.0], [6.0, -torch.inf]], dtype=torch.float64)
+    look = engine(Cage(pay), torch.tensor([1, 0]), depth=1, q_leaf=lambda s: leaf_SA[s])
+    expected = [[2 + 4.0 / 2, -torch.inf], [1 + 4.0 / 2, pay + 6.0 / 2]]
+    torch.testing.assert_close(look.q_BA, torch.tensor(expected, dtype=torch.float64))
+
+
+@every_engine
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"prob_NAK": -0.5}, "probability of outcome 0 of state 1 and action 0 is -0.5"),
+        ({"discount_NAK": -1.0}, r"discount of outcome 0 of state 1 and action 0 is -1.0; it must be in \[0, 1\]"),
+        ({"discount_NAK": float("nan")}, "discount of outcome 0 of state 1 and action 0 is nan"),
+        ({"reward_NA": float("nan")}, "rewards in state 1 are"),
+    ],
+)
+def test_a_model_whose_answers_make_no_sense_is_refused_by_the_state(engine, changed, message):
+    class Broken(Cage):
+        def outcomes(self, state_N: Tensor) -> Outcomes:
+            answer = super().outcomes(state_N)
+            for name, value in changed.items():
+                given = getattr(answer, name)
+                given[state_N == 1, 0] = value
+                if name == "prob_NAK":
+                    twice = torch.cat([given, torch.where(given < 0, 1 - given, 0.0)], -1)
+                    both = [torch.cat([x, x], -1) for x in (answer.discount_NAK, answer.child_NAK)]
+                    answer = Outcomes(answer.reward_NA, twice, *both, 2)
+            return answer
+
+    with pytest.raises(PgtsError, match=message):
+        engine(Broken(1.0), torch.tensor([1]), depth=1, v_leaf=lambda s: torch.zeros(len(s), dtype=torch.float64))
 
 
 @every_engine

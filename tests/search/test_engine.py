@@ -126,6 +126,41 @@ def test_the_samples_of_a_model_in_which_paths_rarely_meet_stay_within_the_budge
         assert seen.nodes <= 2_000
 
 
+def test_an_automatic_search_counts_also_the_calls_of_what_turned_out_too_large():
+    model = watched(GARNET)
+    search = AutoSearch(model, max_nodes=300)
+    assert look(search).model_calls == search.model_calls == len(model.asked) * GARNET.num_actions > 0
+
+
+def test_one_search_that_was_too_large_does_not_make_the_automatic_one_narrow_for_good():
+    search = AutoSearch(TabularModel(GARNET), max_nodes=250)
+    v_S = some_v(GARNET)
+
+    def pruned(root_B: Tensor, depth: int) -> float:
+        seen = search(root_B, depth=depth, v_leaf=lambda s: v_S[s], generator=stream(0, "search"))
+        assert ("nodes hold all paths" in str(search)) == (float(seen.pruned_BA.max()) == 0)
+        return float(seen.pruned_BA.max())
+
+    assert pruned(torch.arange(20), 2) > 0
+    assert pruned(torch.arange(1), 1) == 0
+    assert pruned(torch.arange(20), 2) > 0
+
+
+def test_a_larger_search_of_a_model_that_only_draws_takes_fewer_samples():
+    search = AutoSearch(DrawingModel(random_mdp(5000, 4, branching=50, seed=2)), max_nodes=2_000)
+    samples = []
+    for roots, depth in ((1, 0), (3, 2)):
+        seen = search(
+            torch.arange(roots),
+            depth=depth,
+            v_leaf=lambda s: torch.zeros(len(s), dtype=torch.float64),
+            generator=stream(0, "search"),
+        )
+        assert seen.nodes <= 2_000
+        samples.append(int(str(search).split()[1]))
+    assert samples[0] > samples[1]
+
+
 @pytest.mark.parametrize("model", [TabularModel(GARNET), DrawingModel(GARNET)])
 def test_a_budget_that_is_too_small_for_anything_is_an_error(model):
     with pytest.raises(NodeBudgetExceeded):
@@ -152,8 +187,9 @@ def test_a_tree_search_of_a_model_that_only_draws_is_one_of_what_was_drawn():
     assert not torch.equal(look(search, seed=1).q_BA, seen.q_BA)
     assert not search.keeps_bounds
     assert str(search) == "mcts, 100000 simulations, merged, 2 drawn outcomes of each action"
-    with pytest.raises(PgtsError, match="samples is 2; TabularModel lists its outcomes"):
-        MCTSSearch(TabularModel(GARNET), samples=2)
+    assert torch.equal(look(MCTSSearch(TabularModel(GARNET), simulations=100_000, samples=2)).q_BA, seen.q_BA)
+    with pytest.raises(PgtsError, match="samples is 0"):
+        MCTSSearch(DrawingModel(GARNET), samples=0)
 
 
 class ListingModel(EnumeratingModel):

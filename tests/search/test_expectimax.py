@@ -394,7 +394,7 @@ def test_leaf_values_of_a_wrong_shape_are_refused(shape):
 def test_a_leaf_value_that_is_not_finite_is_refused_and_its_state_is_named(bad, depth):
     mdp = ladder(5)
     v_S, q_SA = some_v(mdp), some_q(mdp)
-    v_S[3] = q_SA[3, 1] = bad
+    v_S[3] = q_SA[3] = bad
     model, roots = TabularModel(mdp), torch.tensor([3, 2])
     with pytest.raises(PgtsError, match=rf"value of state 3 is {bad}; it must be finite"):
         expectimax(model, roots, depth=depth, v_leaf=Critic(v_S))

@@ -14,7 +14,7 @@ from pgts_torch.errors import NodeBudgetExceeded, PgtsError
 from pgts_torch.models import TabularModel
 from pgts_torch.search import Topology, expectimax
 from pgts_torch.search.mcts import mcts
-from pgts_torch.search.split import apportion
+from pgts_torch.search.split import Selection, apportion
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, ladder, random_mdp
 from tests.search.models import Critic, InterningModel, some_q, some_v, walk_the_tree, watched, zeros
@@ -487,3 +487,22 @@ def test_roots_that_are_no_states_are_refused():
     for bad in (torch.tensor([7]), torch.tensor([], dtype=torch.int64), torch.tensor([0.0])):
         with pytest.raises(PgtsError, match="root_B"):
             mcts(TabularModel(ladder(5)), bad, depth=1, v_leaf=zeros, simulations=3)
+
+
+@pytest.mark.parametrize("merge", [False, True])
+def test_the_roots_count_among_the_nodes_from_the_start(merge):
+    model, knobs = TabularModel(random_mdp(50, 3, branching=4, seed=1)), {"depth": 3, "v_leaf": zeros, "merge": merge}
+    nodes = mcts(model, torch.tensor([0, 7]), simulations=1, **knobs).nodes
+    assert mcts(model, torch.tensor([0, 7]), simulations=1, max_nodes=nodes, **knobs).nodes == nodes
+    with pytest.raises(NodeBudgetExceeded, match=f"max_nodes is {nodes - 1}"):
+        mcts(model, torch.tensor([0, 7]), simulations=1, max_nodes=nodes - 1, **knobs)
+
+
+@pytest.mark.parametrize("rule", ["puct", "uct"])
+def test_rules_with_exploration_hand_out_the_whole_budget_and_no_more_also_where_it_ends_in_a_fraction(rule):
+    """In a graph it may: paths that meet share what was used below."""
+    budget_N, zero_NA = torch.tensor([0.25, 3.5, 2.0], dtype=torch.float64), torch.zeros(3, 2, dtype=torch.float64)
+    given_NA = Selection(rule, 1.25).split(
+        budget_N, q_NA=zero_NA, visits_NA=zero_NA, prior_NA=zero_NA + 0.5, shut_NA=zero_NA, most_NA=None
+    )
+    torch.testing.assert_close(given_NA.sum(1), budget_N)

@@ -339,3 +339,10 @@ def test_a_pruned_search_in_inference_mode_leaves_a_topology_that_serves_outside
     assert not look.q_BA.requires_grad
     assert not look.pruned_BA.requires_grad
     assert not look.q_BA.is_inference()
+
+
+def test_levels_that_no_path_reaches_hold_no_nodes():
+    ended = Outcomes(*(torch.zeros(2, 1), torch.ones(2, 1, 1), torch.zeros(2, 1, 1)), torch.zeros(2, 1, 1).long(), 2)
+    model = TabularModel(TabularMDP(ended.to(dtype=torch.float64), torch.tensor([0.5, 0.5], dtype=torch.float64)))
+    look = expectimax(model, torch.tensor([1]), depth=3, v_leaf=zeros, max_width=1)
+    assert look.nodes_per_level == (1, 0, 0, 0, 0)

@@ -641,3 +641,16 @@ def test_a_model_is_asked_for_no_more_than_it_can():
 def test_a_confidence_that_is_no_probability_is_refused(confidence):
     with pytest.raises(PgtsError, match="confidence is"):
         look(ladder(), torch.tensor([0]), depth=1).interval(confidence)
+
+
+@pytest.mark.parametrize("share", ["none", "level", "search"])
+def test_inference_mode_changes_no_sample(share):
+    def seen() -> Lookahead:
+        knobs = {"samples": 3, "share": share, "generator": stream(0, "inference")}
+        return sampled(TabularModel(ladder(5)), torch.tensor([0, 1]), depth=3, v_leaf=zeros, **knobs)
+
+    outside = seen()
+    with torch.inference_mode():
+        inside = seen()
+    assert torch.equal(inside.q_BA, outside.q_BA)
+    assert torch.equal(inside.stderr_BA, outside.stderr_BA)
