@@ -40,8 +40,8 @@ def main(arguments: Arguments | None = None) -> int:
     """Run `pgts` with these arguments (default: those of the process).
 
     Returns:
-        The exit code: 0; 1 if `check-model` found something missing; 2 after a mistake of the caller, which stands on
-        stderr, a line each; 130 after Ctrl-C.
+        The exit code: 0; 1 if `check-model` found something missing or a run of a sweep failed; 2 after a mistake of
+        the caller, which stands on stderr, a line each; 130 after Ctrl-C.
     """
     try:
         code = _dispatch(sys.argv[1:] if arguments is None else arguments)
@@ -80,6 +80,38 @@ def train(arguments: Arguments) -> None:
 
     summary = run.train(config)
     print(json.dumps(asdict(summary)) if fixed.json else run.describe(summary))
+
+
+@command
+def sweep(arguments: Arguments) -> None:
+    """Train with several seeds at several depths, and compare."""
+    parser = _Parser("sweep", sweep, usage="%(prog)s --out DIR [--config FILE] [--KEY VALUE ...]")
+    parser.add_argument("--out", metavar="DIR", type=_output_folder, help="gets DIR/depth-D/seed-S, a table, a picture")
+    parser.add_argument("--config", metavar="FILE", help="as for pgts train; none: the defaults")
+    parser.add_argument("--seeds", metavar="N", type=_whole(1), default=5, help="0 to N - 1 (default: %(default)s)")
+    parser.add_argument("--depths", metavar="LIST", type=_depth_list, default=(), help="as in 0,2,4 (default: its own)")
+    parser.add_argument("--jobs", metavar="N", type=_whole(1), default=1, help="runs at once (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the table as one JSON object")
+    parser.epilog = SWEEP_HELP
+    fixed, overrides = parser.parse_known_args(arguments)
+    if fixed.out is None:
+        parser.error("the following arguments are required: --out")
+    from pgts_torch.experiment import sweep as sweeping
+
+    runs = sweeping.plan(fixed.config, overrides, depths=fixed.depths, num_seeds=fixed.seeds, out=fixed.out)
+    answer = sweeping.sweep(runs, jobs=fixed.jobs, out=fixed.out)
+    print(json.dumps(asdict(answer)) if fixed.json else sweeping.describe(answer))
+    for name, mistake in answer.failures.items():
+        print(f"error: {name}: {mistake}", file=sys.stderr)
+    if answer.failures:
+        raise SystemExit(CHECK_FAILED)
+
+
+SWEEP_HELP = """\
+Keys of the configuration are those of pgts train. Runs that are finished are
+kept, so a sweep that was cut off goes on when it is started again, and more
+seeds or depths can be added. Each run has one thread. A run that fails is
+named, the others go on, and the exit code is 1."""
 
 
 @command
@@ -314,6 +346,11 @@ def _whole(least: int) -> Callable[[str], int]:
 def _whole_list(text: str) -> tuple[int, ...]:
     """An argparse type: whole numbers separated by commas."""
     return tuple(_whole(0)(part) for part in text.split(","))
+
+
+def _depth_list(text: str) -> tuple[int | str, ...]:
+    """An argparse type: depths separated by commas, each a whole number or the word adaptive."""
+    return tuple(dict.fromkeys(part if part == "adaptive" else _whole(0)(part) for part in text.split(",")))
 
 
 def _json_object(text: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, final
 
 import gymnasium
-import scipy.stats
+import scipy.special
 import torch
 from gymnasium.vector import VectorEnv
 from jaxtyping import Float, Int
@@ -51,7 +51,7 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool, seed: int) 
         seed: of these episodes alone; training is not touched.
     """
     env = algorithm.make_copies(episodes)
-    limit = gymnasium.spec(algorithm.env_id).max_episode_steps or UNLIMITED_LENGTH
+    limit = time_limit(algorithm.env_id)
     names = ("evaluate", "deterministic" if deterministic else "sampled")
     made = rollout(
         _Watched(algorithm.world, env),
@@ -69,6 +69,11 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool, seed: int) 
         _score(made.returns()),
         _score(made.alive_TB.double().sum(0)),
     )
+
+
+def time_limit(env_id: str) -> int:
+    """The most steps of an episode under the environment's own time limit, else UNLIMITED_LENGTH."""
+    return gymnasium.spec(env_id).max_episode_steps or UNLIMITED_LENGTH
 
 
 @final
@@ -135,4 +140,4 @@ def _score(value_B: Float[Tensor, "B"]) -> Score:
     if count == 1:
         return Score(float(value_B), None)
     spread = float(value_B.std()) / math.sqrt(count)
-    return Score(float(value_B.mean()), float(scipy.stats.t.ppf(0.975, count - 1)) * spread)
+    return Score(float(value_B.mean()), float(scipy.special.stdtrit(count - 1, 0.975)) * spread)

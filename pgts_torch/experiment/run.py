@@ -88,6 +88,7 @@ def build(config: Config) -> PGTS:
         horizon=config.rollout.horizon.plain(),
         num_envs=config.rollout.num_envs,
         observation_key=config.env.observation_key,
+        action_repeat=config.search.action_repeat,
         gamma=config.env.gamma,
         seed=config.seed,
         device=config.device,
@@ -265,14 +266,16 @@ def describe(summary: Summary) -> str:
     """The summary as a person reads it, within 80 columns."""
     rows: dict[str, Any] = {}
     if summary.J is not None and summary.J_optimal is not None:
-        share = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 else ""
+        share = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 <= summary.J else ""
         rows |= {
             "return of the policy, J": f"{summary.J:.4g}{share}",
             "optimal return, J*": f"{summary.J_optimal:.4g}",
             f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
         }
+    if summary.certificate is not None:
+        kind = "proved" if summary.certificate_is_proved else "an estimate: the critic is learned"
+        rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({kind})"
     rows |= {
-        "certificate, J* - J <=": _certificate_text(summary),
         "greedy episodes, return": _score_text(summary.deterministic),
         "sampled episodes, return": _score_text(summary.sampled),
         "search": textwrap.fill(summary.search, 50).replace("\n", "\n" + 28 * " "),
@@ -282,13 +285,6 @@ def describe(summary: Summary) -> str:
         "run folder": summary.run,
     }
     return "\n".join(f"{name:<28}{value}" for name, value in rows.items())
-
-
-def _certificate_text(summary: Summary) -> str:
-    if summary.certificate is None:
-        return "none"
-    kind = "proved" if summary.certificate_is_proved else "an estimate: the critic is learned"
-    return f"{summary.certificate:.3g} ({kind})"
 
 
 def _score_text(evaluation: Evaluation) -> str:

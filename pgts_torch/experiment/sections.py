@@ -310,6 +310,10 @@ class SearchConfig(Section):
     stop_at: NonNegative | None = None
     """Training ends once the certificate proves that the policy is this close to the optimal return; null: never."""
 
+    action_repeat: Count = 1
+    """How often the lookahead takes an action before it takes the next, so that it sees as many times further. Not in
+    numbered environments."""
+
     kind: Literal["auto", "expectimax", "sampled", "mcts"] = "auto"
     """How it is made. auto picks by what the model can do and by the budget; expectimax looks at all outcomes, sampled
     at drawn ones, mcts where it seems worth while."""

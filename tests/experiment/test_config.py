@@ -381,8 +381,11 @@ def test_a_shipped_configuration_is_valid_and_says_what_it_shows(path: Path) -> 
     gymnasium.make(config.env.id, **config.env.kwargs).close()
 
 
-def test_the_shipped_configurations_are_those_of_the_paper_and_deep_sea() -> None:
-    assert [path.stem for path in SHIPPED] == ["deep_sea", "grid", "ladder", "random", "tightrope"]
+def test_the_shipped_configurations_are_those_of_the_paper_and_of_gymnasium() -> None:
+    own = {"deep_sea", "grid", "ladder", "random", "tightrope"}
+    others = {"acrobot", "cartpole", "cliff_walking", "frozen_lake_4x4", "frozen_lake_8x8", "mountain_car", "taxi"}
+    assert {path.stem for path in SHIPPED} == own | others
+    assert own == {path.stem for path in SHIPPED if load(path).env.id.startswith("pgts/")}
 
 
 @pytest.mark.parametrize("path", [None, *SHIPPED], ids=lambda path: path.stem if path else "defaults")

@@ -266,7 +266,7 @@ def test_terminal_outcomes_and_actions_that_are_not_allowed_need_no_node():
         assert not narrow.pruned_BA.any()
     assert narrow.nodes_per_level == (3, 1, 1, 1, 1, 1)
     ends = expectimax(Three(), torch.tensor([2]), depth=3, v_leaf=zeros, max_width=1)
-    assert (ends.q_BA.tolist(), ends.nodes_per_level, ends.critic_calls) == ([[5.0, -inf]], (1, 0), 0)
+    assert (ends.q_BA.tolist(), ends.nodes_per_level, ends.critic_calls) == ([[5.0, -inf]], (1, 0, 0, 0, 0), 0)
 
 
 def test_nothing_is_pruned_behind_an_action_that_is_not_allowed():

@@ -1,0 +1,274 @@
+"""One configuration at several depths and with several seeds: `pgts sweep`."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.config import Config
+from pgts_torch.experiment.loading import load
+
+CONFIDENCE = 0.95
+RESAMPLES = 1000
+CURVE_POINTS = 100
+TABLE_FILE, CURVES_FILE = "table.json", "curves.png"
+
+SET_BY_SWEEP = {
+    "search.depth": "--depths says which",
+    "seed": "--seeds says how many",
+    "run.dir": "--out is the folder of all runs",
+    "run.overwrite": "finished runs are kept, others begin anew",
+    "threads": "every run has one, --jobs says how many run at once",
+}
+"""Keys that a sweep sets itself, and what is to be said instead."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a sweep: its depth, its seed, its whole configuration, and the command line that begins it."""
+
+    depth: int | str
+    seed: int
+    config: Config
+    arguments: tuple[str, ...]
+
+    @property
+    def folder(self) -> Path:
+        return Path(str(self.config.run.dir))
+
+    @property
+    def name(self) -> str:
+        return f"depth {self.depth}, seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class Mean:
+    """An interquartile mean over seeds with its bootstrap interval; no interval for one seed."""
+
+    mean: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a depth came to.
+
+    score: of the trained policies, J where it is known exactly, else the mean return of sampled episodes.
+    greedy: the mean return of greedy episodes.
+    env_steps, model_calls, seconds: interquartile means.
+    """
+
+    depth: int | str
+    num_runs: int
+    score: Mean
+    greedy: Mean
+    env_steps: float
+    model_calls: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What a sweep came to: a row for each depth with a finished run, what `score` is, and what failed and why."""
+
+    rows: tuple[Row, ...]
+    score_is: str
+    failures: Mapping[str, str]
+    out: str
+
+
+def plan(
+    path: str | None, overrides: Sequence[str], *, depths: Sequence[int | str], num_seeds: int, out: Path
+) -> list[Run]:
+    """The runs of a sweep, with the seeds 0, 1, ... at each depth.
+
+    Args:
+        path, overrides: of the configuration, as `load` takes them.
+        depths: none: the configuration's own.
+
+    Raises:
+        ConfigError: a configuration is wrong.
+        PgtsError: an override that the sweep sets itself, or a folder that holds another run.
+    """
+    for key in (override.removeprefix("--").partition("=")[0] for override in overrides if override.startswith("--")):
+        if key in SET_BY_SWEEP:
+            raise PgtsError(f"--{key} is set by the sweep: {SET_BY_SWEEP[key]}")
+    shared = ["--config", path] if path is not None else []
+    runs = []
+    for depth in depths or [load(path, overrides).search.depth]:
+        for seed in range(num_seeds):
+            folder = out / f"depth-{depth}" / f"seed-{seed}"
+            own = {"search.depth": depth, "seed": seed, "threads": 1, "run.dir": folder, "run.overwrite": "true"}
+            arguments = [*overrides, *(f"--{key}={value}" for key, value in own.items())]
+            runs.append(Run(depth, seed, load(path, arguments), (*shared, *arguments)))
+    for run in runs:
+        if _summary(run) is not None and load(run.folder / "config.yaml") != run.config:
+            raise PgtsError(f"{run.folder} holds a run of another configuration; choose another --out")
+    return runs
+
+
+def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
+    """Run those that are not finished, each in a process of its own, and write table.json and curves.png."""
+    failures = _run_all([run for run in runs if _summary(run) is None], jobs)
+    finished = [run for run in runs if _summary(run) is not None]
+    answer = Sweep(tuple(_rows(finished)), _score_is(finished), failures, str(out))
+    out.mkdir(parents=True, exist_ok=True)
+    (out / TABLE_FILE).write_text(json.dumps(asdict(answer), indent=2) + "\n", encoding="utf-8")
+    if finished:
+        _draw_curves(finished, out / CURVES_FILE)
+    return answer
+
+
+def interquartile_mean(score_XR: Float[np.ndarray, "*X R"]) -> Float[np.ndarray, "*X"]:
+    """The mean over runs without the lowest and the highest quarter of them, rounded down (Agarwal et al. 2021)."""
+    num_runs = score_XR.shape[-1]
+    cut = num_runs // 4
+    return np.asarray(np.sort(score_XR, axis=-1)[..., cut : num_runs - cut].mean(axis=-1))
+
+
+def bootstrap_interval(score_XR: Float[np.ndarray, "*X R"]) -> Float[np.ndarray, "2 *X"]:
+    """The ends of the middle 95 % of the interquartile means of resampled runs (Efron 1979), by a fixed seed."""
+    num_runs = score_XR.shape[-1]
+    rows_YR = np.random.default_rng(0).integers(num_runs, size=(RESAMPLES, num_runs))
+    tail = (1 - CONFIDENCE) / 2
+    return np.quantile(interquartile_mean(score_XR[..., rows_YR]), [tail, 1 - tail], axis=-1)
+
+
+def describe(answer: Sweep) -> str:
+    """The table as a person reads it, within 80 columns."""
+    lines = [f"{'depth':>8}{'runs':>5}{answer.score_is:>11}{'95 % interval':>24}{'steps':>10}{'calls':>11}{'s':>8}"]
+    for row in answer.rows:
+        score = row.score
+        interval = "" if score.low is None else f"[{score.low:.4g}, {score.high:.4g}]"
+        lines.append(
+            f"{row.depth:>8}{row.num_runs:>5}{score.mean:>11.4g}{interval:>24}"
+            f"{row.env_steps:>10.0f}{row.model_calls:>11.0f}{row.seconds:>8.1f}"
+        )
+    if not answer.rows:
+        return "no run has finished"
+    what = "return of the policy" if answer.score_is == "J" else "return of sampled episodes"
+    return "\n".join([*lines, "", f"Interquartile means over seeds; {answer.score_is}: {what}.", f"in {answer.out}"])
+
+
+def _run_all(runs: Sequence[Run], jobs: int) -> dict[str, str]:
+    """What failed, by name, with the last line that it wrote."""
+    failures: dict[str, str] = {}
+    processes: list[subprocess.Popen[str]] = []
+    pool = ThreadPoolExecutor(jobs)
+    try:
+        waiting = {pool.submit(_run_one, run, processes): run for run in runs}
+        for number, future in enumerate(as_completed(waiting), 1):
+            seconds, mistake = future.result()
+            name = waiting[future].name
+            ending = f"done in {seconds:.0f} s" if mistake is None else f"FAILED: {mistake}"
+            print(f"[{number}/{len(runs)}] {name}: {ending}", file=sys.stderr, flush=True)
+            if mistake is not None:
+                failures[name] = mistake
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.terminate()
+    return failures
+
+
+def _run_one(run: Run, processes: list[subprocess.Popen[str]]) -> tuple[float, str | None]:
+    """Seconds, and the last line of what it complained about if it failed."""
+    started = time.perf_counter()
+    command = [sys.executable, "-m", "pgts_torch.experiment.cli", "train", *run.arguments]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
+    ) as process:
+        processes.append(process)
+        _, complaint = process.communicate()
+    seconds = time.perf_counter() - started
+    if process.returncode == 0:
+        return seconds, None
+    last = (complaint.strip().splitlines() or [f"exit code {process.returncode}"])[-1]
+    return seconds, last.removeprefix("error: ")
+
+
+def _summary(run: Run) -> dict[str, Any] | None:
+    """What a finished run came to; None if it is not finished."""
+    try:
+        return json.loads((run.folder / "summary.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+
+
+def _score_is(runs: Iterable[Run]) -> str:
+    return "J" if all(_finished(run)["J"] is not None for run in runs) else "return"
+
+
+def _finished(run: Run) -> dict[str, Any]:
+    summary = _summary(run)
+    assert summary is not None
+    return summary
+
+
+def _rows(runs: Sequence[Run]) -> list[Row]:
+    key = _score_is(runs)
+    rows = []
+    for depth in dict.fromkeys(run.depth for run in runs):
+        summaries = [_finished(run) for run in runs if run.depth == depth]
+        scores = [each["J"] if key == "J" else each["sampled"]["episodic_return"]["mean"] for each in summaries]
+        greedy = [each["deterministic"]["episodic_return"]["mean"] for each in summaries]
+        costs = (
+            float(interquartile_mean(np.array([each[name] for each in summaries], dtype=np.float64)))
+            for name in ("env_steps", "model_calls", "seconds")
+        )
+        rows.append(Row(depth, len(summaries), _mean(scores), _mean(greedy), *costs))
+    return rows
+
+
+def _mean(scores: Sequence[float]) -> Mean:
+    score_R = np.array(scores, dtype=np.float64)
+    low, high = bootstrap_interval(score_R).tolist() if len(scores) > 1 else (None, None)
+    return Mean(float(interquartile_mean(score_R)), low, high)
+
+
+def _draw_curves(runs: Sequence[Run], path: Path) -> None:
+    """The interquartile mean over seeds against environment steps, a line with its interval for each depth."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    tag = ""
+    for depth in dict.fromkeys(run.depth for run in runs):
+        histories = [_history(run) for run in runs if run.depth == depth]
+        tag = histories[0][0]
+        first = max(step_K[0] for _, step_K, _ in histories)
+        last = min(step_K[-1] for _, step_K, _ in histories)
+        step_X = np.linspace(first, last, CURVE_POINTS)
+        value_XR = np.stack([np.interp(step_X, step_K, value_K) for _, step_K, value_K in histories], axis=-1)
+        [line] = axes.plot(step_X, interquartile_mean(value_XR), label=f"depth {depth}")
+        if len(histories) > 1:
+            low_X, high_X = bootstrap_interval(value_XR)
+            axes.fill_between(step_X, low_X, high_X, color=line.get_color(), alpha=0.2, linewidth=0)
+    axes.set(xlabel="environment steps", ylabel=tag, title=f"{runs[0].config.name}, {runs[0].config.env.id}")
+    axes.legend()
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)
+
+
+def _history(run: Run) -> tuple[str, np.ndarray, np.ndarray]:
+    """The tag of a learning curve, its steps and its values."""
+    lines = [json.loads(line) for line in (run.folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    tag = "exact/J" if "exact/J" in lines[0] else "charts/episodic_return"
+    points = [(line["step"], line[tag]) for line in lines if line.get(tag) is not None]
+    step_K, value_K = np.array(points, dtype=np.float64).T
+    return tag, step_K, value_K
