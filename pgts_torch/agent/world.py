@@ -18,7 +18,7 @@ from torch import Tensor
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.classic import ClassicModel, dynamics_of
-from pgts_torch.models.environments import base_actions, changing_wrapper
+from pgts_torch.models.environments import base_actions, changing_wrapper, register
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import adapter_for
 from pgts_torch.models.tabular import TabularModel, tabular_truth
@@ -366,6 +366,7 @@ def make_vector_env(env_id: str, num_envs: int, *, gamma: float | None, **kwargs
     """
     if num_envs < 1:
         raise PgtsError(f"num_envs is {num_envs}; it must be at least 1")
+    register(env_id)
     options: dict[str, Any] = {"max_episode_steps": -1, **kwargs}
     try:
         if gymnasium.spec(env_id).namespace == "pgts":

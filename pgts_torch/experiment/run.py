@@ -30,7 +30,6 @@ from pgts_torch.experiment.tracking import (
     prepare_folder,
     versions,
 )
-from pgts_torch.models.environments import make_env
 from pgts_torch.tabular import exact, stationary
 
 PLAIN_LINES = 20
@@ -73,7 +72,6 @@ def build(config: Config) -> PGTS:
         PgtsError: the environment does not exist or has no model, or parts do not fit it.
     """
     sampled = config.estimator.type == "sampled"
-    _check_env(config)
     return PGTS(
         config.env.id,
         depth=config.search.depth,
@@ -94,11 +92,6 @@ def build(config: Config) -> PGTS:
         device=config.device,
         env_kwargs=dict(config.env.kwargs),
     )
-
-
-def _check_env(config: Config) -> None:
-    """Import what registers the environment; PgtsError where it is not installed, or cannot be made."""
-    make_env(config.env.id, **config.env.kwargs).close()
 
 
 def train(config: Config) -> Summary:
@@ -127,7 +120,6 @@ def evaluate_run(run: str | Path, *, episodes: int, seed: int) -> dict[str, Eval
     """Evaluate the last checkpoint of a run: greedily and by drawing actions from the policy."""
     torch.set_num_threads(1)
     config = load(Path(run) / CONFIG_FILE)
-    _check_env(config)
     algorithm = PGTS.load(last_checkpoint(Path(run)))
     return {
         kind: evaluate(algorithm, episodes=episodes, deterministic=kind == "deterministic", seed=seed)

@@ -44,12 +44,7 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
     if not isinstance(env, str | EnvSpec):
         return env()
     name = env if isinstance(env, str) else env.id
-    for start, (module, extra) in _MODULES.items():
-        if name.startswith(start):
-            try:
-                importlib.import_module(module)
-            except ModuleNotFoundError as error:
-                raise PgtsError(f"{name} needs {module}: pip install 'pgts_torch[{extra}]'") from error
+    register(name)
     try:
         return gymnasium.make(env, **kwargs)
     except gymnasium.error.DependencyNotInstalled as error:
@@ -60,6 +55,16 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
 
 _MODULES = {"MiniGrid-": ("minigrid", "envs"), "BabyAI-": ("minigrid", "envs"), "ALE/": ("ale_py", "atari")}
 """Environments that are registered by a module, by the start of their ids, and the extra that installs it."""
+
+
+def register(env_id: str) -> None:
+    """Import what registers an environment with Gymnasium; PgtsError, naming the extra, where that is not installed."""
+    for start, (module, extra) in _MODULES.items():
+        if env_id.startswith(start):
+            try:
+                importlib.import_module(module)
+            except ModuleNotFoundError as error:
+                raise PgtsError(f"{env_id} needs {module}: pip install 'pgts_torch[{extra}]'") from error
 
 
 def all_actions(space: spaces.Space) -> Iterator[Any]:

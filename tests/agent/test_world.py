@@ -379,3 +379,21 @@ def test_a_model_is_refused_where_a_wrapper_may_change_what_it_knows(env):
         make_world(env, **KEYWORDS, wrappers=[doubled])
     plain = make_world(env, **KEYWORDS | {"plain": True}, wrappers=[doubled])
     assert isinstance(plain, PlainWorld)
+
+
+def test_images_of_a_minigrid_are_learned_from_with_a_lookahead():
+    pytest.importorskip("minigrid")
+    model = PGTS(
+        "MiniGrid-Empty-5x5-v0",
+        depth=1,
+        policy={"type": "cnn", "scale": 10.0},
+        observation_key="image",
+        num_envs=2,
+        horizon={"type": "fixed", "length": 4},
+    )
+    seen = model.iterate()
+    assert isinstance(model.world, SimulatedWorld)
+    assert model.world.observe(seen.state_N).shape[1:] == (7, 7, 3)
+    assert 0 < seen.model_calls <= 2 * len(seen.state_N) * model.world.num_actions * (1 + model.world.num_actions)
+    observation, _ = gymnasium.make("MiniGrid-Empty-5x5-v0").reset(seed=0)
+    assert 0 <= model.predict(observation) < model.world.num_actions
