@@ -19,7 +19,6 @@ from pgts_torch.agent.pgts import PGTS, Iteration
 from pgts_torch.experiment import diagnostics
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.evaluate import Evaluation, evaluate, last_checkpoint
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.pictures import policy_picture
 from pgts_torch.experiment.tracking import (
     CHECKPOINTS,
@@ -119,7 +118,6 @@ def train(config: Config) -> Summary:
 def evaluate_run(run: str | Path, *, episodes: int, seed: int) -> dict[str, Evaluation]:
     """Evaluate the last checkpoint of a run: greedily and by drawing actions from the policy."""
     torch.set_num_threads(1)
-    config = load(Path(run) / CONFIG_FILE)
     algorithm = PGTS.load(last_checkpoint(Path(run)))
     return {
         kind: evaluate(algorithm, episodes=episodes, deterministic=kind == "deterministic", seed=seed)
