@@ -1,0 +1,27 @@
+"""The comparison that users ask for, a question each.
+
+    python benchmarks/learning.py deep_sea      who finds the treasure, and could one have known?
+    python benchmarks/learning.py tasks         how soon is an environment solved, against PPO, A2C and DQN?
+    python benchmarks/learning.py throughput    how fast is the training, and what does a lookahead cost?
+    python benchmarks/learning.py variance      what does the depth do to the gradient estimate?
+
+What follows are the options of the script of that name: --help lists them.
+"""
+
+import argparse
+import importlib
+
+QUESTIONS = ("deep_sea", "tasks", "throughput", "variance")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, add_help=False
+    )
+    parser.add_argument("question", choices=QUESTIONS)
+    given, options = parser.parse_known_args()
+    importlib.import_module(given.question).main(options)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,210 @@
+"""How soon is an environment solved, against the algorithms that people use today?
+
+    python benchmarks/tasks.py [--seeds N] [--tasks taxi,cartpole] [--methods pgts,ppo] [--jobs N]
+                               [--runs FILE] [--json FILE] [--picture FILE]
+
+Each shipped configuration against PPO, A2C and DQN of stable-baselines3, with the tuned settings of its zoo where it
+has some (`task_rivals.py`). All are evaluated alike, by greedy episodes in fresh copies, at 500 environment steps and
+then at each 1.25 times as many. A run ends when its budget of environment steps is spent, or at the third evaluation in
+a row that reaches the stated return; it is said to have reached it at the first of these three. Seconds are CPU seconds
+without the evaluations.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from records import Key, Record, measure
+
+from pgts_torch.experiment import run as experiment
+from pgts_torch.experiment.evaluate import evaluate
+from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.sweep import bootstrap_interval, interquartile_mean
+
+ROOT = Path(__file__).resolve().parent.parent
+RUNS = Path("runs/learning/tasks.jsonl")
+METHODS = ("pgts", "ppo", "a2c", "dqn")
+FIRST_LOOK, GROWTH, IN_A_ROW = 500, 1.25, 3
+
+
+@dataclass(frozen=True)
+class Task:
+    """A configuration, the return that is to be reached, the budget of environment steps, episodes of an evaluation."""
+
+    reach: float
+    budget: int
+    episodes: int
+
+
+TASKS = {
+    "frozen_lake_8x8": Task(0.75, 120_000, 100),
+    "cliff_walking": Task(-13, 100_000, 1),
+    "taxi": Task(7.0, 200_000, 100),
+    "cartpole": Task(475, 100_000, 20),
+    "acrobot": Task(-100, 100_000, 20),
+    "mountain_car": Task(-115, 120_000, 20),
+    "door_key": Task(0.9, 100_000, 20),
+}
+
+
+class Watch:
+    """Evaluates a training now and then, and says when it has come to its end."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.curve: list[tuple[int, float]] = []
+        self.reached: dict[str, float] | None = None
+        self._next, self._row = float(FIRST_LOOK), list[dict[str, float]]()
+        self._started, self._evaluating = time.process_time(), 0.0
+
+    def __call__(self, env_steps: int, model_calls: int, evaluate: Callable[[], float]) -> bool:
+        """Whether the training goes on."""
+        if env_steps < self._next and env_steps < self.task.budget:
+            return True
+        while self._next <= env_steps:
+            self._next *= GROWTH
+        cost = {"env_steps": env_steps, "model_calls": model_calls, "seconds": self.seconds}
+        begun = time.process_time()
+        score = evaluate()
+        self._evaluating += time.process_time() - begun
+        self.curve.append((env_steps, score))
+        self._row = [*self._row, cost] if score >= self.task.reach else []
+        if len(self._row) == IN_A_ROW:
+            self.reached = self._row[0]
+        return self.reached is None and env_steps < self.task.budget
+
+    @property
+    def seconds(self) -> float:
+        return time.process_time() - self._started - self._evaluating
+
+    def record(self) -> Record:
+        return {"reached": self.reached, "last": self.curve[-1][1], "seconds": self.seconds, "curve": self.curve}
+
+
+def run(key: Key) -> Record:
+    """One method on one task with one seed."""
+    task = TASKS[key["task"]]
+    config = load(str(ROOT / "configs" / f"{key['task']}.yaml"), ["--seed", str(key["seed"])])
+    if key["method"] == "pgts":
+        model, watch = experiment.build(config), Watch(task)
+        model.learn(
+            task.budget,
+            callback=lambda model, _: watch(
+                model.num_env_steps,
+                model.num_model_calls,
+                lambda: (
+                    evaluate(model, episodes=task.episodes, deterministic=True, seed=key["seed"]).episodic_return.mean
+                ),
+            ),
+        )
+        return watch.record()
+    from task_rivals import train
+
+    watch = Watch(task)
+    train(key["method"], config.env.id, seed=key["seed"], gamma=config.env.gamma, watch=watch, budget=task.budget)
+    return watch.record()
+
+
+def row(task: str, method: str, records: list[Record]) -> str:
+    """A row of the table: how many seeds reached the return, after how much, and where all of them ended."""
+
+    def interval(values: list[float], form: str) -> str:
+        value_R = np.array(values, dtype=float)
+        low, high = bootstrap_interval(value_R)
+        return f"{interquartile_mean(value_R):{form}} ({low:{form}} to {high:{form}})"
+
+    reached = [r["reached"] for r in records if r["reached"] is not None]
+    costs = {name: sorted(r[name] for r in reached) for name in ("env_steps", "model_calls", "seconds")}
+    most = len(reached) > len(records) / 2
+    missing = len(records) - len(reached)
+    median = {name: np.median([*values, *[np.inf] * missing]) if most else None for name, values in costs.items()}
+    steps, calls, seconds = (
+        "-" if value is None or np.isinf(value) else f"{value:,.{digits}f}"
+        for value, digits in zip(median.values(), (0, 0, 1), strict=True)
+    )
+    return (
+        f"| {task} | {TASKS[task].reach:g} | {method.upper()} | {len(reached)} of {len(records)} | {steps} | {calls} "
+        f"| {seconds} | {interval([r['last'] for r in records], '.4g')} |"
+    )
+
+
+def table(records: list[Record]) -> str:
+    """In Markdown."""
+    lines = [
+        "| task | return | method | seeds that reached it | env steps | model calls | CPU s | return at the end |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for task in dict.fromkeys(r["task"] for r in records):
+        for method in METHODS:
+            mine = [r for r in records if r["task"] == task and r["method"] == method]
+            lines += [row(task, method, mine)] if mine else []
+    return "\n".join(lines)
+
+
+def picture(records: list[Record]) -> Figure:
+    """The return of greedy episodes against environment steps, for each task; a line is a median over seeds."""
+    tasks = list(dict.fromkeys(r["task"] for r in records))
+    figure = Figure(figsize=(12, 5.4), layout="constrained")
+    panels = figure.subplots(2, 4).flatten()
+    for axes, task in zip(panels, tasks, strict=False):
+        for method in METHODS:
+            mine = [r for r in records if r["task"] == task and r["method"] == method]
+            if not mine:
+                continue
+            x = np.geomspace(FIRST_LOOK, TASKS[task].budget, 100)
+            # A run that has ended early stays where it was.
+            y = [np.interp(x, *np.array(r["curve"], dtype=float).T) for r in mine]
+            axes.plot(x, np.median(y, axis=0), label=method.upper())
+        axes.axhline(TASKS[task].reach, color="k", linestyle=":", linewidth=1)
+        axes.set(title=task, xscale="log")
+    panels[0].legend()
+    for axes in panels[len(tasks) :]:
+        axes.remove()
+    figure.supxlabel("environment steps")
+    figure.supylabel("return of greedy episodes")
+    return figure
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="tasks.py"
+    )
+
+    def names(text: str) -> tuple[str, ...]:
+        return tuple(text.split(","))
+
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--tasks", type=names, default=tuple(TASKS))
+    parser.add_argument("--methods", type=names, default=METHODS)
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time, each in one thread")
+    parser.add_argument("--runs", type=Path, default=RUNS, help="finished runs, kept and not made again")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--picture", type=Path)
+    given = parser.parse_args(arguments)
+    for known, asked in ((TASKS, given.tasks), (METHODS, given.methods)):
+        if unknown := set(asked) - set(known):
+            parser.error(f"{', '.join(sorted(unknown))} is not among {', '.join(known)}")
+    torch.set_num_threads(1)
+    keys: list[dict[str, Any]] = [
+        {"task": task, "method": method, "seed": seed}
+        for seed in range(given.seeds)
+        for task in given.tasks
+        for method in given.methods
+    ]
+    records = measure(keys, run, path=given.runs, jobs=given.jobs)
+    if given.json:
+        given.json.write_text(json.dumps(records, indent=1) + "\n")
+    if given.picture:
+        picture(records).savefig(given.picture, dpi=120)
+    print(table(sorted(records, key=lambda r: list(TASKS).index(r["task"]))))
+
+
+if __name__ == "__main__":
+    main()
