@@ -15,18 +15,23 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 if TYPE_CHECKING:
+    from pgts_torch.agent.callbacks import EvalCallback
+    from pgts_torch.agent.evaluate import evaluate
     from pgts_torch.agent.pgts import PGTS
 
     __version__: str
 
 _SUBPACKAGES = ("agent", "envs", "models", "search", "tabular")
 
-__all__ = ["PGTS", "__version__", "agent", "envs", "models", "search", "tabular"]
+_NAMES = {"PGTS": "agent.pgts", "EvalCallback": "agent.callbacks", "evaluate": "agent.evaluate"}
+"""What is offered here, and the module that it is loaded from."""
+
+__all__ = ["PGTS", "EvalCallback", "__version__", "agent", "envs", "evaluate", "models", "search", "tabular"]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "PGTS":
-        return importlib.import_module("pgts_torch.agent.pgts").PGTS
+    if name in _NAMES:
+        return getattr(importlib.import_module(f"pgts_torch.{_NAMES[name]}"), name)
     if name == "__version__":
         return importlib.metadata.version("pgts_torch")
     if name in _SUBPACKAGES:

@@ -31,10 +31,7 @@ class SampledAdvantages:
 
     def __call__(self, rollout: Rollout, critic: Critic) -> Float[Tensor, "T B"]:
         """The advantages; where an episode is over, they mean nothing."""
-        v_TB, next_v_TB = (
-            critic.v(rollout.observe(state_TB.reshape(-1))).to(rollout.reward_TB).view(state_TB.shape)
-            for state_TB in (rollout.state_TB, rollout.next_state_TB)
-        )
+        v_TB, next_v_TB = rollout.values(critic.v)
         return gae(rollout, v_TB, next_v_TB, self.lambda_)
 
 

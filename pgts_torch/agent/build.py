@@ -3,16 +3,19 @@
 The command line, `PGTS(...)` and saved models speak of parts in this one form.
 """
 
-from collections.abc import Callable, Mapping
-from typing import Any
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
 
 import torch
+from gymnasium.vector import VectorEnv
 
 from pgts_torch.agent.advantages import Estimator, LookaheadAdvantages, SampledAdvantages
+from pgts_torch.agent.copies import env_name
 from pgts_torch.agent.critics import Critic, ExactCritic, MonteCarlo, RolloutCritic, TabularCritic, TDLambda
 from pgts_torch.agent.networks import CNN, MLP
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
-from pgts_torch.agent.neural_updates import GradientUpdate, NetworkMirrorUpdate, PPOUpdate
+from pgts_torch.agent.neural_updates import GradientUpdate, NetworkMirrorUpdate, NetworkUpdate, PPOUpdate
 from pgts_torch.agent.policies import Biased, Policy, Random, SimplexPolicy, SoftmaxPolicy, TabularPolicy, Uniform
 from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Horizon
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate, Update
@@ -20,8 +23,12 @@ from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
+from pgts_torch.tabular.exact import check_depth
 
 Description = str | Mapping[str, Any]
+
+DEFAULT_MAX_DEPTH = 64
+DEFAULT_TOLERANCE = 0.1
 
 _Choices = Mapping[str, Callable[..., Any]]
 
@@ -126,9 +133,64 @@ def make_critic(description: Description | None, world: World, policy: Policy, *
     return _make("critic", _CRITICS, description, *given, nested=nested)
 
 
+def make_depths(depth: int | Literal["adaptive"], max_depth: int | None, tolerance: float | None) -> Sequence[int]:
+    """The depths that an iteration tries, in order; PgtsError where an argument is out of range or has no effect."""
+    if depth != "adaptive":
+        for name, value in (("max_depth", max_depth), ("tolerance", tolerance)):
+            if value is not None:
+                raise PgtsError(f"{name} is {value}, which only depth='adaptive' heeds; depth is {depth}")
+        return (check_depth(depth),)
+    if tolerance is not None and not 0 <= tolerance < math.inf:
+        raise PgtsError(f"tolerance is {tolerance}; it must be finite and at least 0")
+    return range(check_depth(DEFAULT_MAX_DEPTH if max_depth is None else max_depth) + 1)
+
+
+def check_parts(
+    arguments: Mapping[str, Any], world: World, policy: Policy, update: Update, estimator: Estimator
+) -> None:
+    """PgtsError where parts do not fit each other, or where one of the arguments of `PGTS` would have no effect."""
+    update.check(policy)
+    if isinstance(policy, TabularPolicy):
+        shape, found = _tabular(world, "the policy").mdp_shape, (policy.num_states, policy.num_actions)
+        if found != shape:
+            raise PgtsError(f"the policy is one of (states, actions) = {found}; the environment has {shape}")
+    if not isinstance(arguments["env"], str):
+        if arguments["gamma"] not in (None, world.gamma):
+            raise PgtsError(f"gamma is {arguments['gamma']}; the given environment has its own, {world.gamma}")
+        if given := arguments["env_kwargs"]:
+            raise PgtsError(f"env_kwargs is {given}; an environment that is given as an object takes none")
+    if isinstance(arguments["env"], VectorEnv) and (count := arguments["actions_per_dimension"]) is not None:
+        raise PgtsError(f"actions_per_dimension is {count}; a VectorEnv takes its own actions, make them discrete")
+    if not isinstance(estimator, SampledAdvantages):
+        return
+    for name, default in (("depth", 0), ("search", "auto"), ("stop_at", None)):
+        if (value := arguments[name]) != default:
+            raise PgtsError(f"{name} is {value}; sampled advantages look no step ahead, it must be {default}")
+    if not isinstance(update, NetworkUpdate):
+        raise PgtsError(f"{type(update).__name__} takes one row a state; sampled advantages have one a visit")
+    if isinstance(update, NetworkMirrorUpdate):
+        raise PgtsError(
+            "NetworkMirrorUpdate needs the advantages of all actions, for they stand in an exponent; sampled ones are "
+            "of the actions taken"
+        )
+
+
+def described(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of `PGTS` as plain values, without an environment that was given as an object; PgtsError where a
+    part was given as one."""
+    for name in ("search", "estimator", "policy", "critic", "update", "horizon"):
+        if not isinstance(arguments[name], str | Mapping | None):
+            raise PgtsError(f"{name} was given as {arguments[name]!r}; only models made from descriptions can be saved")
+    env = arguments["env"] if isinstance(arguments["env"], str) else None
+    return {**arguments, "env": env, "env_kwargs": dict(arguments["env_kwargs"] or {})}
+
+
 def _tabular(world: World, what: str) -> TabularWorld:
     if not isinstance(world, TabularWorld):
-        raise PgtsError(f"{what} is a table; observations of this environment are {world.observation_space}")
+        raise PgtsError(
+            f"{what} is a table of numbered states, which {env_name(world.env)} does not have; take a network: mlp or "
+            "cnn as policy, network as critic"
+        )
     return world
 
 

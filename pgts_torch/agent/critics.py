@@ -260,10 +260,11 @@ def lambda_returns(
     """
     lambda_TB = lambda_ * rollout.follows_TB
     returns_TB = rollout.reward_TB + discount_TB * (1 - lambda_TB) * bootstrap_TB
-    later_TB = discount_TB * lambda_TB
-    for t in reversed(range(len(returns_TB) - 1)):
-        returns_TB[t] += later_TB[t] * returns_TB[t + 1]
-    return returns_TB
+    # Row by row on the CPU, where a few numbers cost least.
+    row_TB, later_TB = returns_TB.cpu().numpy(), (discount_TB * lambda_TB).cpu().numpy()
+    for t in reversed(range(len(row_TB) - 1)):
+        row_TB[t] += later_TB[t] * row_TB[t + 1]
+    return torch.from_numpy(row_TB).to(returns_TB.device)
 
 
 def _fitted(learned: Learned | None) -> Learned:

@@ -128,9 +128,6 @@ class Trunk(nn.Module):
         super().__init__()
         self.encoder, self.layers, self.num_features = encoder, layers, num_features
 
-    def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
-        return self.layers(input_N)
-
 
 @final
 @dataclass(frozen=True)
@@ -230,6 +227,8 @@ class Network(nn.Module):
         self.trunk = trunk
         head = skip_init(nn.Linear, trunk.num_features, num_outputs)
         self.head: nn.Linear = _orthogonal(head, gain, generator)
+        self._layers = [*trunk.layers, self.head]  # a plain list: calls of nested modules cost as much as small layers
+        self._most_rows = max(1, _MOST_INPUTS // max(trunk.encoder.num_inputs, trunk.num_features))
 
     @cached_property
     def weights(self) -> list[nn.Parameter]:
@@ -238,19 +237,19 @@ class Network(nn.Module):
 
     def encode(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
         """The inputs that `forward` takes; they carry no gradient."""
-        with torch.no_grad():
-            return self.trunk.encoder(observation_N)
+        return self.trunk.encoder(observation_N)
 
     def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
-        return self.head(self.trunk(input_N))
+        for layer in self._layers:
+            input_N = layer(input_N)
+        return input_N
 
     @torch.no_grad()
     def evaluate(self, observation_N: Tensor) -> Float[Tensor, "N D"]:
         """Outputs without gradient, in pieces of bounded memory."""
-        rows = max(1, _MOST_INPUTS // max(self.trunk.encoder.num_inputs, self.trunk.num_features))
-        if len(observation_N) <= rows:
-            return self(self.encode(observation_N))
-        return torch.cat([self(self.encode(piece)) for piece in observation_N.split(rows)])
+        if len(observation_N) <= self._most_rows:
+            return self.forward(self.encode(observation_N))
+        return torch.cat([self.forward(self.encode(piece)) for piece in observation_N.split(self._most_rows)])
 
     def plain_state(self) -> dict[str, Tensor]:
         """Weights and running statistics, copied to the CPU."""

@@ -134,10 +134,14 @@ class NetworkCritic(Critic):
         self._policy = policy
         alive_TB = rollout.alive_TB
         observation_V, action_V = rollout.observe(rollout.state_TB[alive_TB]), rollout.action_TB[alive_TB]
-        target_V = self._targets(rollout)[alive_TB]
+        v_TB, target_TB = self._targets(rollout)
+        target_V = target_TB[alive_TB]
         if not math.isfinite(target_V.sum()):
             raise PgtsError("a target of the critic is not finite; it has learned nothing from this rollout")
-        error_V = target_V - self._taken(self._values(self.network, observation_V), action_V)
+        if self._lags or self.target == "q":
+            error_V = target_V - self._taken(self._values(self.network, observation_V), action_V)
+        else:
+            error_V = target_V - v_TB[alive_TB]
 
         encoder = self.network.trunk.encoder
         if encoder.fresh or not _share(policy, self.network):
@@ -203,13 +207,12 @@ class NetworkCritic(Critic):
         """v, or Q of the actions taken."""
         return value_ND.squeeze(-1) if self.target == "v" else value_ND.gather(-1, action_N[:, None]).squeeze(-1)
 
-    def _targets(self, rollout: Rollout) -> Float[Tensor, "T B"]:
-        bootstrap_TB = torch.zeros_like(rollout.reward_TB)
-        after_V = rollout.observe(rollout.next_state_TB[rollout.alive_TB])
-        bootstrap_TB[rollout.alive_TB] = self._v(self._target_network, after_V).to(bootstrap_TB)
+    def _targets(self, rollout: Rollout) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
+        """v of the target network at the visits, and the targets, which stand on it."""
+        v_TB, next_v_TB = rollout.values(lambda observation_N: self._v(self._target_network, observation_N))
         if isinstance(self.method, MonteCarlo):
-            return lambda_returns(rollout, bootstrap_TB, rollout.survival_TB, 1.0)
-        return lambda_returns(rollout, bootstrap_TB, rollout.discount_TB, self.method.lambda_)
+            return v_TB, lambda_returns(rollout, next_v_TB, rollout.survival_TB, 1.0)
+        return v_TB, lambda_returns(rollout, next_v_TB, rollout.discount_TB, self.method.lambda_)
 
     @torch.no_grad()
     def _rescale(self, target_V: Float[Tensor, "V"]) -> None:

@@ -30,13 +30,23 @@ from pgts_torch.errors import PgtsError
 class Batch(NamedTuple):
     """What one update moves the policy by.
 
-    input_N: encoded observations.   old_NA: log pi before the update.   advantage_NA, weight_N: float32.
+    input_N: encoded observations.   advantage_NA, weight_N: float32.
     """
 
     input_N: Float[Tensor, "N ..."]
-    old_NA: Float[Tensor, "N A"]
     advantage_NA: Float[Tensor, "N A"]
     weight_N: Float[Tensor, "N"]
+
+
+class Move(NamedTuple):
+    """What the steps of an update did.
+
+    old_NA, new_NA: log pi before and after them, without gradient.   losses: and diagnostics, by name.
+    """
+
+    old_NA: Float[Tensor, "N A"]
+    new_NA: Float[Tensor, "N A"]
+    losses: dict[str, float]
 
 
 @dataclass(eq=False, kw_only=True)
@@ -91,13 +101,8 @@ class NetworkUpdate(Update):
         network, encoder = policy.network, policy.network.trunk.encoder
         if fresh := encoder.fresh:
             encoder.absorb(observation_N)
-        input_N = network.encode(observation_N)
-        with torch.no_grad():
-            old_NA = network(input_N).log_softmax(-1)
-        batch = Batch(input_N, old_NA, advantage_NA.float(), weight_N.float())
-        losses = self.move(network, batch, generator)
-        with torch.no_grad():
-            new_NA = network(input_N).log_softmax(-1)
+        batch = Batch(network.encode(observation_N), advantage_NA.float(), weight_N.float())
+        old_NA, new_NA, losses = self.move(network, batch, generator)
         share_N = batch.weight_N / batch.weight_N.sum()
         losses["entropy"] = float(share_N @ entropy(new_NA))
         losses["kl"] = float(share_N @ divergence(old_NA, new_NA))
@@ -116,8 +121,8 @@ class NetworkUpdate(Update):
         """PgtsError if an option beside those above is out of range."""
 
     @abstractmethod
-    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> dict[str, float]:
-        """Take the steps; losses and diagnostics by name."""
+    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
+        """Take the steps."""
 
     def step(self, network: Network, loss: Tensor, *, through: tuple[Tensor, Tensor] | None = None) -> float:
         """One step down the loss (see `Optimiser.step`); the norm of its gradient."""
@@ -142,13 +147,14 @@ class GradientUpdate(NetworkUpdate):
     def check_options(self) -> None:
         _check_entropy_coef(self.entropy_coef)
 
-    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> dict[str, float]:
+    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
         """policy: less the objective without entropy, before the step; grad_norm: before clipping."""
         log_NA = network(batch.input_N).log_softmax(-1)
         policy_loss = -(batch.weight_N @ (log_NA.exp() * batch.advantage_NA).sum(-1))
         bonus = batch.weight_N @ entropy(log_NA) if self.entropy_coef else 0.0
         norm = self.step(network, policy_loss - self.entropy_coef * bonus)
-        return {"policy": float(policy_loss.detach()), "grad_norm": norm}
+        losses = {"policy": float(policy_loss.detach()), "grad_norm": norm}
+        return Move(log_NA.detach(), _log_probs(network, batch.input_N), losses)
 
 
 @final
@@ -185,29 +191,34 @@ class PPOUpdate(NetworkUpdate):
         if self.target_kl is not None:
             check_positive("target_kl", self.target_kl)
 
-    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> dict[str, float]:
+    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
         """policy: mean over the steps of less the objective without entropy; grad_norm: mean, before clipping;
         clip_fraction: the share of actions, after the steps, whose rho is out of range; num_steps taken."""
-        batch = batch._replace(weight_N=batch.weight_N / batch.weight_N.mean())
+        input_N, advantage_NA, weight_N = batch
+        old_NA = _log_probs(network, input_N)
+        weight_N = weight_N / weight_N.mean()
         if self.normalize_advantage:
-            batch = batch._replace(advantage_NA=batch.advantage_NA / _scale(batch))
-        policy_losses, norms = [], []
-        passes = _passes(network, batch, self.num_epochs, self.minibatch_size, generator)
-        for log_NA, (_, old_NA, advantage_NA, weight_N) in passes:
-            if self.target_kl is not None and _mean(weight_N, divergence(old_NA, log_NA)) > self.target_kl:
+            advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N)
+        columns, policy_losses, norms = (input_N, old_NA, advantage_NA, weight_N), [], []
+        passes = _passes(network, columns, self.num_epochs, self.minibatch_size, generator)
+        for log_NA, (_, before_NA, part_NA, part_N) in passes:
+            if self.target_kl is not None and _mean(part_N, divergence(before_NA, log_NA)) > self.target_kl:
                 break
             with torch.no_grad():
-                gain_NA, push_NA = self.objective(log_NA, old_NA, advantage_NA)
-                policy_loss = -_mean(weight_N, (old_NA.exp() * gain_NA).sum(-1))
-                down_NA = -push_NA * (weight_N / len(weight_N))[:, None]
+                gain_NA, push_NA = self.objective(log_NA, before_NA, part_NA)
+                policy_loss = -_mean(part_N, (before_NA.exp() * gain_NA).sum(-1))
+                down_NA = -push_NA * (part_N / len(part_N))[:, None]
             norms.append(self.step(network, policy_loss, through=(log_NA, down_NA)))
             policy_losses.append(float(policy_loss))
-        return {
+        new_NA = _log_probs(network, input_N)
+        outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.clip_range
+        losses = {
             "policy": sum(policy_losses) / len(policy_losses),
             "grad_norm": sum(norms) / len(norms),
-            "clip_fraction": self._clip_fraction(network, batch),
+            "clip_fraction": float(_mean(weight_N, (old_NA.exp() * outside_NA).sum(-1))),
             "num_steps": len(norms),
         }
+        return Move(old_NA, new_NA, losses)
 
     def objective(
         self, log_NA: Float[Tensor, "N A"], old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"]
@@ -226,12 +237,6 @@ class PPOUpdate(NetworkUpdate):
         if self.entropy_coef:
             slope_NA = slope_NA - self.entropy_coef * (log_NA + 1)
         return gain_NA, log_NA.exp() * slope_NA
-
-    @torch.no_grad()
-    def _clip_fraction(self, network: Network, batch: Batch) -> float:
-        ratio_NA = (network(batch.input_N).log_softmax(-1) - batch.old_NA).exp()
-        outside_NA = (ratio_NA - 1).abs() > self.clip_range
-        return float(_mean(batch.weight_N, (batch.old_NA.exp() * outside_NA).sum(-1)))
 
 
 @final
@@ -259,17 +264,18 @@ class NetworkMirrorUpdate(NetworkUpdate):
         check_count("num_epochs", self.num_epochs)
         check_count("minibatch_size", self.minibatch_size)
 
-    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> dict[str, float]:
+    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
         """policy: mean_s w(s) KL(target || pi) after the steps; grad_norm: mean over the steps, before clipping."""
-        target_NA = (batch.old_NA + batch.advantage_NA / self.temperature).log_softmax(-1)
+        old_NA = _log_probs(network, batch.input_N)
+        target_NA = (old_NA + batch.advantage_NA / self.temperature).log_softmax(-1)
         weight_N = batch.weight_N / batch.weight_N.mean()
         columns, norms = (batch.input_N, target_NA, weight_N), []
         passes = _passes(network, columns, self.num_epochs, self.minibatch_size, generator)
         for log_NA, (_, part_NA, part_N) in passes:
             norms.append(self.step(network, _mean(part_N, divergence(part_NA, log_NA))))
-        with torch.no_grad():
-            after = _mean(weight_N, divergence(target_NA, network(batch.input_N).log_softmax(-1)))
-        return {"policy": float(after), "grad_norm": sum(norms) / len(norms)}
+        new_NA = _log_probs(network, batch.input_N)
+        after = float(_mean(weight_N, divergence(target_NA, new_NA)))
+        return Move(old_NA, new_NA, {"policy": after, "grad_norm": sum(norms) / len(norms)})
 
 
 def entropy(log_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
@@ -280,6 +286,12 @@ def entropy(log_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
 def divergence(log_p_NA: Float[Tensor, "N A"], log_q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
     """KL(p(.|s) || q(.|s)) in nats, from log p and log q."""
     return (log_p_NA.exp() * (log_p_NA - log_q_NA)).sum(-1)
+
+
+@torch.no_grad()
+def _log_probs(network: Network, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N A"]:
+    """log pi, without gradient."""
+    return network(input_N).log_softmax(-1)
 
 
 def _passes(
@@ -296,9 +308,11 @@ def _mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"]) -> Float[Te
     return weight_N @ value_N / len(value_N)
 
 
-def _scale(batch: Batch) -> Float[Tensor, ""]:
-    size_N = (batch.old_NA.exp() * batch.advantage_NA.abs()).sum(-1)
-    return _mean(batch.weight_N, size_N.square()).sqrt() + 1e-8
+def _scale(
+    old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]
+) -> Float[Tensor, ""]:
+    size_N = (old_NA.exp() * advantage_NA.abs()).sum(-1)
+    return _mean(weight_N, size_N.square()).sqrt() + 1e-8
 
 
 def _check_numbers(advantage_NA: Tensor, weight_N: Tensor) -> None:

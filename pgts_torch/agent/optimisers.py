@@ -73,9 +73,9 @@ class Optimiser:
             if self.max_grad_norm is not None and norm > self.max_grad_norm:
                 gradient_D *= self.max_grad_norm / norm
             step_D = self._adam(gradient_D) if self.method == "adam" else gradient_D.mul_(-self.learning_rate)
-            pieces = step_D.split([parameter.numel() for parameter in parameters])
-            for parameter, piece in zip(parameters, pieces, strict=True):
-                parameter.add_(piece.view_as(parameter))
+            moved: list[Tensor] = list(parameters)
+            pieces = step_D.split([parameter.numel() for parameter in moved])
+            torch._foreach_add_(moved, [piece.view_as(like) for piece, like in zip(pieces, moved, strict=True)])
         return norm
 
     def _adam(self, gradient_D: Tensor) -> Tensor:

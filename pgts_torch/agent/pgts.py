@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self, final
 
@@ -17,72 +16,35 @@ from tqdm import tqdm
 from pgts_torch.agent import saving
 from pgts_torch.agent.advantages import LookaheadAdvantages, SampledAdvantages, score_function
 from pgts_torch.agent.build import (
+    DEFAULT_TOLERANCE,
     Description,
+    check_parts,
+    described,
     make_critic,
+    make_depths,
     make_estimator,
     make_horizon,
     make_policy,
     make_search,
     make_update,
 )
+from pgts_torch.agent.certificate import certificate
+from pgts_torch.agent.copies import divided_actions, make_vector_env, more_copies, registered_limit
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.neural_updates import NetworkUpdate
-from pgts_torch.agent.policies import Policy, TabularPolicy, listed
+from pgts_torch.agent.iteration import Iteration, Seen
+from pgts_torch.agent.policies import Policy, listed
 from pgts_torch.agent.rollout import Horizon, Rollout, rollout
 from pgts_torch.agent.updates import Update
-from pgts_torch.agent.world import make_vector_env, make_world
+from pgts_torch.agent.world import make_world
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.environments import EnvSource
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Leaf, Lookahead
 from pgts_torch.seeding import stream
-from pgts_torch.tabular.exact import check_depth
 from pgts_torch.tabular.mdp import TabularMDP
 
-DEFAULT_MAX_DEPTH = 64
-DEFAULT_TOLERANCE = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What the policy pi_k is moved by.
-
-    state_N, weight_N: the states that it visited, and what each counts for in the update; with sampled advantages every
-        visit has a row of its own.
-    pi_NA: pi_k at these states.
-    advantage_NA: how much better each action is.
-    depth: m.
-    look: (T^m Q)(s, .) at these states; None with sampled advantages.
-    gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, with v(s) = <pi(.|s), Q(s, .)> of the same critic.
-    certificate: an upper bound on J* - J^pi; true if the critic is exact, else as far as its v is right at the start
-        states. Infinite where the model knows no largest value, and for sampled searches, which prove nothing.
-    """
-
-    state_N: Int[Tensor, "N"]
-    weight_N: Float[Tensor, "N"]
-    pi_NA: Float[Tensor, "N A"]
-    advantage_NA: Float[Tensor, "N A"]
-    depth: int
-    look: Lookahead | None
-    gap_N: Float[Tensor, "N"]
-    certificate: float
-
-
-@dataclass(frozen=True, eq=False)
-class Iteration(Seen):
-    """What one pass through the loop of Algorithm 1 saw and did.
-
-    experience: the episodes of pi_k.
-    losses: the critic's and the update's, by name.
-    model_calls: (state, action) asked of the model in this pass, by the lookahead and by the critic.
-    """
-
-    experience: Rollout
-    losses: dict[str, float]
-    model_calls: int
-
-
 Callback = Callable[["PGTS", Iteration], bool | None]
-"""Called after each iteration; returning False ends the training."""
+"""Called after each iteration; returning False ends the training. `agent.callbacks` has some."""
 
 
 @final
@@ -95,9 +57,10 @@ class PGTS:
     from streams named by (seed, k), so a loaded model goes on exactly as the saved one would have.
 
     Args:
-        env: a Gymnasium id, or copies as a VectorEnv that resets by mask. What a lookahead asks is the environment's
-            table (pgts/*, or a P table), else its dynamics in torch (CartPole, Acrobot, MountainCar), else a simulator
-            that is restored from snapshots.
+        env: a Gymnasium id; or an environment or a spec, of which copies are made by its spec; or a function that makes
+            one; or copies as a VectorEnv that resets by mask. What a lookahead asks is the environment's table
+            (pgts/*, or a P table), else its dynamics in torch (CartPole, Acrobot, MountainCar, Pendulum), else a
+            simulator that is restored from snapshots.
         depth: m. 0 is plain policy gradient. "adaptive": in each iteration the smallest m at which the policy is far
             from stationary, because then it deserves no deeper look: sum_s d(s) g_m(s) > tolerance * certificate.
         max_depth: the largest m of an adaptive depth (default 64).
@@ -110,6 +73,8 @@ class PGTS:
         policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax", "mlp",
             {"type": "tabular", "target": "q"}, ... Default: tables where the environment is tabular, else networks.
         num_envs: episodes in each iteration.
+        actions_per_dimension: into how many evenly spaced values, from the lowest to the highest, each dimension of
+            continuous actions is divided; None: actions are discrete.
         action_repeat: how often the lookahead takes an action before it takes the next, so that it sees as many times
             further at the same depth (`TensorModel` says what T^m Q is then); not in tables. Experience, and the
             policy, take single actions.
@@ -126,7 +91,7 @@ class PGTS:
 
     def __init__(
         self,
-        env: str | VectorEnv,
+        env: EnvSource | VectorEnv,
         *,
         depth: int | Literal["adaptive"] = 4,
         max_depth: int | None = None,
@@ -139,6 +104,7 @@ class PGTS:
         update: Description | Update | None = None,
         horizon: Description | Horizon = "fixed",
         num_envs: int = 32,
+        actions_per_dimension: int | None = None,
         action_repeat: int = 1,
         observation_key: str | None = None,
         gamma: float | None = None,
@@ -147,7 +113,7 @@ class PGTS:
         env_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
         self._arguments = {name: value for name, value in locals().items() if name != "self"}
-        self.depths = _depths(depth, max_depth, tolerance)
+        self.depths = make_depths(depth, max_depth, tolerance)
         self.tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
         if stop_at is not None and not 0 <= stop_at < math.inf:
             raise PgtsError(f"stop_at is {stop_at}; it must be finite and at least 0")
@@ -161,6 +127,7 @@ class PGTS:
             gamma=gamma,
             observation_key=observation_key,
             plain=isinstance(self.estimator, SampledAdvantages),
+            actions_per_dimension=actions_per_dimension,
             action_repeat=action_repeat,
             device=device,
             **(env_kwargs or {}),
@@ -177,36 +144,11 @@ class PGTS:
         self.search: Search | None = None
         if isinstance(self.estimator, LookaheadAdvantages):
             self.search = make_search(search, self.world)
-        self._check_parts()
+        check_parts(self._arguments, self.world, self.policy, self.update, self.estimator)
+        self._values_of_actions = None if actions_per_dimension is None else divided_actions(self.world.env)
         self.num_iterations = 0
         self.num_env_steps = 0
         self.num_model_calls = 0
-
-    def _check_parts(self) -> None:
-        """PgtsError where parts do not fit each other, or where an argument would have no effect."""
-        self.update.check(self.policy)
-        if isinstance(self.policy, TabularPolicy):
-            shape, found = (
-                (self.mdp.num_states, self.mdp.num_actions),
-                (self.policy.num_states, self.policy.num_actions),
-            )
-            if found != shape:
-                raise PgtsError(f"the policy is one of (states, actions) = {found}; the environment has {shape}")
-        if not isinstance(self._arguments["env"], str):
-            gamma, env_kwargs = self._arguments["gamma"], self._arguments["env_kwargs"]
-            if gamma not in (None, self.world.gamma):
-                raise PgtsError(f"gamma is {gamma}; the given environment has its own, {self.world.gamma}")
-            if env_kwargs:
-                raise PgtsError(f"env_kwargs is {env_kwargs}; an environment that is given as an object takes none")
-        if isinstance(self.estimator, SampledAdvantages):
-            for name, default in (("depth", 0), ("search", "auto"), ("stop_at", None)):
-                if self._arguments[name] != default:
-                    value = self._arguments[name]
-                    raise PgtsError(f"{name} is {value}; sampled advantages look no step ahead, it must be {default}")
-            if not isinstance(self.update, NetworkUpdate):
-                raise PgtsError(
-                    f"{type(self.update).__name__} takes one row a state; sampled advantages have one a visit"
-                )
 
     def iterate(self) -> Iteration:
         """One pass through the loop: visit states, estimate Q^pi, look m steps ahead, move pi.        [PGTS Alg. 1]"""
@@ -244,10 +186,11 @@ class PGTS:
         """The lookahead from the visited states, at the given depth or at the first that sees enough."""
         states, weight_N = experience.visits(self.update.state_weight)
         pi_NA = self.policy.probs(self.world.observe(states))
-        v_N = (pi_NA * self.lookahead(states, depth=0).q_BA).sum(-1)
+        shallow = self.lookahead(states, depth=0)
+        v_N = (pi_NA * shallow.q_BA).sum(-1)
         _, occupancy_N = experience.visits("occupancy")
         for depth in self.depths:
-            look = self.lookahead(states, depth=depth)
+            look = self.lookahead(states, depth=depth) if depth else shallow
             gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
             certificate = self._certificate(experience, states, v_N, depth)
             if float(gap_N @ occupancy_N) > self.tolerance * certificate or self._proved(certificate):
@@ -287,17 +230,21 @@ class PGTS:
         return listed(self.policy, self.world.observe(states))
 
     @property
-    def env_id(self) -> str:
-        """The environment's Gymnasium id; PgtsError if the environment was given as an object."""
-        env_id = self._arguments["env"]
-        if not isinstance(env_id, str):
-            raise PgtsError(f"the environment was given as {env_id!r}; only one given by its id can be made again")
-        return env_id
+    def time_limit(self) -> int | None:
+        """The most steps of an episode of the environment as it is registered; None: there is no limit."""
+        return registered_limit(self._arguments["env"], self.world.env)
 
     def make_copies(self, num_envs: int) -> VectorEnv:
-        """Fresh copies of the environment, without its time limit."""
-        kwargs = self._arguments["env_kwargs"] or {}
-        return make_vector_env(self.env_id, num_envs, gamma=self._arguments["gamma"], **kwargs)
+        """Fresh copies of the environment, without its registered time limit.
+
+        Raises:
+            PgtsError: it was given as copies that are no SyncVectorEnv.
+        """
+        env = self._arguments["env"]
+        if isinstance(env, VectorEnv):
+            return more_copies(env, num_envs)
+        options = {name: self._arguments[name] for name in ("gamma", "actions_per_dimension")}
+        return make_vector_env(env, num_envs, **options, **(self._arguments["env_kwargs"] or {}))
 
     def lookahead(self, state_N: Int[Tensor, "N"], *, depth: int | None = None) -> Lookahead:
         """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves.
@@ -305,58 +252,59 @@ class PGTS:
         Args:
             depth: m; default the depth of the training, or its largest if it is adaptive.
         """
-        observe, critic = self.world.observe, self.critic
-        leaf: Leaf = lambda s: critic.v(observe(s)) if critic.target == "v" else critic.q(observe(s))  # noqa: E731
-        return self._search(state_N, self.depths[-1] if depth is None else depth, **{f"{critic.target}_leaf": leaf})
-
-    def _search(self, state_N: Int[Tensor, "N"], depth: int, **leaf: Leaf) -> Lookahead:
-        # All searches of an iteration see the same samples: their differences are not noise.
-        generator = stream(self.seed, "iteration", self.num_iterations, "search", device=self.device)
         if self.search is None:
             raise PgtsError("with sampled advantages there is no lookahead")
-        return self.search(state_N, depth=depth, generator=generator, **leaf)
+        observe, critic = self.world.observe, self.critic
+        leaf: Leaf = lambda s: critic.v(observe(s)) if critic.target == "v" else critic.q(observe(s))  # noqa: E731
+        depth = self.depths[-1] if depth is None else depth
+        return self.search(state_N, depth=depth, generator=self._search_stream(), **{f"{critic.target}_leaf": leaf})
+
+    def _search_stream(self) -> torch.Generator:
+        """All searches of an iteration see the same samples, so that their differences are not noise."""
+        return stream(self.seed, "iteration", self.num_iterations, "search", device=self.device)
 
     def _certificate(self, experience: Rollout, state_N: Tensor, v_N: Tensor, depth: int) -> float:
-        """J* - J^pi <= mean over starts of (T^n w)(s) - v(s), for w the highest value there can be; n is the number of
-        levels that the lookahead has itself, so the model is asked nothing new.        [docs/theory.md, Prop. 5]"""
-        starts, count_N = experience.state_TB[0].unique(return_counts=True)
-        assert self.world.model is not None
         assert self.search is not None
-        if not self.search.keeps_bounds:
-            return math.inf
-        highest = torch.tensor(self.world.model.highest_value, dtype=torch.float64, device=self.device)
-        upper_N = highest.expand(len(starts))
+        assert self.world.model is not None
         expansions = depth + (self.critic.target == "v")
-        if expansions and bool(highest.isfinite()):
-            upper_N = self._search(starts, expansions - 1, v_leaf=lambda s: highest.expand(len(s))).q_BA.amax(-1)
-        missing_N = upper_N - v_N[torch.searchsorted(state_N, starts)]
-        return max(0.0, float(missing_N @ count_N.double() / experience.num_episodes))
+        generator = self._search_stream()
+        return certificate(
+            self.search, self.world.model, experience, state_N, v_N, expansions=expansions, generator=generator
+        )
 
     def _proved(self, certificate: float) -> bool:
         return self.stop_at is not None and certificate <= self.stop_at
 
-    def learn(self, total_steps: int, *, callback: Callback | None = None, progress: bool = False) -> Self:
+    def learn(self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool = False) -> Self:
         """Iterate until `total_steps` environment steps have been made in all, counting those before this call.
 
         Args:
-            callback: called with (self, iteration) after each iteration; returning False ends the training.
+            callback: one or more, each called with (self, iteration) after each iteration; if one returns False, the
+                training ends.
             progress: show a progress bar.
+
+        Raises:
+            PgtsError: a callback that cannot be called; or the environment failed, naming step and seeds.
         """
+        callbacks = [callback] if callable(callback) else callback
+        if not isinstance(callbacks, Sequence) or not all(map(callable, callbacks)):
+            raise PgtsError(f"callback is {callback!r}; it must be a function of (model, iteration), or a list of such")
         with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=not progress) as bar:
             while self.num_env_steps < total_steps:
                 iteration = self.iterate()
                 bar.update(iteration.experience.num_steps)
-                if (callback is not None and callback(self, iteration) is False) or self._proved(iteration.certificate):
+                answers = [call(self, iteration) for call in callbacks]
+                if False in answers or self._proved(iteration.certificate):
                     break
         return self
 
     def predict(
         self, observation: ArrayLike, *, deterministic: bool = True, generator: torch.Generator | None = None
-    ) -> np.ndarray | np.int64:
-        """Actions for observations, one number for one state; no search.
+    ) -> np.ndarray | np.generic:
+        """Actions for observations, as the environment takes them; no search.
 
         Args:
-            observation: one state or an array of states, as integers.
+            observation: what the environment shows, or an array of it.
             deterministic: the most probable action, else one drawn from pi.
             generator: for drawing; default a stream of this model's seed, the same in each call.
         """
@@ -368,38 +316,51 @@ class PGTS:
         else:
             generator = generator or stream(self.seed, "predict", device=self.device)
             action_N = self.policy.sample(observation_N, generator=generator)
-        return action_N.cpu().numpy().reshape(shape)[()]
+        action = action_N.cpu().numpy().reshape(shape)
+        return action[()] if self._values_of_actions is None else self._values_of_actions[action]
 
     def save(self, path: str | Path) -> None:
         """Write everything that training or acting goes on from into one file with a checksum.
 
+        An environment that was given as an object is left out: `load` must be given one.
+
         Raises:
-            PgtsError: the environment or a part was given as an object, so that no file can describe it, or an
-                argument is no plain value.
+            PgtsError: a part was given as an object, so that no file can describe it, or an argument is no plain value.
         """
-        plain = {**self._arguments, "device": str(self.device), "env_kwargs": dict(self._arguments["env_kwargs"] or {})}
-        for name in ("env", "search", "estimator", "policy", "critic", "update", "horizon"):
-            if not isinstance(plain[name], str | Mapping | None):
-                raise PgtsError(f"{name} was given as {plain[name]!r}; only models made from descriptions can be saved")
-        saving.write(path, {"arguments": plain, "state": self.state_dict()})
+        arguments = described(self._arguments) | {"device": str(self.device)}
+        saving.write(path, {"arguments": arguments, "state": self.state_dict()})
 
     @classmethod
-    def load(cls, path: str | Path, *, device: torch.device | str | None = None) -> Self:
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        env: EnvSource | VectorEnv | None = None,
+        device: torch.device | str | None = None,
+    ) -> Self:
         """The model that `save` wrote; it trains on exactly as the saved one would have.
 
         Only the lookahead starts anew: it asks the model again for what it had seen, and `num_model_calls` counts that.
 
         Args:
+            env: the environment, where it was given to the saved model as an object; default its id.
             device: where to load it; default the device it was saved from.
 
         Raises:
-            PgtsError: no such file, damaged, or not ours.
+            PgtsError: no such file, damaged, or not ours; or an environment is needed, or is not.
         """
         content = saving.read(path)
         if content.keys() != {"arguments", "state"}:
             raise PgtsError(f"{path} holds {sorted(map(str, content))}, not a model")
-        arguments = content["arguments"] | ({} if device is None else {"device": str(device)})
-        model = cls(**arguments)
+        arguments, saved_env = content["arguments"], content["arguments"]["env"]
+        if (env is None) == (saved_env is None):
+            raise PgtsError(
+                f"{path} names no environment, for it was given as an object: load it with env=..."
+                if env is None
+                else f"env is {env!r}; {path} has its own, {saved_env}"
+            )
+        arguments |= {"env": saved_env if env is None else env}
+        model = cls(**arguments | ({} if device is None else {"device": str(device)}))
         model.load_state_dict(content["state"])
         return model
 
@@ -422,15 +383,3 @@ class PGTS:
         self.num_iterations = state["num_iterations"]
         self.num_env_steps = state["num_env_steps"]
         self.num_model_calls = state["num_model_calls"]
-
-
-def _depths(depth: int | Literal["adaptive"], max_depth: int | None, tolerance: float | None) -> Sequence[int]:
-    """The depths that an iteration tries, in order; PgtsError where an argument is out of range or has no effect."""
-    if depth != "adaptive":
-        for name, value in (("max_depth", max_depth), ("tolerance", tolerance)):
-            if value is not None:
-                raise PgtsError(f"{name} is {value}, which only depth='adaptive' heeds; depth is {depth}")
-        return (check_depth(depth),)
-    if tolerance is not None and not 0 <= tolerance < math.inf:
-        raise PgtsError(f"tolerance is {tolerance}; it must be finite and at least 0")
-    return range(check_depth(DEFAULT_MAX_DEPTH if max_depth is None else max_depth) + 1)

@@ -1,5 +1,6 @@
 """Policies: a distribution over actions for each observation. Tabular ones, whose observations are states."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, final
@@ -74,8 +75,19 @@ class Policy(ABC):
         """Take over parameters of the same shape; PgtsError if they do not fit."""
 
     def sample(self, observation_N: Tensor, *, generator: torch.Generator) -> Int[Tensor, "N"]:
-        """One action for each observation, drawn with the caller's generator."""
-        return torch.multinomial(self.probs(observation_N), 1, generator=generator).squeeze(-1)
+        """One action for each observation, drawn with the caller's generator.
+
+        The largest of pi(a|o) / E_a, where the E_a are exponentially distributed: what `torch.multinomial` draws, which
+        takes five times as long to check its probabilities.
+
+        Raises:
+            PgtsError: a probability is not a number.
+        """
+        pi_NA = self.probs(observation_N)
+        score_N, action_N = (pi_NA / torch.empty_like(pi_NA).exponential_(generator=generator)).max(-1)
+        if math.isnan(score_N.sum()):
+            raise PgtsError(f"the policy has no probabilities, but {pi_NA[score_N.isnan()][0].tolist()}")
+        return action_N
 
 
 class TabularPolicy(Policy):

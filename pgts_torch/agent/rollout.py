@@ -10,8 +10,9 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pgts_torch.agent.copies import env_name
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.world import World, env_name
+from pgts_torch.agent.world import World
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.seeding import draw_keys, seed_sequence
@@ -65,8 +66,8 @@ class GeometricHorizon:
 
     def survival(self, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
         """What one unit of weight is worth after a step of this discount: 1 with that probability, else 0."""
-        uniform_B = torch.rand(discount_B.shape, generator=generator, dtype=torch.float64, device=discount_B.device)
-        return (uniform_B < discount_B).double()
+        uniform_B = torch.rand(discount_B.shape, generator=generator, dtype=torch.float64, device=generator.device)
+        return (uniform_B.to(discount_B.device) < discount_B).double()
 
     def check_end(self, num_alive: int) -> None:
         """PgtsError if episodes are alive at the limit."""
@@ -81,7 +82,8 @@ Horizon = FixedHorizon | GeometricHorizon
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """B episodes, step by step; where an episode is over, its row is padded and `alive_TB` is False.
+    """B episodes, step by step; where an episode is over, its row is padded and `alive_TB` is False. Each row begins
+    in the states where the row before it ended.
 
     reward_TB: in reward units.   discount_TB: of the transition itself, 0 where it terminated.
     weight_TB: what a visit counts for in the occupancy: the product of the discounts before it (fixed horizon) or 1
@@ -113,6 +115,18 @@ class Rollout:
     def follows_TB(self) -> Bool[Tensor, "T B"]:
         """Whether the next row goes on with the same episode."""
         return torch.cat([self.alive_TB[1:], torch.zeros_like(self.alive_TB[:1])])
+
+    def values(self, v: Callable[[Tensor], Tensor]) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
+        """v(s_t) and v(s_{t+1}); where the episode is over, they mean nothing. Each visit, and each end, is asked once.
+
+        Args:
+            v: the values of observations.
+        """
+        state_UB = torch.cat([self.state_TB, self.next_state_TB[-1:]])
+        needed_UB = torch.cat([self.alive_TB[:1], self.alive_TB])
+        v_UB = torch.zeros_like(state_UB, dtype=self.reward_TB.dtype)
+        v_UB[needed_UB] = v(self.observe(state_UB[needed_UB])).to(v_UB)
+        return v_UB[:-1], v_UB[1:]
 
     def returns(self) -> Float[Tensor, "B"]:
         """Weighted reward of each episode: an estimate of J^pi, unbiased for the geometric horizon."""
@@ -165,48 +179,63 @@ def rollout(
             answered with something that is not a number, naming environment, step and seed.
     """
     words = seed_sequence(seed, *names, "env").generate_state(env.num_envs)
-    observation, _ = env.reset(seed=words.tolist())
-    observation_B, state_B = world.encode(observation), world.number(env, observation)
-    alive_B = torch.ones_like(state_B, dtype=torch.bool)
-    weight_B = torch.ones_like(state_B, dtype=torch.float64)
-    rows: list[tuple[Tensor, ...]] = []
-    while len(rows) < horizon.limit and bool(alive_B.any()):
-        action_B = policy.sample(observation_B, generator=generator)
+    try:
+        observation, _ = env.reset(seed=words.tolist())
+        observation_B, reads = world.encode(observation), [world.read(env, observation)]
+    except Exception as error:
+        raise _failure(env, "at the start", words.tolist(), error) from error
+    # What is small stays in numpy until the end: on tensors of a few numbers, each operation costs several times more.
+    alive_B, weight_B = np.ones(env.num_envs, dtype=bool), np.ones(env.num_envs)
+    rows: list[tuple[np.ndarray, ...]] = []
+    while len(rows) < horizon.limit and alive_B.any():
+        action_B = policy.sample(observation_B, generator=generator).cpu().numpy()
         try:
-            reward_B, discount_B, truncated_B, observation_B, next_B = _step(world, env, action_B)
+            reward_B, discount_B, truncated_B, observation_B, read_B = _step(world, env, action_B)
         except Exception as error:
-            where = f"in step {len(rows)} of the episodes with the seeds {words.tolist()}"
-            raise PgtsError(f"{env_name(env)} failed {where}: {type(error).__name__}: {error}") from error
-        survival_B = horizon.survival(discount_B, generator)
-        rows.append((state_B, action_B, reward_B, discount_B, next_B, alive_B, weight_B * alive_B, survival_B))
+            raise _failure(env, f"in step {len(rows)}", words.tolist(), error) from error
+        survival_B = horizon.survival(torch.from_numpy(discount_B), generator).numpy()
+        rows.append((action_B, reward_B, discount_B, alive_B, weight_B * alive_B, survival_B))
+        reads.append(read_B)
         weight_B = weight_B * survival_B
         alive_B = alive_B & (survival_B > 0) & ~truncated_B
-        state_B = next_B
     horizon.check_end(int(alive_B.sum()))
-    return Rollout(*(torch.stack(column) for column in zip(*rows, strict=True)), observe=world.observe)
+    number_TB = world.numbers(torch.cat(reads)).view(len(reads), -1)
+    action_TB, reward_TB, discount_TB, alive_TB, weight_TB, survival_TB = (
+        torch.from_numpy(np.stack(column)).to(world.device) for column in zip(*rows, strict=True)
+    )
+    return Rollout(
+        number_TB[:-1],
+        action_TB,
+        reward_TB,
+        discount_TB,
+        number_TB[1:],
+        alive_TB,
+        weight_TB,
+        survival_TB,
+        observe=world.observe,
+    )
+
+
+def _failure(env: VectorEnv, when: str, seeds: list[int], error: Exception) -> PgtsError:
+    what = str(error) if isinstance(error, PgtsError) else f"{type(error).__name__}: {error}"
+    return PgtsError(f"{env_name(env)} failed {when} of the episodes with the seeds {seeds}: {what}")
 
 
 def _step(
-    world: World, env: VectorEnv, action_B: Int[Tensor, "B"]
-) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"], Bool[Tensor, "B"], Tensor, Int[Tensor, "B"]]:
-    """Rewards, discounts, whether a copy was truncated, observations and states; copies that are over start again."""
-    device = action_B.device
-    observation, reward, terminated, truncated, info = env.step(action_B.cpu().numpy())
-    reward_B = torch.from_numpy(np.asarray(reward, dtype=np.float64)).to(device)
-    if not bool(reward_B.isfinite().all()):
+    world: World, env: VectorEnv, action_B: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor, Tensor]:
+    """Rewards, discounts, whether a copy was truncated, observations, and what states are numbered by; copies that are
+    over start again."""
+    observation, rewards, terminated, truncated, info = env.step(action_B)
+    reward_B = np.array(rewards, dtype=np.float64)
+    if not np.isfinite(reward_B).all():
         raise PgtsError(f"the rewards are {reward_B.tolist()}; they must be finite")
-    discount = np.where(terminated, 0.0, info.get("discount", world.gamma))
-    observation_B, state_B = world.encode(observation), world.number(env, observation)
+    discount_B = np.where(terminated, 0.0, info.get("discount", world.gamma))
+    observation_B, read_B = world.encode(observation), world.read(env, observation)
     over = terminated | truncated
     if over.any():
         env.reset(options={"reset_mask": over})
-    return (
-        reward_B,
-        torch.from_numpy(discount).to(device),
-        torch.from_numpy(truncated).to(device),
-        observation_B,
-        state_B,
-    )
+    return reward_B, discount_B, truncated, observation_B, read_B
 
 
 def simulated_returns(

@@ -6,19 +6,19 @@ A lookahead speaks of states, which are numbers; policies and critics speak of o
 from abc import ABC, abstractmethod
 from typing import Any, final
 
-import gymnasium
-import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import iterate
-from jaxtyping import Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
+from pgts_torch.agent.copies import check_vector_env, env_name, make_vector_env
+from pgts_torch.agent.observations import Observations, states_of
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.classic import ClassicModel, dynamics_of
-from pgts_torch.models.environments import base_actions, changing_wrapper, register
+from pgts_torch.models.environments import EnvSource, base_actions, changing_wrapper
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import adapter_for
 from pgts_torch.models.tabular import TabularModel, tabular_truth
@@ -57,8 +57,17 @@ class World(ABC):
         """
 
     @abstractmethod
+    def read(self, env: VectorEnv, observation: Any) -> Shaped[Tensor, "B ..."]:
+        """What the states that the copies are in now are told apart by; `observation` is what they have just said."""
+
+    @abstractmethod
+    def numbers(self, read_N: Shaped[Tensor, "N ..."]) -> Int[Tensor, "N"]:
+        """The numbers of states that were read. Many at once cost little more than a few."""
+
+    @final
     def number(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
-        """The state that each copy is in now; `observation` is what they have just said."""
+        """The numbers of the states that the copies are in now."""
+        return self.numbers(self.read(env, observation))
 
     @abstractmethod
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
@@ -93,11 +102,15 @@ class TabularWorld(World):
 
     def encode(self, observation: Any) -> Tensor:
         """The states, int64."""
-        return _states(observation, self.model.num_states).to(self.device)
+        return states_of(observation, self.model.num_states).to(self.device)
 
-    def number(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
+    def read(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
         """The observation."""
         return self.encode(observation)
+
+    def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+        """The observations."""
+        return read_N
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """The state."""
@@ -106,50 +119,6 @@ class TabularWorld(World):
     def forget(self) -> bool:
         """Nothing: a state keeps its number."""
         return False
-
-
-class _Seen:
-    """What a policy sees of an environment whose observations are numbers, vectors or images.
-
-    Args:
-        space: of the environment's observations.
-        key: which part of dictionary observations is meant.
-
-    Raises:
-        PgtsError: dictionary observations without a key, a key that they do not have, or another kind of space.
-    """
-
-    def __init__(self, space: spaces.Space[Any], key: str | None, device: torch.device) -> None:
-        if isinstance(space, spaces.Dict):
-            known = ", ".join(map(str, space.keys()))
-            if key is None:
-                raise PgtsError(f"observations are dictionaries of {known}: say which part a policy sees")
-            if key not in space.spaces:
-                raise PgtsError(f"observations have no part {key!r}; they have {known}")
-            space = space[key]
-        elif key is not None:
-            raise PgtsError(f"observations are {space}; they have no part {key!r}")
-        if not isinstance(space, spaces.Discrete | spaces.Box):
-            raise PgtsError(f"observations are {space}; a policy sees numbers, vectors or images")
-        self.space, self.key, self.device = space, key, device
-
-    def part(self, observation: Any) -> Any:
-        """The part of an observation that is meant."""
-        return observation if self.key is None else observation[self.key]
-
-    def encode(self, observation: Any) -> Tensor:
-        return self.encode_part(self.part(observation))
-
-    def encode_part(self, part: Any) -> Tensor:
-        if isinstance(self.space, spaces.Discrete):
-            return _states(part, int(self.space.n)).to(self.device)
-        array = np.asarray(part)
-        if array.shape[-len(self.space.shape) :] != self.space.shape:
-            raise PgtsError(f"an observation has shape {array.shape}; its space is {self.space}")
-        tensor = torch.from_numpy(np.array(array)).to(self.device)
-        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            raise PgtsError(f"an observation is not finite: {array[~np.isfinite(array)][:3].tolist()}")
-        return tensor
 
 
 @final
@@ -173,7 +142,7 @@ class SimulatedWorld(World):
         self.env, self.model = env, model
         self.num_actions, self.gamma = model.num_actions, model.gamma
         self.device = torch.device(device)
-        self._seen = _Seen(env.single_observation_space, observation_key, self.device)
+        self._seen = Observations(env, observation_key, self.device)
         self.observation_space = self._seen.space
         self._model = model
 
@@ -181,11 +150,15 @@ class SimulatedWorld(World):
         """Numbers, vectors or images."""
         return self._seen.encode(observation)
 
-    def number(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
+    def read(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
         """The number of a snapshot of each copy."""
         assert isinstance(env, SyncVectorEnv)
         each = list(iterate(env.observation_space, observation))
         return self._model.roots(env.envs, each).to(self.device)
+
+    def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+        """These."""
+        return read_N
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """What the simulator showed in these states."""
@@ -210,7 +183,7 @@ class DynamicsWorld(World):
     def __init__(self, env: SyncVectorEnv, model: ClassicModel, *, observation_key: str | None = None) -> None:
         self.env, self.model = env, model
         self.num_actions, self.gamma, self.device = model.num_actions, model.gamma, model.device
-        self._seen = _Seen(env.single_observation_space, observation_key, self.device)
+        self._seen = Observations(env, observation_key, self.device)
         self.observation_space = self._seen.space
         self._model = model
 
@@ -218,10 +191,14 @@ class DynamicsWorld(World):
         """Vectors, float32."""
         return self._seen.encode(observation)
 
-    def number(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
-        """The number of the state of each copy."""
+    def read(self, env: VectorEnv, observation: Any) -> Float[Tensor, "B D"]:
+        """The vector of each copy."""
         assert isinstance(env, SyncVectorEnv)
-        return self._model.roots(env.envs)
+        return self._model.vectors(env.envs)
+
+    def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
+        """Equal vectors have one number."""
+        return self._model.number(read_N)
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """What the environment shows in these states."""
@@ -255,7 +232,7 @@ class PlainWorld(World):
         self.env, self.gamma = env, gamma
         self.device = torch.device(device)
         self.num_actions = int(env.single_action_space.n)  # type: ignore[attr-defined]  # checked before
-        self._seen = _Seen(env.single_observation_space, observation_key, self.device)
+        self._seen = Observations(env, observation_key, self.device)
         self.observation_space = self._seen.space
         self._shown: list[Tensor] = []
         self._count = 0
@@ -264,11 +241,14 @@ class PlainWorld(World):
         """Numbers, vectors or images."""
         return self._seen.encode(observation)
 
-    def number(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
+    def read(self, env: VectorEnv, observation: Any) -> Tensor:
+        """The observation."""
+        return self.encode(observation)
+
+    def numbers(self, read_N: Tensor) -> Int[Tensor, "N"]:
         """The next numbers."""
-        encoded_B = self.encode(observation)
-        self._shown.append(encoded_B)
-        first, self._count = self._count, self._count + len(encoded_B)
+        self._shown.append(read_N)
+        first, self._count = self._count, self._count + len(read_N)
         return torch.arange(first, self._count, device=self.device)
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
@@ -284,12 +264,13 @@ class PlainWorld(World):
 
 
 def make_world(
-    env: str | VectorEnv,
+    env: EnvSource | VectorEnv,
     *,
     num_envs: int,
     gamma: float | None,
     observation_key: str | None,
     plain: bool,
+    actions_per_dimension: int | None = None,
     action_repeat: int = 1,
     device: torch.device | str,
     **kwargs: Any,
@@ -300,9 +281,10 @@ def make_world(
     snapshots make it simulated. It is plain where no model is needed.
 
     Args:
-        env: a Gymnasium id, of which `num_envs` copies are made with `kwargs`, or copies.
+        env: what `num_envs` copies are made from (`make_vector_env`, with `kwargs`), or copies.
         gamma: discount; None: the environment's own (pgts/*), else 0.99.
         observation_key: which part of dictionary observations a policy sees.
+        actions_per_dimension: into how many values each dimension of continuous actions is divided.
         plain: whether a world without a model will do: then snapshots are not taken.
         action_repeat: how often an action is taken in one outcome of the model (`TensorModel`).
 
@@ -311,7 +293,10 @@ def make_world(
             in a table, or where there is no model.
         MissingModel: it has no model, and needs one.
     """
-    copies = make_vector_env(env, num_envs, gamma=gamma, **kwargs) if isinstance(env, str) else env
+    if isinstance(env, VectorEnv):
+        copies = env
+    else:
+        copies = make_vector_env(env, num_envs, gamma=gamma, actions_per_dimension=actions_per_dimension, **kwargs)
     check_vector_env(copies)
     discount = DEFAULT_GAMMA if gamma is None else gamma
     wrapper = changing_wrapper(copies.envs[0]) if isinstance(copies, SyncVectorEnv) else ""
@@ -353,55 +338,3 @@ def make_world(
 def _check_single(action_repeat: int, where: str) -> None:
     if action_repeat != 1:
         raise PgtsError(f"action_repeat is {action_repeat}; {where} it must be 1")
-
-
-def make_vector_env(env_id: str, num_envs: int, *, gamma: float | None, **kwargs: Any) -> VectorEnv:
-    """Copies of a registered environment that reset by mask, without its time limit: the horizon is ours.
-
-    Args:
-        gamma: handed to environments that carry a discount of their own (pgts/*), if given.
-
-    Raises:
-        PgtsError: Gymnasium knows no such environment or cannot make it.
-    """
-    if num_envs < 1:
-        raise PgtsError(f"num_envs is {num_envs}; it must be at least 1")
-    register(env_id)
-    options: dict[str, Any] = {"max_episode_steps": -1, **kwargs}
-    try:
-        if gymnasium.spec(env_id).namespace == "pgts":
-            options |= {} if gamma is None else {"gamma": gamma}
-            options |= {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.DISABLED}
-        else:
-            options |= {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode.DISABLED}}
-        return gymnasium.make_vec(env_id, num_envs=num_envs, **options)
-    except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
-        raise PgtsError(f"{env_id} cannot be made: {error}") from error
-
-
-def check_vector_env(env: VectorEnv) -> None:
-    """PgtsError unless rollouts can be made in this environment: discrete actions, reset by mask."""
-    if not isinstance(env, VectorEnv):
-        raise PgtsError(f"the environment is {env!r}; it must be a Gymnasium id or a VectorEnv")
-    space = env.single_action_space
-    if not isinstance(space, spaces.Discrete) or space.start != 0:
-        raise PgtsError(f"the actions of {env_name(env)} are {space}; they must be Discrete(n) counted from 0")
-    mode = env.metadata.get("autoreset_mode")
-    if mode != AutoresetMode.DISABLED:
-        raise PgtsError(f"the environment resets by {mode}; make it with autoreset_mode=AutoresetMode.DISABLED")
-
-
-def _states(observation: Any, num_states: int) -> Int[Tensor, "..."]:
-    """Observations that are numbers below `num_states`."""
-    state = np.asarray(observation)
-    if not np.issubdtype(state.dtype, np.integer):
-        raise PgtsError(f"observation is of {state.dtype}; states are integers")
-    off = state[(state < 0) | (state >= num_states)]
-    if off.size:
-        raise PgtsError(f"state {off.flat[0]} does not exist; states are 0 to {num_states - 1}")
-    return torch.from_numpy(np.array(state, dtype=np.int64))
-
-
-def env_name(env: VectorEnv) -> str:
-    """What an error calls an environment."""
-    return env.spec.id if env.spec is not None else repr(env)

@@ -2,30 +2,57 @@
 
 import textwrap
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 
+from pgts_torch.errors import MissingModel
 from pgts_torch.models.environments import make_env
 from pgts_torch.models.fidelity import Report, check_model
+from pgts_torch.models.tabular import tabular_truth
 
 _WIDTH = 79
 
 
-def answer(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Report:
+@dataclass(frozen=True)
+class Table:
+    """The answer where an environment cannot be restored and need not be, for its transitions are known."""
+
+    env: str
+    num_states: int
+    num_actions: int
+    family: str = "table"
+    usable: bool = True
+
+    @property
+    def verdict(self) -> str:
+        """One line."""
+        return f"{self.env}: a table of {self.num_states} states and {self.num_actions} actions, no snapshot is needed"
+
+
+def answer(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Report | Table:
     """What `check_model` finds of an id and the arguments of `gymnasium.make`, on one thread."""
     torch.set_num_threads(1)
-    return check_model(lambda: make_env(env_id, **kwargs), seed=seed)
+    try:
+        return check_model(lambda: make_env(env_id, **kwargs), seed=seed)
+    except MissingModel as missing:
+        try:
+            mdp = tabular_truth(make_env(env_id, **kwargs), gamma=1.0)
+        except MissingModel:
+            raise missing from None
+        return Table(env_id, mdp.num_states, mdp.num_actions)
 
 
-def to_json(report: Report) -> dict[str, Any]:
+def to_json(report: Report | Table) -> dict[str, Any]:
     """All that is in a report, and what follows from it."""
     return asdict(report) | {"usable": report.usable, "verdict": report.verdict}
 
 
-def describe(report: Report) -> str:
+def describe(report: Report | Table) -> str:
     """The report for people: at most 79 columns."""
+    if isinstance(report, Table):
+        return report.verdict
     return "\n".join(_lines(report))
 
 

@@ -123,9 +123,9 @@ def evaluate(arguments: Arguments) -> None:
     parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the episodes (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
     given = parser.parse_args(arguments)
-    from pgts_torch.experiment import run
+    from pgts_torch.experiment.evaluate import evaluate_run
 
-    answer = run.evaluate_run(given.run_dir, episodes=given.episodes, seed=given.seed)
+    answer = evaluate_run(given.run_dir, episodes=given.episodes, seed=given.seed)
     _answer({kind: asdict(evaluation) for kind, evaluation in answer.items()}, as_json=given.json)
 
 

@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgts_torch.agent.pgts import PGTS, Iteration
+from pgts_torch.agent.iteration import Iteration
+from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.updates import SoftmaxUpdate
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.ascent import softmax_direction

@@ -1,130 +1,26 @@
-"""How good a policy is, by episodes that nothing is learned from."""
+"""The data behind `pgts evaluate`: what a run has left, measured."""
 
-import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
 
-import gymnasium
-import scipy.special
 import torch
-from gymnasium.vector import VectorEnv
-from jaxtyping import Float, Int
-from torch import Tensor
 
+from pgts_torch.agent.evaluate import Evaluation, evaluate
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.rollout import FixedHorizon, rollout
-from pgts_torch.agent.world import World
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.tracking import CHECKPOINTS
-from pgts_torch.seeding import stream
 
-UNLIMITED_LENGTH = 1000
-"""Longest episode where the environment sets no time limit."""
-
-
-@dataclass(frozen=True)
-class Score:
-    """A mean over episodes with the half-width of its 95 % confidence interval (Student's t); None for one episode."""
-
-    mean: float
-    half_width: float | None
+KINDS = {"deterministic": True, "sampled": False}
+"""How actions are taken: the most probable one, or drawn from pi."""
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """Episodes under the environment's own time limit: sums of rewards, discounted sums, and lengths."""
-
-    episodes: int
-    episodic_return: Score
-    discounted_return: Score
-    episodic_length: Score
-
-
-def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool, seed: int) -> Evaluation:
-    """Run the policy in fresh copies of its environment.
-
-    Args:
-        episodes: how many, at least 1.
-        deterministic: take the most probable action, else draw from pi.
-        seed: of these episodes alone; training is not touched.
-    """
-    env = algorithm.make_copies(episodes)
-    limit = time_limit(algorithm.env_id)
-    names = ("evaluate", "deterministic" if deterministic else "sampled")
-    made = rollout(
-        _Watched(algorithm.world, env),
-        env,
-        Greedy(algorithm.policy) if deterministic else algorithm.policy,
-        FixedHorizon(limit),
-        seed=seed,
-        names=names,
-        generator=stream(seed, *names, device=algorithm.device),
-    )
-    env.close()
-    return Evaluation(
-        episodes,
-        _score((made.reward_TB * made.alive_TB).sum(0)),
-        _score(made.returns()),
-        _score(made.alive_TB.double().sum(0)),
-    )
-
-
-def time_limit(env_id: str) -> int:
-    """The most steps of an episode under the environment's own time limit, else UNLIMITED_LENGTH."""
-    return gymnasium.spec(env_id).max_episode_steps or UNLIMITED_LENGTH
-
-
-@final
-class _Watched(World):
-    """Copies in which a policy is only watched: no state is asked for again, so none is told from another.
-
-    Args:
-        world: says what the policy sees.
-        env: copies of its environment.
-    """
-
-    def __init__(self, world: World, env: VectorEnv) -> None:
-        self.env, self._world = env, world
-        self.num_actions, self.observation_space = world.num_actions, world.observation_space
-        self.gamma, self.device = world.gamma, world.device
-
-    def encode(self, observation: Any) -> Tensor:
-        """As in the world."""
-        return self._world.encode(observation)
-
-    def number(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
-        """0 for all."""
-        return torch.zeros(env.num_envs, dtype=torch.int64, device=self.device)
-
-    def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """Nothing can be said."""
-        raise AssertionError("what was watched is over")
-
-    def forget(self) -> bool:
-        """Nothing."""
-        return False
-
-
-@final
-class Greedy(Policy):
-    """Takes the most probable action of another policy."""
-
-    def __init__(self, policy: Policy) -> None:
-        self.policy = policy
-        self.num_actions = policy.num_actions
-
-    def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
-        """1 for the most probable action, 0 for the others."""
-        best_N = self.policy.probs(observation_N).argmax(-1)
-        return torch.nn.functional.one_hot(best_N, self.num_actions).double()
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.policy.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.policy.load_state_dict(state)
+def evaluate_run(run: str | Path, *, episodes: int, seed: int) -> dict[str, Evaluation]:
+    """Evaluate the last checkpoint of a run: greedily and by drawing actions from the policy."""
+    torch.set_num_threads(1)
+    algorithm = PGTS.load(last_checkpoint(Path(run)))
+    return {
+        kind: evaluate(algorithm, episodes=episodes, deterministic=deterministic, seed=seed)
+        for kind, deterministic in KINDS.items()
+    }
 
 
 def last_checkpoint(run: Path) -> Path:
@@ -133,11 +29,3 @@ def last_checkpoint(run: Path) -> Path:
     if not checkpoints:
         raise PgtsError(f"{run} holds no checkpoint; it must be the folder of a run")
     return checkpoints[-1]
-
-
-def _score(value_B: Float[Tensor, "B"]) -> Score:
-    count = len(value_B)
-    if count == 1:
-        return Score(float(value_B), None)
-    spread = float(value_B.std()) / math.sqrt(count)
-    return Score(float(value_B.mean()), float(scipy.special.stdtrit(count - 1, 0.975)) * spread)

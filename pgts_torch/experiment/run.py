@@ -6,7 +6,7 @@ import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,17 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from pgts_torch.agent.pgts import PGTS, Iteration
+from pgts_torch.agent.callbacks import EvalCallback
+from pgts_torch.agent.evaluate import Evaluation, Score, evaluate
+from pgts_torch.agent.iteration import Iteration
+from pgts_torch.agent.pgts import PGTS
 from pgts_torch.experiment import diagnostics
 from pgts_torch.experiment.config import Config, dump
-from pgts_torch.experiment.evaluate import Evaluation, evaluate, last_checkpoint
+from pgts_torch.experiment.evaluate import KINDS
 from pgts_torch.experiment.pictures import policy_picture
+from pgts_torch.experiment.sections import EvalConfig
 from pgts_torch.experiment.tracking import (
+    BEST_FILE,
     CHECKPOINTS,
     CONFIG_FILE,
     SUMMARY_FILE,
@@ -84,6 +89,7 @@ def build(config: Config) -> PGTS:
         update=config.update.plain(),
         horizon=config.rollout.horizon.plain(),
         num_envs=config.rollout.num_envs,
+        actions_per_dimension=config.env.actions_per_dimension,
         observation_key=config.env.observation_key,
         action_repeat=config.search.action_repeat,
         gamma=config.env.gamma,
@@ -115,16 +121,6 @@ def train(config: Config) -> Summary:
     return summary
 
 
-def evaluate_run(run: str | Path, *, episodes: int, seed: int) -> dict[str, Evaluation]:
-    """Evaluate the last checkpoint of a run: greedily and by drawing actions from the policy."""
-    torch.set_num_threads(1)
-    algorithm = PGTS.load(last_checkpoint(Path(run)))
-    return {
-        kind: evaluate(algorithm, episodes=episodes, deterministic=kind == "deterministic", seed=seed)
-        for kind in ("deterministic", "sampled")
-    }
-
-
 def _loop(config: Config, algorithm: PGTS, folder: RunFolder) -> Summary:
     recorder = _Recorder(config, algorithm, folder)
     algorithm.learn(config.total_steps, callback=recorder)
@@ -148,8 +144,10 @@ class _Recorder:
         self.started = self._clock = time.perf_counter()
         self._pi_SA = self._table()
         self._deepest, self._certificate = 0, math.inf
+        self._evaluations = _evaluations(config.eval, config.seed, folder)
 
-    def __call__(self, algorithm: PGTS, iteration: Iteration) -> None:
+    def __call__(self, algorithm: PGTS, iteration: Iteration) -> bool:
+        """Whether training may go on."""
         seconds = time.perf_counter() - self._clock
         k, step = algorithm.num_iterations, algorithm.num_env_steps
         self._deepest, self._certificate = max(self._deepest, iteration.depth), iteration.certificate
@@ -160,12 +158,26 @@ class _Recorder:
             tags["charts/SPS"] = iteration.experience.num_steps / seconds
             self.folder.log(step, tags)
             self.report.line(step, tags)
-        if self.config.eval.every and k % self.config.eval.every == 0:
-            self.folder.log(step, _evaluation_tags(algorithm, self.config))
+        go_on = [evaluation(algorithm, iteration) for evaluation in self._evaluations.values()]
+        if tags := {tag: value for kind in self._evaluations for tag, value in self._scores(kind, step)}:
+            self.folder.log(step, tags)
         if self.config.log.checkpoint_every and k % self.config.log.checkpoint_every == 0:
             _save(algorithm, self.folder)
         self._pi_SA = self._table()
         self._clock = time.perf_counter()
+        return all(go_on)
+
+    def _scores(self, kind: str, step: int) -> Iterator[tuple[str, float]]:
+        """The tags of the evaluation that was made just now, if one was."""
+        history = self._evaluations[kind].history
+        if not history or history[-1].env_steps != step:
+            return
+        for name in ("episodic_return", "episodic_length"):
+            score: Score = getattr(history[-1].evaluation, name)
+            short = name.removeprefix("episodic_")
+            yield f"eval/{kind}_{short}", score.mean
+            if score.half_width is not None:
+                yield f"eval/{kind}_{short}_half_width", score.half_width
 
     def _table(self) -> Tensor | None:
         """The policy in all states, where they can be listed."""
@@ -186,7 +198,7 @@ class _Recorder:
             }
         deterministic, sampled = (
             evaluate(algorithm, episodes=config.eval.episodes, deterministic=kind, seed=config.seed)
-            for kind in (True, False)
+            for kind in KINDS.values()
         )
         return Summary(
             run=str(self.folder.path),
@@ -207,14 +219,14 @@ class _Recorder:
         )
 
 
-def _evaluation_tags(algorithm: PGTS, config: Config) -> dict[str, float]:
-    scores = {
-        kind: evaluate(
-            algorithm, episodes=config.eval.episodes, deterministic=kind == "deterministic", seed=config.seed
-        )
-        for kind in ("deterministic", "sampled")
-    }
-    return {f"eval/{kind}_return": score.episodic_return.mean for kind, score in scores.items()}
+def _evaluations(config: EvalConfig, seed: int, folder: RunFolder) -> dict[str, EvalCallback]:
+    """The evaluations during training, by how actions are taken; the deterministic ones say what is best and enough."""
+    if config.every is None:
+        return {}
+    shared: dict[str, Any] = {"every": config.every, "episodes": config.episodes, "seed": seed}
+    best_path = folder.path / BEST_FILE if config.keep_best else None
+    greedy = EvalCallback(**shared, best_path=best_path, stop_at_return=config.stop_at_return)
+    return {"deterministic": greedy, "sampled": EvalCallback(**shared, deterministic=False)}
 
 
 def _save(algorithm: PGTS, folder: RunFolder) -> None:

@@ -188,9 +188,11 @@ def is_nullable(node: Node) -> bool:
 
 
 def _bounds(node: Node) -> str:
-    """An interval, or one comparison."""
+    """An interval, or one comparison, or nothing."""
     low, above = node.get("minimum"), node.get("exclusiveMinimum")
     high = node.get("maximum")
+    if high is None and low is None and above is None:
+        return ""
     if high is None or high == INT64_MAX:
         return f" >= {low:g}" if above is None else f" > {above:g}"
     return f" in {'[' if above is None else '('}{low if above is None else above:g}, {high:g}]"

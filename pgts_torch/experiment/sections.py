@@ -1,6 +1,7 @@
 """The sections of a configuration, in the order in which `pgts train --help` lists them."""
 
-from typing import Any, Literal
+import json
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
@@ -33,6 +34,10 @@ class EnvConfig(Section):
 
     kwargs: Kwargs = Field(default={})
     """Arguments for gymnasium.make, for instance --env.kwargs.n 7."""
+
+    actions_per_dimension: Annotated[int, Field(ge=2, le=10_000)] | None = None
+    """Into how many evenly spaced values each dimension of continuous actions is divided; null: actions are
+    discrete."""
 
     observation_key: Key | None = None
     """The part of dictionary observations that policy and critic see, for instance image; null: they are no
@@ -516,13 +521,33 @@ class LogConfig(Section):
 
 
 class EvalConfig(Section):
-    """Episodes of the current policy that nothing is learned from."""
+    """Episodes of the current policy that nothing is learned from: of the most probable actions, and of drawn ones."""
 
-    every: Natural = 0
-    """Iterations from one evaluation to the next; 0: never."""
+    every: Count | None = None
+    """Environment steps from one evaluation to the next; null: only after the last iteration."""
 
     episodes: Count = 10
     """Episodes of one evaluation."""
+
+    stop_at_return: float | None = None
+    """Training ends once greedy episodes have this mean return; null: it does not. Only with eval.every."""
+
+    keep_best: bool = False
+    """Save the model as best.pt whenever greedy episodes have a higher mean return than ever. Only with eval.every."""
+
+    @field_validator("stop_at_return", "keep_best")
+    @classmethod
+    def _only_during_training(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None and value is not False and info.data.get("every", 1) is None:
+            name = str(info.field_name)
+            raise conflict(
+                "eval.{name} is {value}, which needs evaluations during training; eval.every is null",
+                f"eval.{name}",
+                "eval.every",
+                name=name,
+                value=json.dumps(value),
+            )
+        return value
 
 
 class RunConfig(Section):

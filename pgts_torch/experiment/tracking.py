@@ -18,6 +18,7 @@ METRICS_FILE = "metrics.jsonl"
 SUMMARY_FILE = "summary.json"
 VERSIONS_FILE = "versions.json"
 CHECKPOINTS = "checkpoints"
+BEST_FILE = "best.pt"
 _PACKAGES = ("pgts_torch", "torch", "numpy", "scipy", "gymnasium", "tensorboard")
 
 

@@ -105,13 +105,14 @@ class ClassicModel(TensorModel):
         Raises:
             PgtsError: it is another environment, has other constants than those read at first, or was not reset.
         """
-        return self._vectors([env])[0]
+        return self.vectors([env])[0]
 
     def roots(self, envs: Sequence[gymnasium.Env]) -> Int[Tensor, "B"]:
         """The numbers of the states that several instances are in; raises as `read` does."""
-        return self.number(self._vectors(envs))
+        return self.number(self.vectors(envs))
 
-    def _vectors(self, envs: Sequence[gymnasium.Env]) -> Tensor:
+    def vectors(self, envs: Sequence[gymnasium.Env]) -> Float[Tensor, "B D"]:
+        """The states that several instances are in; raises as `read` does."""
         rows = np.array([self._state_of(env) for env in envs], dtype=np.float64)
         return torch.from_numpy(rows).to(self.device, self.dtype)
 

@@ -33,7 +33,7 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
     is made from its spec.
 
     Raises:
-        PgtsError: there is no such id, an extra is missing, or an instance has no spec.
+        PgtsError: there is no such id, an extra is missing, an instance has no spec, or a function makes none.
     """
     if isinstance(env, gymnasium.Env):
         if env.spec is None:
@@ -42,7 +42,10 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
             )
         env = env.spec
     if not isinstance(env, str | EnvSpec):
-        return env()
+        made = env()
+        if not isinstance(made, gymnasium.Env):
+            raise PgtsError(f"{env!r} gave {made!r}; it must be a Gymnasium environment")
+        return made
     name = env if isinstance(env, str) else env.id
     register(name)
     try:
@@ -58,13 +61,29 @@ _MODULES = {"MiniGrid-": ("minigrid", "envs"), "BabyAI-": ("minigrid", "envs"), 
 
 
 def register(env_id: str) -> None:
-    """Import what registers an environment with Gymnasium; PgtsError, naming the extra, where that is not installed."""
+    """Import what registers an environment with Gymnasium: the module of `MODULE:ID`, or one that is known.
+
+    Raises:
+        PgtsError: it is not installed; the message names the extra, if there is one.
+    """
+    own, colon, _ = env_id.rpartition(":")
+    if colon:
+        try:
+            importlib.import_module(own)
+        except ModuleNotFoundError as error:
+            raise PgtsError(f"{env_id} cannot be made: {error}") from error
     for start, (module, extra) in _MODULES.items():
         if env_id.startswith(start):
             try:
                 importlib.import_module(module)
             except ModuleNotFoundError as error:
                 raise PgtsError(f"{env_id} needs {module}: pip install 'pgts_torch[{extra}]'") from error
+
+
+def spec_of(env_id: str) -> EnvSpec:
+    """What Gymnasium knows of an id; its own error where it knows nothing."""
+    register(env_id)
+    return gymnasium.spec(env_id.rpartition(":")[2])
 
 
 def all_actions(space: spaces.Space) -> Iterator[Any]:

@@ -22,14 +22,19 @@ from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, 
 _KEY_OF_CERTAINTY = 0
 """Outcomes that are listed draw nothing; this is what they would draw from."""
 
+_MOST_BYTES = 2**26
+"""`clear` forgets what the simulator has answered once the keys of the states that it led to are longer than this."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """What an action gave. random: it may give something else under another key."""
+    """What an action gave. shown: what `observe` made of the observation. random: it may give something else under
+    another key."""
 
     reward: float
     discount: float
-    child: int
+    child: Snapshot
+    shown: Any
     random: bool
 
 
@@ -39,7 +44,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
 
     The instance belongs to the model alone, without wrappers: time limits end no episode here, and nothing that the
     model is asked touches the environment that an agent acts in. Chance comes from the keys of the search, so a search
-    cannot foresee what that environment will draw. A transition that draws nothing is asked of the simulator once.
+    cannot foresee what that environment will draw. A transition that draws nothing is asked of the simulator once, and
+    the answer outlives `clear`, for it is no matter of numbers; only where answers take much memory are they forgotten.
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
@@ -90,7 +96,13 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         self.simulator_steps = 0
         """How often the simulator was stepped."""
         self._observe = observe
-        self.env.reset(seed=0)  # to have a state at all, which the first snapshot replaces
+        try:
+            self.env.reset(seed=0)  # to have a state at all, which the first snapshot replaces
+        except Exception as error:
+            raise PgtsError(f"{self.name} failed in reset with seed 0: {type(error).__name__}: {error}") from error
+        self._show = self.adapter.blindfold(self.env)
+        self._sure: dict[tuple[bytes, int], _Step] = {}
+        self._sure_bytes = 0
         self.generation = -1
         self.clear()
 
@@ -101,7 +113,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         self._snapshots: list[Snapshot] = []
         self._observations: list[Any] = []
         self._number: dict[bytes, int] = {}
-        self._sure: dict[tuple[int, int], _Step] = {}
+        if self._sure_bytes > _MOST_BYTES:
+            self._sure, self._sure_bytes = {}, 0
         self._known_worlds: list[Any] = []
 
     def root(self, env: gymnasium.Env, observation: Any = None) -> int:
@@ -131,13 +144,23 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
 
     def number(self, snapshot: Snapshot, observation: Any = None) -> int:
         """The number of a state: a new one if no equal state was met before."""
+        number = self._known(snapshot, None)
+        if self._observations[number] is None and observation is not None:
+            self._see(number, observation)
+        return number
+
+    def _see(self, number: int, observation: Any) -> None:
+        self._observations[number] = self._observe(observation) if self._observe else observation
+
+    def _known(self, snapshot: Snapshot, shown: Any) -> int:
+        """The number of a state that shows this."""
         number = self._number.setdefault(snapshot.key, self.num_states)
         if number == self.num_states:
             self.num_states += 1
             self._snapshots.append(snapshot)
-            self._observations.append(None)
-        if self._observations[number] is None and observation is not None:
-            self._observations[number] = self._observe(observation) if self._observe else observation
+            self._observations.append(shown)
+        elif self._observations[number] is None:
+            self._observations[number] = shown
         return number
 
     def snapshot(self, state: int) -> Snapshot:
@@ -216,15 +239,18 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         return (
             torch.tensor([step.reward for step in steps], dtype=self.dtype, device=self.device),
             torch.tensor([step.discount for step in steps], dtype=self.dtype, device=self.device),
-            torch.tensor([step.child for step in steps], dtype=torch.int64, device=self.device),
+            torch.tensor(
+                [self._known(step.child, step.shown) for step in steps], dtype=torch.int64, device=self.device
+            ),
         )
 
     def _step(self, state: int, action: int, key: int) -> _Step:
         """What follows; from memory where it is sure."""
-        if (state, action) in self._sure:
-            return self._sure[state, action]
         self._check("state", state, self.num_states)
         self._check("action", action, self.num_actions)
+        asked = self._snapshots[state].key, action
+        if asked in self._sure:
+            return self._sure[asked]
         taken = self.actions[action]
         try:
             self.adapter.set_state(self.env, self._snapshots[state].data)
@@ -235,15 +261,18 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
                 discount *= 0.0 if terminated else self.gamma
                 if terminated:
                     break
-            child = self.number(self.adapter.get_state(self.env), observation)
+            child = self._known(self.adapter.get_state(self.env), None)
+            if self._observations[child] is None:
+                self._see(child, observation if self._show is None else self._checked(self._show(), total))
         except Exception as error:
             what = str(error) if type(error) is PgtsError else f"{type(error).__name__}: {error}"
             raise PgtsError(
                 f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}: {what}"
             ) from error
-        step = _Step(total, discount, child, random)
+        step = _Step(total, discount, self._snapshots[child], self._observations[child], random)
         if not random:
-            self._sure[state, action] = step
+            self._sure[asked] = step
+            self._sure_bytes += len(step.child.key)
         return step
 
     def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, bool, bool]:
@@ -257,9 +286,15 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         self.simulator_steps += 1
         drew = generator_state(self.env) != before if known is None else known
         reward = float(reward)
+        if self._show is None:
+            self._checked(observation, reward)
+        return observation, reward, bool(terminated), drew
+
+    def _checked(self, observation: Any, reward: float) -> Any:
+        """The observation; PgtsError unless it and the reward are what the environment declares."""
         if wrong := wrong_answer(self.env.observation_space, observation, reward):
             raise PgtsError(wrong)
-        return observation, reward, bool(terminated), drew
+        return observation
 
     def _check(self, what: str, number: int, count: int) -> None:
         if not 0 <= number < count:

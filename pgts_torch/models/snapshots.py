@@ -70,6 +70,11 @@ class SnapshotAdapter(ABC):
         """Whether chance decides what follows `action` in the present state; None: see whether the step draws."""
         return None
 
+    def blindfold(self, env: Any) -> Callable[[], Any] | None:
+        """From here on the steps of `env` give None for an observation, because it costs much and is the same for equal
+        states; what makes it of the present state. None, and nothing done: they give it."""
+        return None
+
     def obstacle(self, env: Any) -> str:
         """Why this instance cannot be restored after all; empty where it can."""
         return ""

@@ -5,6 +5,7 @@ import enum
 import io
 import marshal
 import pickle
+from collections.abc import Callable
 from typing import Any, final
 
 import numpy as np
@@ -13,7 +14,7 @@ from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter
 
 _SPACES_AND_RENDERING = (
     "observation_space action_space actions reward_range metadata spec window clock screen_size render_size "
-    "render_mode highlight tile_size agent_pov _np_random _np_random_seed"
+    "render_mode highlight tile_size agent_pov _np_random _np_random_seed gen_obs"
 )
 _NO_STATE_OF_MINIGRID = frozenset(_SPACES_AND_RENDERING.split())
 
@@ -24,6 +25,9 @@ class MiniGrid(SnapshotAdapter):
 
     Equal states may pickle to different bytes (a position is a tuple here and an array there, a colour is one string
     or two equal ones), so the key is another text: the values alone, in one order. The count of steps is in it.
+
+    Walls without a position of their own are all alike, and most of what a grid consists of: an environment that was
+    given a state has one for each colour.
     """
 
     name = "MiniGrid"
@@ -39,6 +43,30 @@ class MiniGrid(SnapshotAdapter):
         for name in vars(env).keys() - state.keys() - _NO_STATE_OF_MINIGRID:
             delattr(env, name)
         vars(env).update(state)
+        cells, wall = env.grid.grid, None
+        for i, cell in enumerate(cells):
+            if cell is not None and cell is not wall and _is_plain_wall(cell):
+                if wall is not None and wall.color == cell.color:
+                    cells[i] = wall
+                else:
+                    wall = cell
+
+    def blindfold(self, env: Any) -> Callable[[], Any] | None:
+        if not all(
+            cls.__module__.split(".")[0] in ("minigrid", "gymnasium", "typing") for cls in type(env).__mro__[:-1]
+        ):
+            return None
+        show = env.gen_obs
+        env.gen_obs = lambda: None
+        return show
+
+
+def _is_plain_wall(value: Any) -> bool:
+    kind = type(value)
+    if kind.__qualname__ != "Wall" or kind.__module__ != "minigrid.core.world_object":
+        return False
+    plain = {"type": "wall", "color": value.color, "contains": None, "init_pos": None, "cur_pos": None}
+    return vars(value) == plain
 
 
 _PLAIN = frozenset({type(None), bool, int, float, str, bytes})
@@ -54,9 +82,15 @@ def _spell(value: Any, parts: list[Any], seen: dict[int, int]) -> None:
         parts.append(value)
     elif kind is tuple or kind is list:
         parts += ("(", len(value))
+        wall = None  # most of a grid, and the same object again and again
         for item in value:
             if type(item) in _PLAIN:
                 parts.append(item)
+            elif item is wall:
+                parts.append(("wall", wall.color))
+            elif _is_plain_wall(item):
+                wall = item
+                parts.append(("wall", wall.color))
             else:
                 _spell(item, parts, seen)
     elif kind is np.ndarray:

@@ -116,9 +116,9 @@ def test_a_critic_converges_to_the_values_of_a_policy_that_stands_still(target, 
 )
 def test_what_was_cut_is_bootstrapped_and_what_terminated_is_not(method, expected):
     made = by_hand()
-    target_TB = tabular_critic([10.0] * 4, method=method)._targets(made)
+    target_TB = tabular_critic([10.0] * 4, method=method)._targets(made)[1]
     torch.testing.assert_close([*target_TB[:, 0].tolist(), float(target_TB[2, 1])], expected)
-    blind_TB = tabular_critic([0.0] * 4, method=method)._targets(made)
+    blind_TB = tabular_critic([0.0] * 4, method=method)._targets(made)[1]
     assert blind_TB[2, 1] == target_TB[2, 1]
     assert blind_TB[2, 0] != target_TB[2, 0]
 

@@ -222,6 +222,25 @@ def test_a_whole_training_asks_the_model_at_most_once_for_each_state_and_action(
     assert 0 < model.num_model_calls == total <= model.mdp.num_states * model.mdp.num_actions
 
 
+@pytest.mark.parametrize(("depth", "looks"), [(0, [0]), (3, [0, 3])])
+def test_an_iteration_looks_once_at_depth_0_and_once_at_its_own(depth, looks, monkeypatch):
+    model, made = make(depth=depth), []
+    look = model.lookahead
+    monkeypatch.setattr(model, "lookahead", lambda states, *, depth: made.append(depth) or look(states, depth=depth))
+    model.iterate()
+    assert made == looks
+
+
+def test_with_sampled_advantages_a_critic_values_each_visit_and_each_end_twice_and_then_learns(monkeypatch):
+    estimator = {"type": "sampled", "lambda": 0.9}
+    model = make("CartPole-v1", depth=0, estimator=estimator, policy="mlp", critic={"type": "network", "num_epochs": 1})
+    network, rows = model.critic.network, []
+    evaluate = network.evaluate
+    monkeypatch.setattr(network, "evaluate", lambda seen_N: rows.append(len(seen_N)) or evaluate(seen_N))
+    experience = model.iterate().experience
+    assert rows == 2 * [experience.num_steps + experience.num_episodes]
+
+
 def test_what_the_rollout_critic_asks_is_counted_too():
     model = make(critic={"type": "rollout", "samples": 2, "horizon": {"type": "fixed", "length": 3}})
     seen = model.iterate()
@@ -238,8 +257,8 @@ def test_an_environment_without_a_model_is_refused_with_what_is_missing():
     with pytest.raises(MissingModel, match="get_state") as caught:
         PGTS(env)
     assert "Unpublished" in str(caught.value)
-    with pytest.raises(PgtsError, match="must be a Gymnasium id or a VectorEnv"):
-        PGTS(gymnasium.make("FrozenLake-v1"))
+    with pytest.raises(MissingModel, match="get_state"):
+        PGTS(Unpublished)
 
 
 @pytest.mark.parametrize(
@@ -265,6 +284,21 @@ def test_arguments_that_do_not_fit_are_refused(kwargs, message):
         make(**kwargs)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"update": "mirror"}, "NetworkMirrorUpdate needs the advantages of all actions"),
+        ({"policy": "softmax", "update": "mirror"}, "MirrorUpdate takes one row a state"),
+        ({"depth": 1}, "depth is 1; sampled advantages look no step ahead"),
+    ],
+)
+def test_sampled_advantages_are_refused_where_they_mean_nothing(options, message):
+    sampled = {"depth": 0, "estimator": "sampled", "policy": "mlp", "update": "ppo"}
+    make(**sampled).iterate()
+    with pytest.raises(PgtsError, match=message):
+        make(**sampled | options)
+
+
 def test_parts_may_be_given_as_objects():
     model = PGTS(
         copies(grid(4, traps=(5,)), 3),
@@ -274,7 +308,7 @@ def test_parts_may_be_given_as_objects():
     )
     assert model.iterate().depth == 4
     assert model.update == SoftmaxUpdate(0.2)
-    with pytest.raises(PgtsError, match="only one given by its id"):
+    with pytest.raises(PgtsError, match="was given as copies that cannot be made again"):
         model.make_copies(2)
 
 

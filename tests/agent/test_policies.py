@@ -107,3 +107,22 @@ def test_where_there_is_one_action_it_is_taken(kind, init):
     policy = kind(3, 1, init=init)
     assert torch.equal(policy.table(), torch.ones(3, 1, dtype=torch.float64))
     assert torch.equal(policy.sample(torch.arange(3), generator=stream(0, "test")), torch.zeros(3, dtype=torch.int64))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_actions_are_those_that_multinomial_draws(dtype):
+    pi_NA = torch.rand(500, 4, dtype=dtype, generator=stream(0, "rows"))
+    pi_NA[::3, 1] = 0
+    policy, state_N = SimplexPolicy(500, 4), torch.arange(500)
+    policy.probs_SA = pi_NA / pi_NA.sum(-1, keepdim=True)
+    drawn_N = policy.sample(state_N, generator=stream(1, "actions"))
+    assert drawn_N.tolist() == torch.multinomial(policy.probs_SA, 1, generator=stream(1, "actions"))[:, 0].tolist()
+    assert drawn_N.tolist() != policy.sample(state_N, generator=stream(2, "actions")).tolist()
+
+
+def test_a_policy_without_probabilities_draws_no_action():
+    policy = SoftmaxPolicy(3, 2)
+    policy.logits_SA[1, 0] = torch.nan
+    assert len(policy.sample(torch.tensor([0, 2]), generator=stream(0, "actions"))) == 2
+    with pytest.raises(PgtsError, match=r"the policy has no probabilities, but \[nan, nan\]"):
+        policy.sample(torch.arange(3), generator=stream(0, "actions"))

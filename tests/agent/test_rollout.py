@@ -87,6 +87,16 @@ def by_hand() -> Rollout:
     )
 
 
+def test_the_values_before_and_after_each_step_are_asked_once_for_each_visit_and_each_end():
+    made, v_S, asked = by_hand(), torch.tensor([5.0, 10.0, 20.0, 30.0]), []
+    v_TB, next_v_TB = made.values(lambda state_N: asked.append(state_N) or v_S[state_N])
+    alive_TB = made.alive_TB
+    assert v_TB[alive_TB].tolist() == v_S[made.state_TB][alive_TB].tolist() == [30.0, 10.0, 10.0, 20.0, 30.0]
+    assert next_v_TB[alive_TB].tolist() == v_S[made.next_state_TB][alive_TB].tolist() == [10.0, 20.0, 30.0, 5.0, 10.0]
+    assert v_TB.dtype == next_v_TB.dtype == made.reward_TB.dtype
+    assert [len(state_N) for state_N in asked] == [made.num_steps + made.num_episodes] == [7]
+
+
 @pytest.mark.parametrize("name", DISCOUNTED)
 def test_visits_under_the_geometric_horizon_are_an_unbiased_sample_of_d_pi(name):
     mdp = DISCOUNTED[name]()
@@ -356,7 +366,7 @@ def test_actions_that_are_not_counted_from_0_are_refused():
     class Shifted(VectorWrapper):
         single_action_space = gymnasium.spaces.Discrete(2, start=1)
 
-    with pytest.raises(PgtsError, match=r"the actions of Pendulum-v1 are Box"):
+    with pytest.raises(PgtsError, match=r"the actions of Pendulum-v1 are continuous, Box"):
         check_vector_env(make_vector_env("Pendulum-v1", 2, gamma=None))
     with pytest.raises(PgtsError, match=r"are Discrete\(2, start=1\)"):
         check_vector_env(Shifted(copies(ladder(), 2)))

@@ -1,8 +1,10 @@
 """A saved model goes on as if nothing had happened; a damaged or foreign file is refused and runs nothing."""
 
+import functools
 import hashlib
 import pickle
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -171,16 +173,40 @@ def test_other_files_and_no_file_are_refused_by_name(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "env",
+    [
+        lambda: make_vector_env("pgts/Ladder-v0", 4, gamma=None),
+        lambda: gymnasium.make("FrozenLake-v1"),
+        lambda: functools.partial(gymnasium.make, "FrozenLake-v1", is_slippery=False),
+    ],
+    ids=["copies", "instance", "function"],
+)
+def test_a_model_of_an_environment_that_is_an_object_is_loaded_with_one(env, tmp_path):
+    path = tmp_path / "model.pt"
+    short = {"depth": 1, "num_envs": 4, "horizon": {"type": "fixed", "length": 12}, "seed": 7}
+    whole = PGTS(env(), **short)
+    whole.iterate()
+    whole.save(path)
+    with pytest.raises(PgtsError, match=r"model.pt names no environment, for it was given as an object: load it with"):
+        PGTS.load(path)
+    loaded = PGTS.load(path, env=env())
+    assert same_bits(whole.iterate().experience, loaded.iterate().experience)
+    assert_same_tensors(whole.state_dict()["policy"], loaded.state_dict()["policy"])
+    make().save(path)
+    with pytest.raises(PgtsError, match=r"model.pt has its own, pgts/Ladder-v0"):
+        PGTS.load(path, env=env())
+
+
+@pytest.mark.parametrize(
     ("name", "part"),
     [
-        ("env", lambda: make_vector_env("pgts/Ladder-v0", 4, gamma=None)),
         ("policy", lambda: SoftmaxPolicy(5, 2)),
         ("update", lambda: SoftmaxUpdate(0.3)),
         ("horizon", lambda: FixedHorizon(4)),
     ],
 )
 def test_a_model_with_a_part_that_no_file_can_describe_is_not_saved(name, part, tmp_path):
-    model = make(**{name: part()}) if name != "env" else PGTS(part(), depth=2)
+    model = make(**{name: part()})
     model.iterate()
     with pytest.raises(PgtsError, match=f"{name} was given as"):
         model.save(tmp_path / "model.pt")

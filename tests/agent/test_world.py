@@ -13,11 +13,12 @@ from torch import Tensor
 
 from pgts_torch import PGTS
 from pgts_torch.agent import world as worlds
+from pgts_torch.agent.build import make_policy
 from pgts_torch.agent.rollout import FixedHorizon, rollout
 from pgts_torch.agent.world import DynamicsWorld, PlainWorld, SimulatedWorld, TabularWorld, World, make_world
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel, with_torques
-from pgts_torch.seeding import draw_keys, stream
+from pgts_torch.seeding import draw_keys, seed_sequence, stream
 from tests.agent.helpers import same_bits
 
 KEYWORDS = {"num_envs": 3, "gamma": None, "observation_key": None, "plain": False, "device": "cpu"}
@@ -122,6 +123,24 @@ def test_what_can_be_asked_about_an_environment_decides_its_world(make, kind):
     assert (world.mdp is None) == (kind is not TabularWorld)
 
 
+@pytest.mark.parametrize("id", ["CartPole-v1", "CliffWalking-v1"])
+def test_the_states_of_a_rollout_are_numbered_at_once_as_one_after_the_other(id, monkeypatch):
+    world, other, asked = world_of(id), world_of(id), []
+    policy = make_policy("mlp", world, seed=0)
+    monkeypatch.setattr(
+        world, "numbers", lambda read_N: asked.append(len(read_N)) or type(world).numbers(world, read_N)
+    )
+    made = rollout(world, world.env, policy, FixedHorizon(6), seed=0, names=("test",), generator=stream(0, "test"))
+    assert asked == [7 * 3]
+    observation, _ = other.env.reset(seed=seed_sequence(0, "test", "env").generate_state(3).tolist())
+    for state_B, action_B in zip(made.state_TB, made.action_TB, strict=True):
+        assert torch.equal(other.number(other.env, observation), state_B)
+        observation, _, over, *_ = other.env.step(action_B.numpy())
+        assert not over.any()
+    assert torch.equal(other.number(other.env, observation), made.next_state_TB[-1])
+    assert torch.equal(made.next_state_TB[:-1], made.state_TB[1:])
+
+
 def test_changed_constants_are_honoured_and_must_be_the_same_in_all_copies():
     world = world_of("CartPole-v1", sutton_barto_reward=True)
     world.env.reset(seed=0)
@@ -154,11 +173,12 @@ def test_actions_are_those_of_the_copies_also_in_a_simulator():
         (lambda: world_of("CartPole-v1", action_repeat=0), "action_repeat is 0; it must be at least 1"),
         (lambda: world_of("CartPole-v1", observation_key="x"), "they have no part 'x'"),
         (lambda: world_of("CartPole-v1", plain=True, observation_key="x"), "they have no part 'x'"),
-        (lambda: world_of(copies_of(Parts)), "observations are dictionaries of .*: say which part"),
+        (lambda: world_of(copies_of(Parts)), "the observations of Parts are dictionaries of .*: set observation_key"),
         (lambda: world_of(copies_of(Parts), observation_key="x"), "no part 'x'; they have"),
-        (lambda: world_of(gymnasium.make("CartPole-v1")), "it must be a Gymnasium id or a VectorEnv"),
+        (lambda: world_of(3), "the environment is 3; it must be a Gymnasium id, an environment, a function"),
+        (lambda: world_of(Cart()), "has no spec to make another instance from: give a function that makes one"),
         (lambda: world_of(SyncVectorEnv([Cart])), "the environment resets by"),
-        (lambda: make_world("Pendulum-v1", **KEYWORDS), "the actions of Pendulum-v1 are Box"),
+        (lambda: make_world("Pendulum-v1", **KEYWORDS), "the actions of Pendulum-v1 are continuous, Box"),
         (lambda: world_of("CartPole-v1", num_envs=0), "num_envs is 0"),
         (lambda: world_of("NoSuch-v0"), "NoSuch-v0 cannot be made"),
     ],
@@ -334,19 +354,6 @@ def test_each_iteration_numbers_anew():
 def test_repeated_actions_prove_nothing_and_single_ones_do():
     assert cartpole().iterate().certificate < 100
     assert cartpole(action_repeat=2).iterate().certificate == torch.inf
-
-
-def test_a_pendulum_is_swung_by_torques_from_a_list():
-    model = PGTS(
-        "Pendulum-v1",
-        depth=2,
-        num_envs=2,
-        horizon={"type": "fixed", "length": 5},
-        env_kwargs={"wrappers": [with_torques]},
-    )
-    assert isinstance(model.world, DynamicsWorld)
-    assert model.iterate().look.q_BA.shape == (10, 5)
-    assert model.predict(np.zeros((4, 3), np.float32)).shape == (4,)
 
 
 @pytest.mark.usefixtures("unchecked_shapes")

@@ -47,6 +47,22 @@ def test_a_usable_environment_is_told_in_a_table_with_exit_code_0(capsys):
     assert lines[-1] == "CliffWalking-v1 can serve as a model: its outcomes can be listed"
 
 
+@pytest.mark.parametrize(("kwargs", "states"), [([], 100), (["--kwargs", '{"size": 4, "traps": []}'], 16)])
+def test_a_table_is_told_in_one_line_to_need_no_snapshot(kwargs, states, capsys):
+    assert main(["check-model", "pgts/Grid-v0", *kwargs]) == 0
+    verdict = f"pgts/Grid-v0: a table of {states} states and 4 actions, no snapshot is needed"
+    assert capsys.readouterr().out == verdict + "\n"
+    told = answer(capsys, "pgts/Grid-v0", *kwargs)
+    assert told == {
+        "env": "pgts/Grid-v0",
+        "family": "table",
+        "num_states": states,
+        "num_actions": 4,
+        "usable": True,
+        "verdict": verdict,
+    }
+
+
 def test_the_json_holds_the_same_and_the_seed_decides_the_walks(capsys):
     told = answer(capsys, "FrozenLake-v1", "--seed", "4")
     assert (told["env"], told["family"], told["num_actions"]) == ("FrozenLake-v1", "toy text", 4)

@@ -48,6 +48,14 @@ class FakeRun(types.ModuleType):
     def describe(self, answer: Answer) -> str:
         return f"mean: {answer.mean}"
 
+
+class FakeEvaluation(types.ModuleType):
+    """Stands for the evaluation of a run, likewise."""
+
+    def __init__(self) -> None:
+        super().__init__("pgts_torch.experiment.evaluate")
+        self.calls: list[Any] = []
+
     def evaluate_run(self, run: Path, *, episodes: int, seed: int) -> dict[str, Answer]:
         self.calls.append((run, episodes, seed))
         return {"sampled": Answer(0.25), "deterministic": Answer(0.5, 0.125)}
@@ -155,8 +163,10 @@ def test_print_config_prints_yaml_that_loads_to_the_same_configuration(
 
 
 def test_evaluate_hands_on_its_arguments_and_prints_for_people_or_programs(
-    run: FakeRun, here: Path, capsys: pytest.CaptureFixture[str]
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    fake = FakeEvaluation()
+    monkeypatch.setitem(sys.modules, "pgts_torch.experiment.evaluate", fake)
     (here / "config.yaml").write_text(dump(Config()))
     assert main(["evaluate", ".", "--episodes", "7", "--seed", "3"]) == 0
     assert capsys.readouterr().out.splitlines() == [
@@ -167,7 +177,7 @@ def test_evaluate_hands_on_its_arguments_and_prints_for_people_or_programs(
     ]
     assert main(["evaluate", "--json", "."]) == 0
     assert json.loads(capsys.readouterr().out)["deterministic"] == {"mean": 0.5, "half_width": 0.125}
-    assert run.calls == [(Path("."), 7, 3), (Path("."), 100, 0)]
+    assert fake.calls == [(Path("."), 7, 3), (Path("."), 100, 0)]
 
 
 def test_an_error_of_the_run_is_one_line_and_ctrl_c_exits_with_130(

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -29,6 +28,7 @@ from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import MAX_BYTES, MAX_MISTAKES, ConfigError, load
 from pgts_torch.experiment.schema import Option, Schema
 from pgts_torch.experiment.sections import SEARCH_OPTIONS, FixedHorizonConfig, SampledAdvantagesConfig, SearchConfig
+from pgts_torch.models.environments import make_env
 from pgts_torch.tabular import ladder
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
@@ -377,13 +377,18 @@ def test_a_shipped_configuration_is_valid_and_says_what_it_shows(path: Path) -> 
     config = load(path)
     assert path.read_text().startswith("# ")
     assert config.name == path.stem
-    assert gymnasium.spec(config.env.id).id == config.env.id
-    gymnasium.make(config.env.id, **config.env.kwargs).close()
+    if config.env.id.startswith("MiniGrid-"):
+        pytest.importorskip("minigrid", exc_type=ImportError)
+    made = make_env(config.env.id, **config.env.kwargs)
+    assert made.spec is not None
+    assert made.spec.id == config.env.id
+    made.close()
 
 
 def test_the_shipped_configurations_are_those_of_the_paper_and_of_gymnasium() -> None:
-    own = {"deep_sea", "grid", "ladder", "random", "tightrope"}
-    others = {"acrobot", "cartpole", "cliff_walking", "frozen_lake_4x4", "frozen_lake_8x8", "mountain_car", "taxi"}
+    own = {"deep_sea", "deep_sea_bsuite", "deep_sea_stochastic", "grid", "ladder", "random", "tightrope"}
+    toy_text = {"cliff_walking", "frozen_lake_4x4", "frozen_lake_8x8", "taxi"}
+    others = toy_text | {"acrobot", "cartpole", "mountain_car", "door_key"}
     assert {path.stem for path in SHIPPED} == own | others
     assert own == {path.stem for path in SHIPPED if load(path).env.id.startswith("pgts/")}
 
@@ -406,6 +411,8 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a whole number >= 0": st.integers(0, 2**63 - 1),
     "a whole number >= 1": st.integers(1, 2**63 - 1),
     "a whole number in [1, 1024]": st.integers(1, 1024),
+    "a whole number in [2, 10000] or null": st.none() | st.integers(2, 10_000),
+    "a number or null": st.none() | st.floats(allow_nan=False, allow_infinity=False),
     "a number > 0": st.floats(0, exclude_min=True, allow_infinity=False),
     "a whole number >= 0 or adaptive": st.just("adaptive") | st.integers(0, 2**63 - 1),
     "a whole number >= 1 or null": st.none() | st.integers(1, 2**63 - 1),
@@ -467,6 +474,8 @@ def configurations(draw: st.DrawFn) -> Config:
     if types["update.type"] == "mirror":
         ignored = [key for key in given if key.startswith("update.") and (key == "update.step_size") != is_table]
         given |= {key: None for key in ignored if key not in ("update.type", "update.state_weight")}
+    if given["eval.every"] is None:
+        given |= {"eval.stop_at_return": None, "eval.keep_best": False}
     if given["search.depth"] != "adaptive":
         given["search.max_depth"] = given["search.tolerance"] = None
     for name, kind in SEARCH_OPTIONS.items():
@@ -503,6 +512,14 @@ def test_what_only_an_adaptive_depth_heeds_is_refused_beside_a_number(key: str) 
     assert load(None, ["--search.depth", "adaptive", f"--search.{key}", "1"]).search.depth == "adaptive"
     with pytest.raises(ConfigError, match=f"search.{key} is 1.*, which only search.depth adaptive heeds"):
         load(None, ["--search.depth", "4", f"--search.{key}", "1"])
+
+
+@pytest.mark.parametrize(("key", "value"), [("stop_at_return", 0.5), ("stop_at_return", 0.0), ("keep_best", True)])
+def test_what_only_evaluations_during_training_heed_is_refused_without_them(key: str, value: Any) -> None:
+    word = str(value).lower()
+    assert getattr(load(None, ["--eval.every", "100", f"--eval.{key}={word}"]).eval, key) == value
+    with pytest.raises(ConfigError, match=f"eval.{key} is {word}, which needs .*; eval.every is null"):
+        load(None, [f"--eval.{key}={word}"])
 
 
 def test_every_default_is_the_one_that_the_help_names() -> None:

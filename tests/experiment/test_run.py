@@ -8,10 +8,12 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import diagnostics, evaluate, run
+from pgts_torch.experiment import diagnostics, run
 from pgts_torch.experiment.config import Config
+from pgts_torch.experiment.evaluate import last_checkpoint
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
 from pgts_torch.tabular import exact, stationary
@@ -54,7 +56,7 @@ def few_iterations(folder: Path, *arguments: str, config: Path = ROOT / "configs
 @pytest.mark.usefixtures("unchecked_shapes")  # other tests check them; here they cost half the time
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
 def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(config, tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluate, "time_limit", lambda env_id: 15)
+    monkeypatch.setattr(PGTS, "time_limit", 15)
     summary = run.train(few_iterations(tmp_path, config=config))
     folder = tmp_path / "run"
     lines = read_metrics(folder)
@@ -118,12 +120,42 @@ def test_what_is_logged_and_evaluated_does_not_change_what_is_learned(tmp_path):
     quiet = few_iterations(tmp_path, "--log.every", "1000", "--run.tensorboard", "false")
     loud = few_iterations(tmp_path, "--eval.every", "1", "--log.checkpoint_every", "1", "--run.overwrite")
     run.train(quiet)
-    silent = PGTS.load(run.last_checkpoint(tmp_path / "run")).policy.table()
+    silent = PGTS.load(last_checkpoint(tmp_path / "run")).policy.table()
     run.train(loud)
-    watched = PGTS.load(run.last_checkpoint(tmp_path / "run")).policy.table()
+    watched = PGTS.load(last_checkpoint(tmp_path / "run")).policy.table()
     assert torch.equal(silent, watched)
     assert len(list((tmp_path / "run" / "checkpoints").iterdir())) >= 2
     assert any("eval/deterministic_return" in line for line in read_metrics(tmp_path / "run"))
+
+
+def test_evaluations_during_training_are_written_down_at_their_steps_with_their_intervals(tmp_path):
+    run.train(few_iterations(tmp_path, "--eval.every", "100", "--eval.episodes", "3"))
+    lines = [line for line in read_metrics(tmp_path / "run") if any(tag.startswith("eval/") for tag in line)]
+    assert [line["step"] for line in lines] == [120]
+    names = [f"eval/{kind}_{score}" for kind in ("deterministic", "sampled") for score in ("return", "length")]
+    assert set(lines[0]) == {"step", *names, *(f"{name}_half_width" for name in names)}
+    algorithm = run.build(few_iterations(tmp_path))
+    algorithm.learn(120)
+    score = evaluate(algorithm, episodes=3, deterministic=False, seed=0)
+    assert lines[0]["eval/sampled_return"] == score.episodic_return.mean
+    assert lines[0]["eval/sampled_length_half_width"] == score.episodic_length.half_width
+    assert set(EventAccumulator(str(tmp_path / "run")).Reload().Tags()["scalars"]) >= set(names)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_training_ends_at_the_stated_return_of_greedy_episodes_and_the_best_model_is_kept(tmp_path):
+    fast = ["--update.step_size", "50", "--policy.init", "{type: uniform}", "--eval.every", "120"]
+    best = ["--eval.keep_best", "--run.overwrite"]
+    summary = run.train(few_iterations(tmp_path, *fast, *best, "--total_steps", "600", "--eval.stop_at_return", "96"))
+    lines = read_metrics(tmp_path / "run")
+    assert summary.env_steps == lines[-1]["step"] < 600
+    greedy = [line["eval/deterministic_return"] for line in lines if "eval/deterministic_return" in line]
+    assert greedy[-1] == 96.0 == PGTS.load(tmp_path / "run" / "best.pt").predict(0) * 96
+    assert all(score < 96 for score in greedy[:-1])
+    assert last_checkpoint(tmp_path / "run").name == f"{summary.env_steps:012d}.pt"
+    summary = run.train(few_iterations(tmp_path, *fast, "--run.overwrite", "--total_steps", "600"))
+    assert summary.env_steps >= 600
+    assert not (tmp_path / "run" / "best.pt").exists()
 
 
 def test_nothing_shipped_learns_from_exact_values(tmp_path):
@@ -167,7 +199,7 @@ def test_what_cannot_be_built_leaves_nothing_behind(arguments, tmp_path):
 
 def test_the_summary_states_exact_numbers(tmp_path):
     summary = run.train(few_iterations(tmp_path))
-    algorithm = PGTS.load(run.last_checkpoint(tmp_path / "run"))
+    algorithm = PGTS.load(last_checkpoint(tmp_path / "run"))
     pi_SA = algorithm.policy.table()
     assert summary.J == exact.evaluate(algorithm.mdp, pi_SA).J
     assert summary.stationarity_gap == float(stationary.gap(algorithm.mdp, pi_SA, 4).max())
@@ -177,11 +209,11 @@ def test_the_summary_states_exact_numbers(tmp_path):
 def test_evaluation_runs_the_greedy_and_the_sampled_policy_to_the_time_limit():
     algorithm = PGTS("pgts/Ladder-v0", depth=4, policy={"type": "softmax", "init": {"type": "uniform"}}, seed=0)
     algorithm.policy.load_state_dict({"logits_SA": mirror_step(*always_right(), 1.0).log()})
-    greedy = evaluate.evaluate(algorithm, episodes=3, deterministic=True, seed=0)
+    greedy = evaluate(algorithm, episodes=3, deterministic=True, seed=0)
     assert (greedy.episodic_return.mean, greedy.episodic_length.mean) == (96.0, 100.0)
     assert greedy.discounted_return.mean == pytest.approx((0.9**4 - 0.9**100) / 0.1)
     assert greedy.episodic_return.half_width == 0
-    sampled = evaluate.evaluate(algorithm, episodes=200, deterministic=False, seed=0)
+    sampled = evaluate(algorithm, episodes=200, deterministic=False, seed=0)
     truth = exact.evaluate(algorithm.mdp, algorithm.policy.table()).J
     # 95 % interval, twice as wide: error probability below 1e-3. J beyond step 100 is below 1e-4.
     assert abs(sampled.discounted_return.mean - truth) < 2 * sampled.discounted_return.half_width + 1e-4
@@ -190,7 +222,7 @@ def test_evaluation_runs_the_greedy_and_the_sampled_policy_to_the_time_limit():
 
 def test_one_episode_has_no_confidence_interval():
     algorithm = PGTS("pgts/Ladder-v0", seed=0)
-    assert evaluate.evaluate(algorithm, episodes=1, deterministic=True, seed=0).episodic_return.half_width is None
+    assert evaluate(algorithm, episodes=1, deterministic=True, seed=0).episodic_return.half_width is None
 
 
 def test_a_value_that_is_not_finite_is_written_as_null(tmp_path):

@@ -10,11 +10,13 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import evaluate, run
+from pgts_torch.experiment import run
 from pgts_torch.experiment.config import Config
+from pgts_torch.experiment.evaluate import evaluate_run, last_checkpoint
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.tracking import read_metrics
 
@@ -66,7 +68,7 @@ def same_bits(first: dict[str, Any], second: dict[str, Any]) -> bool:
 
 
 def trained(folder: Path) -> PGTS:
-    return PGTS.load(run.last_checkpoint(folder / "run"))
+    return PGTS.load(last_checkpoint(folder / "run"))
 
 
 def test_a_network_run_leaves_a_whole_folder_and_claims_nothing_exact(tmp_path):
@@ -91,9 +93,9 @@ def test_a_network_run_leaves_a_whole_folder_and_claims_nothing_exact(tmp_path):
 
 def test_evaluating_the_folder_of_a_run_gives_the_numbers_of_its_summary(tmp_path):
     summary = run.train(small(tmp_path))
-    answer = run.evaluate_run(tmp_path / "run", episodes=3, seed=0)
+    answer = evaluate_run(tmp_path / "run", episodes=3, seed=0)
     assert answer == {"deterministic": summary.deterministic, "sampled": summary.sampled}
-    assert run.evaluate_run(tmp_path / "run", episodes=3, seed=1) != answer
+    assert evaluate_run(tmp_path / "run", episodes=3, seed=1) != answer
 
 
 @pytest.mark.parametrize("estimator", [[], ["--search.depth", "0", "--estimator.type", "sampled"]])
@@ -108,6 +110,15 @@ def test_what_is_logged_and_evaluated_does_not_move_a_bit_of_training(estimator,
     assert not same_bits(quiet, state_of(trained(tmp_path)))
 
 
+def test_a_pendulum_is_trained_by_a_knob_and_measured_again_from_its_folder(tmp_path):
+    summary = run.train(small(tmp_path, "--env.actions_per_dimension", "3", env="Pendulum-v1"))
+    assert summary.model_calls > 0
+    answer = evaluate_run(tmp_path / "run", episodes=3, seed=0)
+    assert answer["deterministic"] == summary.deterministic
+    with pytest.raises(PgtsError, match=r"the actions of Pendulum-v1 are continuous, .*: set actions_per_dimension"):
+        run.build(small(tmp_path, env="Pendulum-v1"))
+
+
 def test_an_evaluation_leaves_statistics_and_states_as_they_are(tmp_path):
     algorithm = run.build(small(tmp_path))
     algorithm.iterate()
@@ -118,7 +129,7 @@ def test_an_evaluation_leaves_statistics_and_states_as_they_are(tmp_path):
     assert model is not None
     before, rows, states = state_of(algorithm), float(norm.count), model.num_states
     for deterministic in (True, False):
-        evaluate.evaluate(algorithm, episodes=3, deterministic=deterministic, seed=5)
+        evaluate(algorithm, episodes=3, deterministic=deterministic, seed=5)
     assert same_bits(before, state_of(algorithm))
     assert float(norm.count) == rows > 0
     assert model.num_states == states > 0
@@ -128,7 +139,7 @@ def test_an_evaluation_leaves_statistics_and_states_as_they_are(tmp_path):
 
 def test_an_evaluation_ends_at_the_time_limit_of_the_environment(tmp_path):
     algorithm = run.build(small(tmp_path, env="MountainCar-v0"))
-    score = evaluate.evaluate(algorithm, episodes=2, deterministic=True, seed=0)
+    score = evaluate(algorithm, episodes=2, deterministic=True, seed=0)
     assert (score.episodic_return.mean, score.episodic_length.mean) == (-200.0, 200.0)
     assert score.discounted_return.mean == pytest.approx(-(1 - 0.99**200) / 0.01)
 

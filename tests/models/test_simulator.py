@@ -13,7 +13,7 @@ from gymnasium import spaces
 from torch import Tensor
 
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.models import SimulatorModel, TabularModel
+from pgts_torch.models import SimulatorModel, TabularModel, simulator
 from pgts_torch.models.environments import all_actions, grid_actions, make_env, sampled_actions
 from pgts_torch.models.snapshots import generator_state
 from pgts_torch.search import Topology, expectimax, sampled
@@ -148,6 +148,73 @@ def test_a_search_asks_the_simulator_once_for_each_state_and_action():
     state_N, action_N = torch.zeros(9, dtype=torch.int64), torch.zeros(9, dtype=torch.int64)
     model.sample(state_N, action_N, key_N=keys(9))
     assert model.simulator_steps == first.model_calls
+
+
+@pytest.mark.parametrize(("most_bytes", "asked_again"), [(10**9, False), (0, True)])
+def test_answers_outlive_the_numbers_of_states_unless_they_take_much_memory(most_bytes, asked_again, monkeypatch):
+    monkeypatch.setattr(simulator, "_MOST_BYTES", most_bytes)
+    model, answers, steps = SimulatorModel("CliffWalking-v1", gamma=0.9), [], []
+    for state in (0, 36, 36):  # the second search leads to states that the first one has numbered otherwise
+        model.clear()
+        root_B = model.roots([standing_in("CliffWalking-v1", state)])
+        answers.append(expectimax(model, root_B, depth=20, v_leaf=zeros).q_BA)
+        steps.append(model.simulator_steps)
+    fresh = SimulatorModel("CliffWalking-v1", gamma=0.9)
+    alone = expectimax(fresh, fresh.roots([standing_in("CliffWalking-v1", 36)]), depth=20, v_leaf=zeros).q_BA
+    assert torch.equal(answers[1], alone)
+    assert torch.equal(answers[2], alone)
+    assert not torch.equal(answers[0], alone)
+    assert (steps[2] > steps[1]) == asked_again
+
+
+@pytest.mark.parametrize(
+    "id", ["MiniGrid-DoorKey-5x5-v0", "MiniGrid-Dynamic-Obstacles-5x5-v0", "MiniGrid-MemoryS7-v0", "BabyAI-GoToObj-v0"]
+)
+def test_observations_that_are_made_late_are_those_that_steps_give(id):
+    pytest.importorskip("minigrid", exc_type=ImportError)
+    model, env = (
+        SimulatorModel(id, gamma=0.9, observe=lambda seen: np.append(seen["image"], seen["direction"])),
+        make_env(id),
+    )
+    observation, _ = env.reset(seed=3)
+    base: Any = env.unwrapped
+    state = model.root(env, observation)
+    for action in (0, 2, 1, 2, 3, 2, 2, 5, 2, 0, 2):
+        drawn = model.sample(torch.tensor([state]), torch.tensor([action]), key_N=torch.tensor([5]))
+        model.adapter.seed(base, 5)
+        observation, reward, terminated, *_ = base.step(action)
+        state = int(drawn.next_state_N)
+        assert model.snapshot(state).key == model.adapter.get_state(base).key
+        assert (float(drawn.reward_N), float(drawn.discount_N)) == (reward, 0.0 if terminated else 0.9)
+        (shown,) = model.observations(torch.tensor([state]))
+        assert np.array_equal(shown, np.append(observation["image"], observation["direction"]))
+        if terminated:
+            break
+
+
+def test_only_distinct_states_are_looked_at_and_what_others_make_of_a_step_is_kept(monkeypatch):
+    doorkey = pytest.importorskip("minigrid.envs", exc_type=ImportError).DoorKeyEnv
+    looks = []
+    real = doorkey.gen_obs
+    monkeypatch.setattr(doorkey, "gen_obs", lambda env: looks.append(env) or real(env))
+
+    class Dimmed(doorkey):
+        def step(self, action):
+            observation, *rest = super().step(action)
+            return {**observation, "image": observation["image"] // 2}, *rest
+
+    images = []
+    for make in (doorkey, Dimmed):
+        env = make(size=5)
+        observation, _ = env.reset(seed=0)
+        model = SimulatorModel(lambda make=make: make(size=5), gamma=0.9, observe=lambda seen: seen["image"])
+        looks.clear()
+        look = expectimax(model, torch.tensor([model.root(env, observation)]), depth=2, v_leaf=zeros)
+        assert len(looks) == (model.num_states - 1 if make is doorkey else look.model_calls)
+        images.append(model.observations(torch.tensor([1]))[0])
+    assert look.model_calls > 2 * model.num_states
+    assert np.array_equal(images[0] // 2, images[1])
+    assert images[1].any()
 
 
 def test_what_chance_decides_is_asked_for_every_key():

@@ -1,0 +1,133 @@
+"""Copies of an environment that step together and reset by mask."""
+
+import functools
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+from pgts_torch.agent.optimisers import check_count
+from pgts_torch.errors import PgtsError
+from pgts_torch.models import snapshots
+from pgts_torch.models.environments import EnvSource, all_actions, make_env, spec_of, with_torques
+
+
+def make_vector_env(
+    env: EnvSource, num_envs: int, *, gamma: float | None, actions_per_dimension: int | None = None, **kwargs: Any
+) -> VectorEnv:
+    """Copies of an environment that reset by mask, without its registered time limit: the horizon is ours.
+
+    Args:
+        env: an id; or an instance or a spec, of which others are made; or a function that makes one.
+        gamma: handed to environments that carry a discount of their own (pgts/*), if given.
+        actions_per_dimension: into how many values each dimension of continuous actions is divided
+            (`models.with_torques`); None: actions are discrete.
+        kwargs: for gymnasium.make_vec, of an id.
+
+    Raises:
+        PgtsError: Gymnasium knows no such environment or cannot make it; or its actions cannot be divided.
+    """
+    if num_envs < 1:
+        raise PgtsError(f"num_envs is {num_envs}; it must be at least 1")
+    if not isinstance(env, str):
+        return SyncVectorEnv([_maker(env, actions_per_dimension)] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+    options: dict[str, Any] = {"max_episode_steps": -1, **kwargs}
+    if actions_per_dimension is not None:
+        divide = functools.partial(_divided, count=actions_per_dimension)
+        options["wrappers"] = [*options.get("wrappers", ()), divide]
+    try:
+        if spec_of(env).namespace == "pgts":
+            if actions_per_dimension is not None:
+                raise PgtsError(f"actions_per_dimension is {actions_per_dimension}; {env} has discrete actions")
+            options |= {} if gamma is None else {"gamma": gamma}
+            options |= {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.DISABLED}
+        else:
+            options |= {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode.DISABLED}}
+        return gymnasium.make_vec(env, num_envs=num_envs, **options)
+    except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
+        raise PgtsError(f"{env} cannot be made: {error}") from error
+
+
+def more_copies(env: VectorEnv, num_envs: int) -> VectorEnv:
+    """Fresh copies, made as those of `env` were; PgtsError unless it is a SyncVectorEnv, which knows how."""
+    if not isinstance(env, SyncVectorEnv):
+        raise PgtsError(f"{env_name(env)} was given as copies that cannot be made again; give a SyncVectorEnv or an id")
+    makers = itertools.islice(itertools.cycle(env.env_fns), num_envs)
+    return SyncVectorEnv(list(makers), autoreset_mode=AutoresetMode.DISABLED)
+
+
+def check_vector_env(env: VectorEnv) -> None:
+    """PgtsError unless rollouts can be made in this environment: discrete actions, reset by mask."""
+    if not isinstance(env, VectorEnv):
+        raise PgtsError(f"the environment is {env!r}; it must be a VectorEnv")
+    space = env.single_action_space
+    if isinstance(space, spaces.Box):
+        raise PgtsError(
+            f"the actions of {env_name(env)} are continuous, {space}: set actions_per_dimension, into how many values "
+            "each dimension of them is divided"
+        )
+    if not isinstance(space, spaces.Discrete) or space.start != 0:
+        raise PgtsError(f"the actions of {env_name(env)} are {space}; they must be Discrete(n) counted from 0")
+    mode = env.metadata.get("autoreset_mode")
+    if mode != AutoresetMode.DISABLED:
+        raise PgtsError(f"the environment resets by {mode}; make it with autoreset_mode=AutoresetMode.DISABLED")
+
+
+def env_name(env: VectorEnv) -> str:
+    """What an error calls an environment."""
+    if env.spec is None and isinstance(env, SyncVectorEnv):
+        return snapshots.env_name(env.envs[0])
+    return repr(env) if env.spec is None else env.spec.id
+
+
+def registered_limit(env: EnvSource | VectorEnv, copies: VectorEnv) -> int | None:
+    """The most steps of an episode of an environment of which copies were made, as registered; None: no limit."""
+    spec: EnvSpec | None
+    if isinstance(env, str):
+        spec = spec_of(env)
+    elif isinstance(env, gymnasium.Env | EnvSpec):
+        spec = env if isinstance(env, EnvSpec) else env.spec
+    else:
+        spec = copies.envs[0].spec if isinstance(copies, SyncVectorEnv) else copies.spec
+    limit = None if spec is None else spec.max_episode_steps
+    return limit if limit is not None and limit > 0 else None
+
+
+def divided_actions(env: VectorEnv) -> np.ndarray:
+    """What each action of `actions_per_dimension` is to the environment itself, a row each."""
+    assert isinstance(env, SyncVectorEnv)
+    outermost = env.envs[0]
+    assert isinstance(outermost, gymnasium.ActionWrapper)
+    return np.stack([outermost.action(action) for action in all_actions(outermost.action_space)])
+
+
+def _maker(env: Any, actions_per_dimension: int | None) -> Callable[[], gymnasium.Env]:
+    """A function that makes another instance of an environment."""
+    if not isinstance(env, gymnasium.Env | EnvSpec) and not callable(env):
+        raise PgtsError(
+            f"the environment is {env!r}; it must be a Gymnasium id, an environment, a function that makes one, or a "
+            "VectorEnv"
+        )
+    source = env.spec or env if isinstance(env, gymnasium.Env) else env
+    limit = {"max_episode_steps": -1} if isinstance(source, EnvSpec) else {}
+    make = functools.partial(make_env, source, **limit)
+    return make if actions_per_dimension is None else lambda: _divided(make(), count=actions_per_dimension)
+
+
+def _divided(env: gymnasium.Env, *, count: int) -> gymnasium.Env:
+    if not isinstance(env.action_space, spaces.Box):
+        raise PgtsError(
+            f"actions_per_dimension is {count}; {snapshots.env_name(env)} has discrete actions, {env.action_space}"
+        )
+    check_count("actions_per_dimension", count)
+    try:
+        return with_torques(env, count)
+    except PgtsError as error:
+        raise PgtsError(
+            f"actions_per_dimension is {count}, but {snapshots.env_name(env)} cannot have it: {error}"
+        ) from error

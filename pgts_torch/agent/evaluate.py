@@ -1,0 +1,136 @@
+"""How good a policy is, by episodes that nothing is learned from."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Self, final
+
+import scipy.special
+import torch
+from gymnasium.vector import VectorEnv
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.agent.optimisers import check_count
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.rollout import FixedHorizon, rollout
+from pgts_torch.agent.world import World
+from pgts_torch.seeding import stream
+
+UNLIMITED_LENGTH = 1000
+"""Longest episode where the environment sets no time limit."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """A mean over episodes with the half-width of its 95 % confidence interval (Student's t); None for one episode."""
+
+    mean: float
+    half_width: float | None
+
+    @classmethod
+    def of(cls, value_B: Float[Tensor, "B"]) -> Self:
+        """Of one value for each episode."""
+        count = len(value_B)
+        if count == 1:
+            return cls(float(value_B), None)
+        spread = float(value_B.std()) / math.sqrt(count)
+        return cls(float(value_B.mean()), float(scipy.special.stdtrit(count - 1, 0.975)) * spread)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes under the environment's own time limit: sums of rewards, discounted sums, and lengths."""
+
+    episodes: int
+    episodic_return: Score
+    discounted_return: Score
+    episodic_length: Score
+
+
+def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed: int = 0) -> Evaluation:
+    """Run the policy in fresh copies of its environment.
+
+    Args:
+        episodes: how many, at least 1.
+        deterministic: take the most probable action, else draw from pi.
+        seed: of these episodes alone; training is not touched.
+
+    Raises:
+        PgtsError: episodes is below 1; `PGTS.make_copies` cannot make copies; or the environment failed, naming step
+            and seeds.
+    """
+    check_count("episodes", episodes)
+    env = algorithm.make_copies(episodes)
+    names = ("evaluate", "deterministic" if deterministic else "sampled")
+    made = rollout(
+        _Watched(algorithm.world, env),
+        env,
+        Greedy(algorithm.policy) if deterministic else algorithm.policy,
+        FixedHorizon(algorithm.time_limit or UNLIMITED_LENGTH),
+        seed=seed,
+        names=names,
+        generator=stream(seed, *names, device=algorithm.device),
+    )
+    env.close()
+    return Evaluation(
+        episodes,
+        Score.of((made.reward_TB * made.alive_TB).sum(0)),
+        Score.of(made.returns()),
+        Score.of(made.alive_TB.double().sum(0)),
+    )
+
+
+@final
+class _Watched(World):
+    """Copies in which a policy is only watched: no state is asked for again, so none is told from another.
+
+    Args:
+        world: says what the policy sees.
+        env: copies of its environment.
+    """
+
+    def __init__(self, world: World, env: VectorEnv) -> None:
+        self.env, self._world = env, world
+        self.num_actions, self.observation_space = world.num_actions, world.observation_space
+        self.gamma, self.device = world.gamma, world.device
+
+    def encode(self, observation: Any) -> Tensor:
+        """As in the world."""
+        return self._world.encode(observation)
+
+    def read(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
+        """0 for all."""
+        return torch.zeros(env.num_envs, dtype=torch.int64, device=self.device)
+
+    def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+        """0 for all."""
+        return read_N
+
+    def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        """Nothing can be said."""
+        raise AssertionError("what was watched is over")
+
+    def forget(self) -> bool:
+        """Nothing."""
+        return False
+
+
+@final
+class Greedy(Policy):
+    """Takes the most probable action of another policy."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self.num_actions = policy.num_actions
+
+    def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
+        """1 for the most probable action, 0 for the others."""
+        best_N = self.policy.probs(observation_N).argmax(-1)
+        return torch.nn.functional.one_hot(best_N, self.num_actions).double()
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.policy.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.policy.load_state_dict(state)

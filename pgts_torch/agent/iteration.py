@@ -1,0 +1,48 @@
+"""What one pass through the loop of Algorithm 1 saw and did."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.agent.rollout import Rollout
+from pgts_torch.search.lookahead import Lookahead
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What the policy pi_k is moved by.
+
+    state_N, weight_N: the states that it visited, and what each counts for in the update; with sampled advantages every
+        visit has a row of its own.
+    pi_NA: pi_k at these states.
+    advantage_NA: how much better each action is.
+    depth: m.
+    look: (T^m Q)(s, .) at these states; None with sampled advantages.
+    gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, with v(s) = <pi(.|s), Q(s, .)> of the same critic.
+    certificate: an upper bound on J* - J^pi; true if the critic is exact, else as far as its v is right at the start
+        states. Infinite where the model knows no largest value, and for sampled searches, which prove nothing.
+    """
+
+    state_N: Int[Tensor, "N"]
+    weight_N: Float[Tensor, "N"]
+    pi_NA: Float[Tensor, "N A"]
+    advantage_NA: Float[Tensor, "N A"]
+    depth: int
+    look: Lookahead | None
+    gap_N: Float[Tensor, "N"]
+    certificate: float
+
+
+@dataclass(frozen=True, eq=False)
+class Iteration(Seen):
+    """What one pass through the loop of Algorithm 1 saw and did.
+
+    experience: the episodes of pi_k.
+    losses: the critic's and the update's, by name.
+    model_calls: (state, action) asked of the model in this pass, by the lookahead and by the critic.
+    """
+
+    experience: Rollout
+    losses: dict[str, float]
+    model_calls: int

@@ -1,0 +1,71 @@
+"""What a policy sees of an environment, as tensors."""
+
+from typing import Any, final
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+from jaxtyping import Int
+from torch import Tensor
+
+from pgts_torch.agent.copies import env_name
+from pgts_torch.errors import PgtsError
+
+
+@final
+class Observations:
+    """What a policy sees of an environment whose observations are numbers, vectors or images.
+
+    Args:
+        env: copies of it.
+        key: which part of dictionary observations is meant.
+
+    Raises:
+        PgtsError: dictionary observations without a key, a key that they do not have, or another kind of space.
+    """
+
+    def __init__(self, env: VectorEnv, key: str | None, device: torch.device) -> None:
+        space, what = env.single_observation_space, f"the observations of {env_name(env)}"
+        if isinstance(space, spaces.Dict):
+            known = ", ".join(map(str, space.keys()))
+            if key is None:
+                raise PgtsError(f"{what} are dictionaries of {known}: set observation_key, which part a policy sees")
+            if key not in space.spaces:
+                raise PgtsError(f"{what} have no part {key!r}; they have {known}")
+            space = space[key]
+        elif key is not None:
+            raise PgtsError(f"{what} are {space}; they have no part {key!r}")
+        if not isinstance(space, spaces.Discrete | spaces.Box):
+            raise PgtsError(f"{what} are {space}; a policy sees numbers, vectors or images")
+        self.space, self.key, self.device = space, key, device
+
+    def part(self, observation: Any) -> Any:
+        """The part of an observation that is meant."""
+        return observation if self.key is None else observation[self.key]
+
+    def encode(self, observation: Any) -> Tensor:
+        """As `World.encode`."""
+        return self.encode_part(self.part(observation))
+
+    def encode_part(self, part: Any) -> Tensor:
+        """The same, of the part that is meant."""
+        if isinstance(self.space, spaces.Discrete):
+            return states_of(part, int(self.space.n)).to(self.device)
+        array = np.asarray(part)
+        if array.shape[max(0, array.ndim - len(self.space.shape)) :] != self.space.shape:
+            raise PgtsError(f"an observation has shape {array.shape}; its space is {self.space}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise PgtsError(f"an observation is not finite: {array[~np.isfinite(array)][:3].tolist()}")
+        return torch.from_numpy(np.array(array)).to(self.device)
+
+
+def states_of(observation: Any, num_states: int) -> Int[Tensor, "..."]:
+    """Observations that are numbers below `num_states`."""
+    state = np.asarray(observation)
+    if not np.issubdtype(state.dtype, np.integer):
+        raise PgtsError(f"observation is of {state.dtype}; states are integers")
+    off = state[(state < 0) | (state >= num_states)]
+    if off.size:
+        raise PgtsError(f"state {off.flat[0]} does not exist; states are 0 to {num_states - 1}")
+    return torch.from_numpy(np.array(state, dtype=np.int64))

@@ -1,0 +1,153 @@
+"""What an agent can be given to act in: ids, instances, functions; continuous actions, divided."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from pgts_torch import PGTS
+from pgts_torch.agent.callbacks import EvalCallback
+from pgts_torch.agent.copies import make_vector_env
+from pgts_torch.agent.evaluate import evaluate
+from pgts_torch.agent.world import DynamicsWorld, PlainWorld, SimulatedWorld, TabularWorld
+from pgts_torch.errors import PgtsError
+from tests.agent.helpers import same_bits
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+SHORT = {"depth": 1, "num_envs": 2, "horizon": {"type": "fixed", "length": 5}, "seed": 3}
+
+
+class Field(gymnasium.Env):
+    """A point in the plane, moved by two continuous actions; the reward is its nearness to (1, 1)."""
+
+    observation_space = spaces.Box(-100, 100, (2,), np.float64)
+    action_space = spaces.Box(np.array([-1, -2], np.float32), np.array([1, 2], np.float32))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = np.zeros(2)
+        return self.place, {}
+
+    def step(self, action):
+        assert action in self.action_space
+        self.place = self.place + action
+        return self.place, -float(np.abs(self.place - 1).sum()), False, False, {}
+
+    def get_state(self):
+        return self.place.tobytes()
+
+    def set_state(self, state):
+        self.place = np.frombuffer(state)
+
+
+def pendulum(**kwargs) -> PGTS:
+    return PGTS("Pendulum-v1", **SHORT | {"actions_per_dimension": 5} | kwargs)
+
+
+def test_pendulum_is_trained_evaluated_saved_and_used_by_one_knob(tmp_path):
+    model = pendulum()
+    assert isinstance(model.world, DynamicsWorld)
+    assert model.iterate().look.q_BA.shape[-1] == 5
+    callback = EvalCallback(every=1, episodes=2, best_path=tmp_path / "best.pt")
+    model.learn(30, callback=callback)
+    assert callback.history[-1].evaluation.episodic_length.mean == 200
+    loaded = PGTS.load(tmp_path / "best.pt")
+    env = gymnasium.make("Pendulum-v1")
+    observation, _ = env.reset(seed=0)
+    for _ in range(3):
+        action = loaded.predict(observation)
+        assert action in env.action_space
+        observation, *_ = env.step(action)
+
+
+def test_predicted_actions_are_those_of_the_grid_over_the_space():
+    model = PGTS(Field, **SHORT, actions_per_dimension=3)
+    assert isinstance(model.world, SimulatedWorld)
+    grid = [[x, y] for x in (-1, 0, 1) for y in (-2, 0, 2)]
+    assert model.world.model.num_actions == 9
+    seen = set()
+    for action in model.predict(np.zeros((400, 2)), deterministic=False):
+        assert action in Field.action_space
+        seen.add(tuple(action.tolist()))
+    assert seen == {tuple(map(float, point)) for point in grid}
+    assert model.predict(np.zeros((4, 3, 2))).shape == (4, 3, 2)
+    assert model.predict(np.zeros(2)).shape == (2,)
+
+
+def test_what_the_model_answers_is_what_the_divided_environment_does():
+    model = PGTS(Field, **SHORT, actions_per_dimension=3)
+    seen = model.iterate().experience
+    place_TBD = model.world.observe(seen.next_state_TB.reshape(-1)).view(*seen.state_TB.shape, 2)
+    grid_AD = torch.tensor([[x, y] for x in (-1.0, 0.0, 1.0) for y in (-2.0, 0.0, 2.0)], dtype=torch.float64)
+    torch.testing.assert_close(place_TBD, grid_AD[seen.action_TB].cumsum(0))
+
+
+@pytest.mark.parametrize(
+    ("env", "kind"),
+    [("FrozenLake-v1", TabularWorld), ("CartPole-v1", DynamicsWorld), ("pgts/Ladder-v0", TabularWorld)],
+)
+def test_an_id_an_instance_a_spec_and_a_function_are_the_same_environment(env, kind):
+    instance = gymnasium.make(env)
+    forms = [env, instance, instance.spec, lambda: gymnasium.make(env, max_episode_steps=-1)]
+    models = [PGTS(form, **SHORT) for form in forms]
+    assert all(isinstance(model.world, kind) for model in models)
+    first, *others = [model.iterate().experience for model in models]
+    if env != "pgts/Ladder-v0":  # its many copies draw their starts together
+        assert all(same_bits(first, other) for other in others)
+    assert all(same_bits(others[0], other) for other in others)
+    assert evaluate(models[1], episodes=2) == evaluate(models[2], episodes=2)
+
+
+def test_the_instance_itself_is_not_acted_in():
+    env = gymnasium.make("CartPole-v1")
+    env.reset(seed=0)
+    before = env.unwrapped.state.copy(), env.unwrapped.np_random.bit_generator.state
+    PGTS(env, **SHORT).learn(20)
+    assert np.array_equal(env.unwrapped.state, before[0])
+    assert env.unwrapped.np_random.bit_generator.state == before[1]
+
+
+def test_an_id_that_names_its_module_is_imported_from_there(tmp_path, monkeypatch):
+    source = "import gymnasium\nfrom tests.agent.test_copies import Field\ngymnasium.register('Field-v0', Field)\n"
+    (tmp_path / "fields_of_mine.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    model = PGTS("fields_of_mine:Field-v0", **SHORT, actions_per_dimension=2)
+    assert model.iterate().experience.num_steps == 10
+    model.save(tmp_path / "model.pt")
+    assert PGTS.load(tmp_path / "model.pt").num_env_steps == 10
+    with pytest.raises(PgtsError, match="nothing_of_mine:Field-v0 cannot be made: No module named"):
+        PGTS("nothing_of_mine:Field-v0")
+
+
+def test_continuous_actions_need_no_model_where_advantages_are_sampled():
+    model = pendulum(depth=0, estimator="sampled")
+    assert isinstance(model.world, PlainWorld)
+    assert model.iterate().model_calls == 0
+
+
+@pytest.mark.parametrize(
+    ("env", "options", "message"),
+    [
+        ("Pendulum-v1", {}, r"the actions of Pendulum-v1 are continuous, Box.*: set actions_per_dimension"),
+        (Field, {}, r"the actions of Field are continuous, Box.*: set actions_per_dimension"),
+        ("CartPole-v1", {"actions_per_dimension": 3}, r"actions_per_dimension is 3; .*CartPole-v1.* discrete actions"),
+        ("pgts/Ladder-v0", {"actions_per_dimension": 3}, "actions_per_dimension is 3; pgts/Ladder-v0 has discrete"),
+        ("Pendulum-v1", {"actions_per_dimension": 1}, "it must be at least 2"),
+        (Field, {"actions_per_dimension": 101}, "at most 10,000 actions in 2 dimensions"),
+        (Field, {"env_kwargs": {"n": 3}, "actions_per_dimension": 2}, "given as an object takes none"),
+        (lambda: 3, {}, "gave 3; it must be a Gymnasium environment"),
+        (3, {}, "the environment is 3; it must be a Gymnasium id, an environment, a function that makes one"),
+    ],
+)
+def test_what_cannot_be_acted_in_is_refused_by_name(env, options, message):
+    with pytest.raises(PgtsError, match=message):
+        PGTS(env, **SHORT, **options)
+
+
+def test_copies_that_were_made_take_their_own_actions():
+    copies = make_vector_env("Pendulum-v1", 2, gamma=None, actions_per_dimension=3)
+    assert PGTS(copies, **SHORT).iterate().look.q_BA.shape[-1] == 3
+    with pytest.raises(PgtsError, match="actions_per_dimension is 3; a VectorEnv takes its own actions"):
+        PGTS(copies, **SHORT, actions_per_dimension=3)

@@ -1,0 +1,156 @@
+"""A user's environment that fails: one error names the environment, the step and the seeds of its copies."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from pgts_torch import PGTS, EvalCallback
+from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.seeding import seed_sequence
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+
+class Clock(gymnasium.Env):
+    """Counts its steps, of which the fourth may go wrong."""
+
+    observation_space = spaces.Box(0, 100, (2,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self.shown(), {}
+
+    def step(self, action):
+        self.time += 1
+        if self.time == 4:
+            return self.fourth()
+        return self.shown(), 1.0, False, False, {}
+
+    def shown(self):
+        return np.full(2, self.time, np.float32)
+
+    def fourth(self):
+        return self.shown(), 1.0, False, False, {}
+
+    def get_state(self):
+        return self.time
+
+    def set_state(self, state):
+        self.time = state
+
+
+class Raises(Clock):
+    def fourth(self):
+        raise RuntimeError("the spring broke")
+
+
+class Unseen(Clock):
+    def fourth(self):
+        return np.full(2, np.nan, np.float32), 1.0, False, False, {}
+
+
+class Longer(Clock):
+    def fourth(self):
+        return np.zeros(3, np.float32), 1.0, False, False, {}
+
+
+class Shorter(Clock):
+    def fourth(self):
+        return np.zeros(1, np.float32), 1.0, False, False, {}
+
+
+class Worthless(Clock):
+    def fourth(self):
+        return self.shown(), np.nan, False, False, {}
+
+
+class Terse(Clock):
+    def fourth(self):
+        return self.shown(), 1.0, False
+
+
+class Unborn(Clock):
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.full(2, np.nan, np.float32), {}
+
+
+class Stillborn(Clock):
+    def reset(self, *, seed=None, options=None):
+        raise RuntimeError("no start")
+
+
+class Misborn(Clock):
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(3, np.float32), {}
+
+
+def make(env: type[gymnasium.Env], **kwargs) -> PGTS:
+    short = {"depth": 0, "estimator": "sampled", "num_envs": 2, "horizon": {"type": "fixed", "length": 6}, "seed": 5}
+    return PGTS(env, **short | kwargs)
+
+
+def seeds(*names: str | int) -> str:
+    return str(seed_sequence(5, *names, "env").generate_state(2).tolist())
+
+
+FAILURES = {
+    Raises: "in step 3 .* RuntimeError: the spring broke",
+    Unseen: r"in step 3 .* an observation is not finite: \[nan, nan, nan\]",
+    Longer: "in step 3 .* Output array is the wrong shape",
+    Shorter: "in step 3 .* Output array is the wrong shape",
+    Worthless: r"in step 3 .* the rewards are \[nan, nan\]; they must be finite",
+    Terse: "in step 3 .* not enough values to unpack",
+    Unborn: r"at the start .* an observation is not finite: \[nan, nan, nan\]",
+    Misborn: "at the start .* Output array is the wrong shape",
+}
+
+
+@pytest.mark.parametrize("env", FAILURES)
+@pytest.mark.parametrize("options", [{}, {"depth": 1, "estimator": "lookahead"}], ids=["plain", "lookahead"])
+def test_what_fails_in_a_rollout_is_named_with_its_step_and_seeds(env, options):
+    with pytest.raises(PgtsError, match=f"^{env.__name__} failed {FAILURES[env]}") as caught:
+        make(env, **options).iterate()
+    assert f"the seeds {seeds('iteration', 0)}: " in str(caught.value)
+    assert make(Clock, **options).iterate().experience.num_steps == 12
+
+
+def test_what_cannot_start_is_named_by_whoever_starts_it_first():
+    with pytest.raises(PgtsError, match=r"Stillborn failed at the start of .*: RuntimeError: no start"):
+        make(Stillborn).iterate()
+    with pytest.raises(PgtsError, match="Stillborn failed in reset with seed 0: RuntimeError: no start"):
+        make(Stillborn, depth=1, estimator="lookahead")
+
+
+def test_what_fails_in_an_evaluation_is_named_too():
+    model = make(Raises, horizon={"type": "fixed", "length": 3})
+    with pytest.raises(PgtsError, match=r"Raises failed in step 3 .* the spring broke") as caught:
+        model.learn(100, callback=EvalCallback(every=1, episodes=2, seed=5))
+    assert f"the seeds {seeds('evaluate', 'deterministic')}: " in str(caught.value)
+
+
+@pytest.mark.parametrize("env", [Raises, Worthless, Unseen, Longer])
+def test_what_fails_in_a_lookahead_is_named_with_its_environment(env):
+    short = {"depth": 2, "estimator": "lookahead", "horizon": {"type": "fixed", "length": 2}}
+    assert make(env, **short | {"depth": 1}).iterate().depth == 1
+    with pytest.raises(PgtsError, match=f"{env.__name__}"):
+        make(env, **short).iterate()
+
+
+def test_an_environment_without_a_model_is_refused_where_a_lookahead_needs_one_and_not_elsewhere():
+    class Unknown(Clock):
+        get_state = set_state = None
+
+    with pytest.raises(MissingModel, match="Unknown cannot be restored: give Unknown the methods get_state"):
+        make(Unknown, depth=1, estimator="lookahead")
+    assert make(Unknown).iterate().model_calls == 0
+
+
+@pytest.mark.parametrize("callback", [3, [3], "evaluate", {"every": 3}])
+def test_a_callback_that_cannot_be_called_is_refused(callback):
+    with pytest.raises(PgtsError, match=r"callback is .*; it must be a function of"):
+        make(Clock).learn(10, callback=callback)
