@@ -14,7 +14,6 @@ more likely than not, and worth nothing to the critic before that.
 """
 
 import argparse
-import dataclasses
 import json
 import time
 from functools import cache
@@ -92,30 +91,35 @@ def tree_search_run(method: str, size: int, seed: int) -> Record:
 def predicted(size: int, depth: int) -> bool:
     """Whether Algorithm 1 without noise solves this size."""
     mdp = deep_sea(size, gamma=GAMMA)
-    row_S = torch.arange(size * size) // size
-    diagonal = torch.arange(size) * (size + 1)
+    outcomes, diagonal = mdp.outcomes, torch.arange(size) * (size + 1)
+    discount_S = GAMMA ** (torch.arange(size * size) // size)
     pi_SA = torch.full((size * size, 2), 0.5, dtype=torch.float64)
     known_S = torch.zeros(size * size, dtype=torch.bool)
     found = 0.0
     for iteration in range(1, EPISODES // BATCH + 1):
-        reach_S = exact.occupancy(mdp, pi_SA) / GAMMA**row_S
+        reach_S = _reach(mdp, pi_SA, size)
         visited_S = 1 - (1 - reach_S.clamp(max=1)) ** BATCH >= 0.5
         known_S |= visited_S
         found += float(pi_SA[diagonal, 1].prod())
         if found > ENOUGH * iteration:
             return True
-        q_SA = backup(mdp.outcomes, exact.policy_values(_ends_beyond(mdp, known_S), pi_SA) * known_S)
-        look_SA = exact.lookahead(mdp, q_SA, depth)
-        weight_S = exact.occupancy(mdp, pi_SA)
-        pi_SA = torch.where(visited_S[:, None], softmax_step(pi_SA, look_SA, weight_S, STEP_SIZE), pi_SA)
+        v_S = torch.zeros(size * size, dtype=torch.float64)
+        for _ in range(size):  # from the last row up
+            v_S = known_S * (pi_SA * backup(outcomes, v_S)).sum(-1)
+        look_SA = exact.lookahead(mdp, backup(outcomes, v_S), depth)
+        moved_SA = softmax_step(pi_SA, look_SA, discount_S * reach_S, STEP_SIZE)
+        pi_SA = torch.where(visited_S[:, None], moved_SA, pi_SA)
     return False
 
 
-def _ends_beyond(mdp: TabularMDP, known_S: torch.Tensor) -> TabularMDP:
-    """The MDP in which nothing is to be had in a state that is not known."""
-    outcomes = mdp.outcomes
-    discount_NAK = torch.where(known_S[outcomes.child_NAK], outcomes.discount_NAK, 0.0)
-    return dataclasses.replace(mdp, outcomes=dataclasses.replace(outcomes, discount_NAK=discount_NAK))
+def _reach(mdp: TabularMDP, pi_SA: torch.Tensor, size: int) -> torch.Tensor:
+    """How probable it is that an episode comes through each cell."""
+    weight_SAK = pi_SA[:, :, None] * mdp.outcomes.prob_NAK * (mdp.outcomes.discount_NAK > 0)
+    reach_S = mdp.start_S
+    for _ in range(size):  # from the first row down
+        flow_SAK = reach_S[:, None, None] * weight_SAK
+        reach_S = mdp.start_S.index_add(0, mdp.outcomes.child_NAK.flatten(), flow_SAK.flatten())
+    return reach_S
 
 
 def least_depth(size: int) -> int:
@@ -135,15 +139,18 @@ def label(method: str) -> str:
 
 
 def table(records: list[Record], sizes: tuple[int, ...]) -> str:
-    """A row for each method, in Markdown."""
+    """A row for each method, in Markdown; seeds that have not been through all sizes do not count."""
     lines = [
-        f"| method | sizes solved, of {len(sizes)} | 95 % interval | largest solved by all | episodes | env steps "
-        "| model calls | CPU s |",
-        "|---|---|---|---|---|---|---|---|",
+        f"| method | seeds | sizes solved, of {len(sizes)} | 95 % interval | largest solved by all | episodes "
+        "| env steps | model calls | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for method in dict.fromkeys(r["method"] for r in records):
         mine = [r for r in records if r["method"] == method]
-        seeds = sorted({r["seed"] for r in mine})
+        seeds = [seed for seed in {r["seed"] for r in mine} if sum(r["seed"] == seed for r in mine) == len(sizes)]
+        mine = [r for r in mine if r["seed"] in seeds]
+        if not mine:
+            continue
         count_R = np.array([sum(_solved(r) for r in mine if r["seed"] == seed) for seed in seeds], dtype=float)
         low, high = bootstrap_interval(count_R)
         always = [n for n in sizes if all(_solved(r) for r in mine if r["size"] == n)]
@@ -151,7 +158,7 @@ def table(records: list[Record], sizes: tuple[int, ...]) -> str:
             name: np.median([r[name] for r in mine]) for name in ("episodes", "env_steps", "model_calls", "seconds")
         }
         lines.append(
-            f"| {label(method)} | {interquartile_mean(count_R):.1f} | {low:.1f} to {high:.1f} "
+            f"| {label(method)} | {len(seeds)} | {interquartile_mean(count_R):.1f} | {low:.1f} to {high:.1f} "
             f"| {max(always, default='none')} | {median['episodes']:,.0f} | {median['env_steps']:,.0f} "
             f"| {median['model_calls']:,.0f} | {median['seconds']:.1f} |"
         )
@@ -216,7 +223,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--sizes", type=lambda text: tuple(map(int, text.split(","))), default=SIZES)
     parser.add_argument("--methods", type=lambda text: tuple(text.split(",")), default=METHODS)
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time, each in one thread")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time, each in one thread; 0: none")
     parser.add_argument("--runs", type=Path, default=RUNS, help="finished runs, kept and not made again")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--picture", type=Path)
@@ -226,9 +233,9 @@ def main(arguments: list[str] | None = None) -> None:
     torch.set_num_threads(1)
     keys: list[dict[str, Any]] = [
         {"method": method, "size": size, "seed": seed}
+        for seed in range(given.seeds)
         for method in given.methods
         for size in given.sizes
-        for seed in range(given.seeds)
     ]
     records = measure(keys, run, path=given.runs, jobs=given.jobs)
     if given.json:

@@ -19,12 +19,13 @@ Record = dict[str, Any]
 
 def measure(keys: Sequence[Key], run: Callable[[Key], Record], *, path: Path, jobs: int) -> list[Record]:
     """The records of all these runs, in their order; those that the file has not are made and appended, `jobs` at a
-    time, in processes of one thread each."""
+    time, in processes of one thread each. With 0 jobs none is made."""
     kept = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
-    missing = [key for key in keys if _find(kept, key) is None]
+    missing = [key for key in keys if jobs and _find(kept, key) is None]
     path.parent.mkdir(parents=True, exist_ok=True)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, initializer=_one_thread) as pool, path.open("a", encoding="utf-8") as file:
+    pool = ProcessPoolExecutor(jobs or 1, context, initializer=_one_thread)
+    with pool, path.open("a", encoding="utf-8") as file:
         waiting = {pool.submit(run, key): key for key in missing}
         for number, future in enumerate(as_completed(waiting), 1):
             key = waiting[future]

@@ -23,8 +23,8 @@ import torch
 from matplotlib.figure import Figure
 from records import Key, Record, measure
 
+from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.experiment import run as experiment
-from pgts_torch.experiment.evaluate import evaluate
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.sweep import bootstrap_interval, interquartile_mean
 
@@ -44,9 +44,9 @@ class Task:
 
 
 TASKS = {
-    "frozen_lake_8x8": Task(0.75, 120_000, 100),
-    "cliff_walking": Task(-13, 100_000, 1),
-    "taxi": Task(7.0, 200_000, 100),
+    "frozen_lake_8x8": Task(0.75, 60_000, 100),
+    "cliff_walking": Task(-13, 30_000, 1),
+    "taxi": Task(7.0, 150_000, 50),
     "cartpole": Task(475, 100_000, 20),
     "acrobot": Task(-100, 100_000, 20),
     "mountain_car": Task(-115, 120_000, 20),
@@ -183,7 +183,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--tasks", type=names, default=tuple(TASKS))
     parser.add_argument("--methods", type=names, default=METHODS)
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time, each in one thread")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time, each in one thread; 0: none")
     parser.add_argument("--runs", type=Path, default=RUNS, help="finished runs, kept and not made again")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--picture", type=Path)

@@ -225,10 +225,10 @@ def lookahead_line(name: str, depth: int, found: dict[str, list[float]], base: d
     return line + "".join(f"{common.short(calls):>10}" for calls in (found["calls"][0], later["calls"]))
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     parser = common.parser(__doc__)
     parser.add_argument("--only", choices=("training", "lookahead"), help="one of the two")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     common.use_one_core()
     report: dict[str, Any] = {"about": common.about(args)}
     if args.only != "lookahead":

@@ -262,10 +262,10 @@ def picture(report: dict[str, Any], path: Path) -> None:
     figure.savefig(path, dpi=100)
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     parser = common.parser(__doc__)
     parser.add_argument("--picture", type=Path, help="where to draw the figures")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     common.use_one_core()
     estimates = 100 if args.quick else 400
     print(f"{estimates} estimates of {EPISODES} episodes each; 95 % bootstrap intervals over estimates")
