@@ -13,17 +13,14 @@ Beside it stands a prediction from the exact world: Algorithm 1 without noise, i
 more likely than not, and worth nothing to the critic before that.
 """
 
-import argparse
-import json
 import time
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from records import Key, Record, measure
+from records import Key, Record, benchmark
 
 from pgts_torch import PGTS
 from pgts_torch.bellman import backup
@@ -138,7 +135,7 @@ def label(method: str) -> str:
     return NAMES.get(method, f"PGTS, m = {depth}")
 
 
-def table(records: list[Record], sizes: tuple[int, ...]) -> str:
+def table(records: list[Record], sizes: list[int]) -> str:
     """A row for each method, in Markdown; seeds that have not been through all sizes do not count."""
     lines = [
         f"| method | seeds | sizes solved, of {len(sizes)} | 95 % interval | largest solved by all | episodes "
@@ -165,7 +162,7 @@ def table(records: list[Record], sizes: tuple[int, ...]) -> str:
     return "\n".join(lines)
 
 
-def verdict(records: list[Record], sizes: tuple[int, ...]) -> str:
+def verdict(records: list[Record], sizes: list[int]) -> str:
     """How often the prediction was right, for the fixed depths."""
     fixed = [r for r in records if r["method"].startswith("pgts-") and r["method"] != "pgts-adaptive"]
     wrong = [r for r in fixed if _solved(r) != (depth_of(r) >= least_depth(r["size"]))]
@@ -185,9 +182,9 @@ def _solved(record: Record) -> bool:
     return bool(record["solved"]) and record["episodes"] <= EPISODES
 
 
-def picture(records: list[Record], sizes: tuple[int, ...]) -> Figure:
+def picture(records: list[Record]) -> Figure:
     """Left: which (N, m) were solved, under the prediction. Right: after how many steps, for every method."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    sizes, figure = _sizes(records), Figure(figsize=(11, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     for depth in DEPTHS:
         mine = [r for r in records if r["method"] == f"pgts-{depth}"]
@@ -216,35 +213,27 @@ def picture(records: list[Record], sizes: tuple[int, ...]) -> Figure:
     return figure
 
 
+def describe(records: list[Record]) -> str:
+    sizes = _sizes(records)
+    return f"{table(records, sizes)}\n\n{verdict(records, sizes)}"
+
+
+def _sizes(records: list[Record]) -> list[int]:
+    return sorted({r["size"] for r in records})
+
+
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="deep_sea.py"
+    benchmark(
+        __doc__,
+        arguments,
+        problem="size",
+        problems=SIZES,
+        methods=METHODS,
+        runs=RUNS,
+        run=run,
+        describe=describe,
+        draw=picture,
     )
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--sizes", type=lambda text: tuple(map(int, text.split(","))), default=SIZES)
-    parser.add_argument("--methods", type=lambda text: tuple(text.split(",")), default=METHODS)
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time, each in one thread; 0: none")
-    parser.add_argument("--runs", type=Path, default=RUNS, help="finished runs, kept and not made again")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--picture", type=Path)
-    given = parser.parse_args(arguments)
-    if unknown := set(given.methods) - set(METHODS):
-        parser.error(f"no such method: {', '.join(sorted(unknown))}; there are {', '.join(METHODS)}")
-    torch.set_num_threads(1)
-    keys: list[dict[str, Any]] = [
-        {"method": method, "size": size, "seed": seed}
-        for seed in range(given.seeds)
-        for method in given.methods
-        for size in given.sizes
-    ]
-    records = measure(keys, run, path=given.runs, jobs=given.jobs)
-    if given.json:
-        given.json.write_text(json.dumps(records, indent=1) + "\n")
-    if given.picture:
-        picture(records, given.sizes).savefig(given.picture, dpi=120)
-    print(table(records, given.sizes))
-    print()
-    print(verdict(records, given.sizes))
 
 
 if __name__ == "__main__":

@@ -10,18 +10,14 @@ a row that reaches the stated return; it is said to have reached it at the first
 without the evaluations.
 """
 
-import argparse
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
-from records import Key, Record, measure
+from records import Key, Record, benchmark
 
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.experiment import run as experiment
@@ -46,7 +42,7 @@ class Task:
 TASKS = {
     "frozen_lake_8x8": Task(0.75, 60_000, 100),
     "cliff_walking": Task(-13, 30_000, 1),
-    "taxi": Task(7.0, 150_000, 50),
+    "taxi": Task(7.0, 200_000, 50),
     "cartpole": Task(475, 100_000, 20),
     "acrobot": Task(-100, 100_000, 20),
     "mountain_car": Task(-115, 120_000, 20),
@@ -141,7 +137,7 @@ def table(records: list[Record]) -> str:
         "| task | return | method | seeds that reached it | env steps | model calls | CPU s | return at the end |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for task in dict.fromkeys(r["task"] for r in records):
+    for task in TASKS:
         for method in METHODS:
             mine = [r for r in records if r["task"] == task and r["method"] == method]
             lines += [row(task, method, mine)] if mine else []
@@ -150,7 +146,7 @@ def table(records: list[Record]) -> str:
 
 def picture(records: list[Record]) -> Figure:
     """The return of greedy episodes against environment steps, for each task; a line is a median over seeds."""
-    tasks = list(dict.fromkeys(r["task"] for r in records))
+    tasks = [task for task in TASKS if any(r["task"] == task for r in records)]
     figure = Figure(figsize=(12, 5.4), layout="constrained")
     panels = figure.subplots(2, 4).flatten()
     for axes, task in zip(panels, tasks, strict=False):
@@ -173,37 +169,17 @@ def picture(records: list[Record]) -> Figure:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="tasks.py"
+    benchmark(
+        __doc__,
+        arguments,
+        problem="task",
+        problems=tuple(TASKS),
+        methods=METHODS,
+        runs=RUNS,
+        run=run,
+        describe=table,
+        draw=picture,
     )
-
-    def names(text: str) -> tuple[str, ...]:
-        return tuple(text.split(","))
-
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--tasks", type=names, default=tuple(TASKS))
-    parser.add_argument("--methods", type=names, default=METHODS)
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time, each in one thread; 0: none")
-    parser.add_argument("--runs", type=Path, default=RUNS, help="finished runs, kept and not made again")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--picture", type=Path)
-    given = parser.parse_args(arguments)
-    for known, asked in ((TASKS, given.tasks), (METHODS, given.methods)):
-        if unknown := set(asked) - set(known):
-            parser.error(f"{', '.join(sorted(unknown))} is not among {', '.join(known)}")
-    torch.set_num_threads(1)
-    keys: list[dict[str, Any]] = [
-        {"task": task, "method": method, "seed": seed}
-        for seed in range(given.seeds)
-        for task in given.tasks
-        for method in given.methods
-    ]
-    records = measure(keys, run, path=given.runs, jobs=given.jobs)
-    if given.json:
-        given.json.write_text(json.dumps(records, indent=1) + "\n")
-    if given.picture:
-        picture(records).savefig(given.picture, dpi=120)
-    print(table(sorted(records, key=lambda r: list(TASKS).index(r["task"]))))
 
 
 if __name__ == "__main__":
