@@ -209,7 +209,7 @@ def picture(records: list[Record]) -> Figure:
         right.plot(failed, [height] * len(failed), "x", markersize=5, color=line.get_color())
     right.axhline(EPISODES, color="k", linestyle=":", linewidth=1)
     right.set(xlabel="size N", ylabel="episodes until solved", yscale="log", title="Median over seeds (x: not solved)")
-    right.legend(loc="center right")
+    right.legend(loc="lower right")
     return figure
 
 
