@@ -19,6 +19,7 @@ from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.evaluate import Evaluation, Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.errors import NotFinite, failure
 from pgts_torch.experiment import diagnostics
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.evaluate import KINDS
@@ -28,6 +29,7 @@ from pgts_torch.experiment.tracking import (
     BEST_FILE,
     CHECKPOINTS,
     CONFIG_FILE,
+    FAILURE_FILE,
     SUMMARY_FILE,
     VERSIONS_FILE,
     RunFolder,
@@ -104,6 +106,7 @@ def train(config: Config) -> Summary:
 
     Raises:
         PgtsError: something in the configuration cannot be built, or the folder is taken; nothing was written.
+        NotFinite: training met a number that is not finite; what and where stands in failure.json.
     """
     torch.set_num_threads(config.threads)
     algorithm = build(config)
@@ -123,7 +126,13 @@ def train(config: Config) -> Summary:
 
 def _loop(config: Config, algorithm: PGTS, folder: RunFolder) -> Summary:
     recorder = _Recorder(config, algorithm, folder)
-    algorithm.learn(config.total_steps, callback=recorder)
+    try:
+        algorithm.learn(config.total_steps, callback=recorder)
+    except NotFinite as error:
+        where = {"iteration": algorithm.num_iterations, "env_step": algorithm.num_env_steps, "seed": config.seed}
+        record = where | {"tensor": error.what, "message": str(error)}
+        folder.text(FAILURE_FILE, json.dumps(record, indent=2) + "\n")
+        raise failure(f"iteration {algorithm.num_iterations} of {folder.path} stopped", error) from error
     recorder.report.close()
     _save(algorithm, folder)
     return recorder.finish()

@@ -16,6 +16,7 @@ from pgts_torch.errors import PgtsError
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
 SUMMARY_FILE = "summary.json"
+FAILURE_FILE = "failure.json"
 VERSIONS_FILE = "versions.json"
 CHECKPOINTS = "checkpoints"
 BEST_FILE = "best.pt"

@@ -11,7 +11,7 @@ from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.engine import SampledSearch, Search
 from pgts_torch.search.expectimax import expectimax
 from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead
-from pgts_torch.search.topology import Topology
+from pgts_torch.search.topology import Topology, tree_nodes
 
 MOST_SAMPLES = 32
 
@@ -146,8 +146,3 @@ class AutoSearch(Search):
 
     def __str__(self) -> str:
         return self._picked
-
-
-def tree_nodes(roots: int, children: int, expansions: int) -> float:
-    """Nodes of trees in which no two paths meet."""
-    return roots * sum(float(children) ** level for level in range(expansions + 1))
