@@ -44,6 +44,9 @@ def main(arguments: Arguments | None = None) -> int:
         The exit code: 0; 1 if `check-model` found something missing, a run of a sweep failed or a number in training
         was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started us: what is said goes nowhere
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
         code = _dispatch(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()  # meets a broken pipe here, not while the interpreter shuts down

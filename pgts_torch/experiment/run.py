@@ -33,6 +33,7 @@ from pgts_torch.experiment.tracking import (
     SUMMARY_FILE,
     VERSIONS_FILE,
     RunFolder,
+    event_writer,
     prepare_folder,
     versions,
 )
@@ -110,6 +111,8 @@ def train(config: Config) -> Summary:
     """
     torch.set_num_threads(config.threads)
     algorithm = build(config)
+    if config.run.tensorboard:
+        event_writer()
     path = Path(config.run.dir) if config.run.dir else _new_folder(config)
     prepare_folder(path, overwrite=config.run.overwrite)
     if path.exists():

@@ -170,6 +170,16 @@ def remembered(model: PGTS) -> list[Tensor]:
     return [torch.as_tensor(value).clone() for state in states for value in state.values()]
 
 
+@pytest.mark.fault(
+    "observation that is not finite",
+    "reward that is not finite",
+    "discount that is not finite",
+    "value that is not finite",
+    "lookahead that is not finite",
+    "probability that is not finite",
+    "loss that is not finite",
+    "gradient that is not finite",
+)
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 @pytest.mark.parametrize(("place", "kind"), CASES, ids=lambda case: getattr(case, "__name__", case))
 def test_a_number_that_is_not_finite_stops_training_before_the_policy_moves(place, kind, value, monkeypatch):
@@ -193,6 +203,7 @@ def test_without_such_a_number_the_policy_moves(kind):
     assert not all(map(torch.equal, before, remembered(model)))
 
 
+@pytest.mark.fault("step that overflows")
 @pytest.mark.parametrize(
     ("policy", "update"),
     [
@@ -213,6 +224,7 @@ def test_a_tabular_step_that_overflows_leaves_the_table_as_it_is(policy, update)
     assert not torch.equal(policy.table(), before)
 
 
+@pytest.mark.fault("step that overflows")
 def test_a_direction_that_overflows_leaves_the_table_as_it_is():
     policy = SoftmaxPolicy(3, 2, init=Biased(action=1, probability=0.9))
     before, weight_N = policy.table(), torch.ones(1, dtype=torch.float64)
@@ -231,6 +243,7 @@ def test_an_action_that_is_not_allowed_may_be_worth_minus_infinity():
         MirrorUpdate(1.0)(policy, states, advantage_NA.fill_(-math.inf), weight_N, generator=stream(0, "update"))
 
 
+@pytest.mark.fault("step that overflows")
 @pytest.mark.parametrize(("learning_rate", "what"), [(1e20, "probability"), (1e39, "gradient")])
 def test_steps_of_a_network_that_overflow_are_taken_back(learning_rate, what):
     policy = NetworkPolicy(spaces.Box(-math.inf, math.inf, (3,)), 2, network=MLP(activation="relu"))

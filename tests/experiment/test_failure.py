@@ -31,6 +31,7 @@ def train(folder: Path, *arguments: str) -> int:
     return main(["train", "--config", str(ROOT / "configs" / "ladder.yaml"), *few, f"--run.dir={folder}", *arguments])
 
 
+@pytest.mark.fault("reward that is not finite")
 @pytest.mark.usefixtures("breaks_in_the_third_iteration")
 def test_a_run_that_meets_what_is_not_finite_keeps_its_checkpoints_writes_what_it_met_and_exits_with_1(
     tmp_path, capsys

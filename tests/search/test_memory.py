@@ -27,6 +27,7 @@ def test_the_estimate_is_what_the_tables_of_outcomes_take():
     assert table_bytes(7, A, K, torch.float64) == sum(column.numel() * column.element_size() for column in columns)
 
 
+@pytest.mark.fault("lookahead larger than memory")
 def test_a_lookahead_is_refused_before_the_level_that_would_not_fit_is_asked_for():
     model = WatchedModel(TabularModel(GARNET))
     nodes = expectimax(TabularModel(GARNET), ROOT, depth=3, v_leaf=zeros).nodes_per_level
@@ -63,6 +64,7 @@ def test_the_search_that_chooses_narrows_until_it_fits():
     assert float(look.pruned_BA.max()) > 0
 
 
+@pytest.mark.fault("lookahead of too many nodes")
 def test_too_many_nodes_are_refused_with_how_many_there_may_be_at_that_depth():
     model = WatchedModel(TabularModel(GARNET))
     with pytest.raises(NodeBudgetExceeded) as caught:
