@@ -131,14 +131,14 @@ def _loop(config: Config, algorithm: PGTS, folder: RunFolder) -> Summary:
     recorder = _Recorder(config, algorithm, folder)
     try:
         algorithm.learn(config.total_steps, callback=recorder)
+        recorder.report.close()
+        _save(algorithm, folder)
+        return recorder.finish()
     except NotFinite as error:
         where = {"iteration": algorithm.num_iterations, "env_step": algorithm.num_env_steps, "seed": config.seed}
         record = where | {"tensor": error.what, "message": str(error)}
         folder.text(FAILURE_FILE, json.dumps(record, indent=2) + "\n")
         raise failure(f"iteration {algorithm.num_iterations} of {folder.path} stopped", error) from error
-    recorder.report.close()
-    _save(algorithm, folder)
-    return recorder.finish()
 
 
 class _Recorder:

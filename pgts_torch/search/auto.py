@@ -98,7 +98,10 @@ class AutoSearch(Search):
         if float(narrow.pruned_BA.max()) == 0:
             self._picked = f"expectimax: the model lists its outcomes, and {narrow.nodes} nodes hold all paths"
         else:
-            self._picked = f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes"
+            self._picked = (
+                f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes, "
+                "or too much memory"
+            )
         if 2 * max(self._width, narrow.nodes) <= self.max_nodes:
             self._width *= 2
         return replace(narrow, model_calls=topology.model_calls - calls_before)

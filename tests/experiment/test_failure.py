@@ -8,6 +8,8 @@ import pytest
 
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.envs.vector import TabularVectorEnv
+from pgts_torch.errors import NotFinite
+from pgts_torch.experiment import run
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.evaluate import last_checkpoint
 
@@ -46,6 +48,17 @@ def test_a_run_that_meets_what_is_not_finite_keeps_its_checkpoints_writes_what_i
     assert complaint == f"error: iteration 2 of {folder} stopped: {message}"
     assert PGTS.load(last_checkpoint(folder)).num_env_steps == 120
     assert not (folder / "summary.json").exists()
+
+
+def test_what_is_not_finite_in_the_last_evaluation_is_written_down_too(tmp_path, monkeypatch):
+    def fails(*args, **kwargs):
+        raise NotFinite("the rewards are [nan]; they must be finite", what="reward")
+
+    monkeypatch.setattr(run, "evaluate", fails)
+    assert train(tmp_path / "run") == 1
+    record = json.loads((tmp_path / "run" / "failure.json").read_text())
+    assert (record["env_step"], record["tensor"]) == (600, "reward")
+    assert PGTS.load(last_checkpoint(tmp_path / "run")).num_env_steps == 600
 
 
 def test_a_run_that_meets_nothing_of_the_kind_leaves_no_failure(tmp_path):
