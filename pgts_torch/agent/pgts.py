@@ -39,7 +39,7 @@ from pgts_torch.agent.world import make_world
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.search.engine import Search
-from pgts_torch.search.lookahead import Leaf, Lookahead
+from pgts_torch.search.lookahead import Leaf, Lookahead, check_finite
 from pgts_torch.seeding import stream
 from pgts_torch.tabular.mdp import TabularMDP
 
@@ -188,6 +188,7 @@ class PGTS:
         pi_NA = self.policy.probs(self.world.observe(states))
         shallow = self.lookahead(states, depth=0)
         v_N = (pi_NA * shallow.q_BA).sum(-1)
+        check_finite("value", "the policy's value", v_N, states)
         _, occupancy_N = experience.visits("occupancy")
         for depth in self.depths:
             look = self.lookahead(states, depth=depth) if depth else shallow

@@ -15,14 +15,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.fields import INT64_MAX
 from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.schema import Option, Schema
 
-CHECK_FAILED, USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
+CHECK_FAILED = NOT_FINITE = 1
+USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 WIDTH = 79
 
 Arguments = Sequence[str]
@@ -40,9 +41,12 @@ def main(arguments: Arguments | None = None) -> int:
     """Run `pgts` with these arguments (default: those of the process).
 
     Returns:
-        The exit code: 0; 1 if `check-model` found something missing or a run of a sweep failed; 2 after a mistake of
-        the caller, which stands on stderr, a line each; 130 after Ctrl-C.
+        The exit code: 0; 1 if `check-model` found something missing, a run of a sweep failed or a number in training
+        was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started us: what is said goes nowhere
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
         code = _dispatch(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()  # meets a broken pipe here, not while the interpreter shuts down
@@ -50,7 +54,7 @@ def main(arguments: Arguments | None = None) -> int:
     except PgtsError as error:
         for line in str(error).splitlines():
             print(f"error: {line}", file=sys.stderr)
-        return USAGE_ERROR
+        return NOT_FINITE if isinstance(error, NotFinite) else USAGE_ERROR
     except BrokenPipeError:
         # Nobody reads on: what is still in the buffer goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

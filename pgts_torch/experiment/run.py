@@ -19,6 +19,7 @@ from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.evaluate import Evaluation, Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.errors import NotFinite, failure
 from pgts_torch.experiment import diagnostics
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.evaluate import KINDS
@@ -28,9 +29,11 @@ from pgts_torch.experiment.tracking import (
     BEST_FILE,
     CHECKPOINTS,
     CONFIG_FILE,
+    FAILURE_FILE,
     SUMMARY_FILE,
     VERSIONS_FILE,
     RunFolder,
+    event_writer,
     prepare_folder,
     versions,
 )
@@ -104,9 +107,12 @@ def train(config: Config) -> Summary:
 
     Raises:
         PgtsError: something in the configuration cannot be built, or the folder is taken; nothing was written.
+        NotFinite: training met a number that is not finite; what and where stands in failure.json.
     """
     torch.set_num_threads(config.threads)
     algorithm = build(config)
+    if config.run.tensorboard:
+        event_writer()
     path = Path(config.run.dir) if config.run.dir else _new_folder(config)
     prepare_folder(path, overwrite=config.run.overwrite)
     if path.exists():
@@ -123,10 +129,16 @@ def train(config: Config) -> Summary:
 
 def _loop(config: Config, algorithm: PGTS, folder: RunFolder) -> Summary:
     recorder = _Recorder(config, algorithm, folder)
-    algorithm.learn(config.total_steps, callback=recorder)
-    recorder.report.close()
-    _save(algorithm, folder)
-    return recorder.finish()
+    try:
+        algorithm.learn(config.total_steps, callback=recorder)
+        recorder.report.close()
+        _save(algorithm, folder)
+        return recorder.finish()
+    except NotFinite as error:
+        where = {"iteration": algorithm.num_iterations, "env_step": algorithm.num_env_steps, "seed": config.seed}
+        record = where | {"tensor": error.what, "message": str(error)}
+        folder.text(FAILURE_FILE, json.dumps(record, indent=2) + "\n")
+        raise failure(f"iteration {algorithm.num_iterations} of {folder.path} stopped", error) from error
 
 
 class _Recorder:

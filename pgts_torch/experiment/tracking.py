@@ -6,16 +6,19 @@ import platform
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from matplotlib.figure import Figure
-from torch.utils.tensorboard import SummaryWriter
 
 from pgts_torch.errors import PgtsError
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
 SUMMARY_FILE = "summary.json"
+FAILURE_FILE = "failure.json"
 VERSIONS_FILE = "versions.json"
 CHECKPOINTS = "checkpoints"
 BEST_FILE = "best.pt"
@@ -34,7 +37,7 @@ class RunFolder:
         self.path = path
         (path / CHECKPOINTS).mkdir(parents=True)
         self._metrics = (path / METRICS_FILE).open("w", encoding="utf-8", buffering=1)
-        self._events = SummaryWriter(str(path)) if tensorboard else None
+        self._events = event_writer()(str(path)) if tensorboard else None
 
     def __enter__(self) -> Self:
         return self
@@ -65,6 +68,17 @@ class RunFolder:
             self._events.add_figure(name, figure, step)
 
 
+def event_writer() -> "type[SummaryWriter]":
+    """What writes TensorBoard events; PgtsError where TensorBoard is missing."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise PgtsError(
+            f"TensorBoard cannot be imported ({error}): pip install tensorboard, or set run.tensorboard to false"
+        ) from error
+    return SummaryWriter
+
+
 def prepare_folder(path: Path, *, overwrite: bool) -> None:
     """Make sure that `path` can become the folder of a new run.
 
@@ -81,8 +95,15 @@ def prepare_folder(path: Path, *, overwrite: bool) -> None:
 
 
 def versions() -> dict[str, Any]:
-    """Python and the packages that numbers depend on."""
-    return {"python": platform.python_version()} | {name: metadata.version(name) for name in _PACKAGES}
+    """Python and the packages that numbers depend on; None: it is not installed."""
+    return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.engine import SampledSearch, Search
 from pgts_torch.search.expectimax import expectimax
 from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead
-from pgts_torch.search.topology import Topology
+from pgts_torch.search.topology import Topology, tree_nodes
 
 MOST_SAMPLES = 32
 
@@ -98,7 +98,10 @@ class AutoSearch(Search):
         if float(narrow.pruned_BA.max()) == 0:
             self._picked = f"expectimax: the model lists its outcomes, and {narrow.nodes} nodes hold all paths"
         else:
-            self._picked = f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes"
+            self._picked = (
+                f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes, "
+                "or too much memory"
+            )
         if 2 * max(self._width, narrow.nodes) <= self.max_nodes:
             self._width *= 2
         return replace(narrow, model_calls=topology.model_calls - calls_before)
@@ -146,8 +149,3 @@ class AutoSearch(Search):
 
     def __str__(self) -> str:
         return self._picked
-
-
-def tree_nodes(roots: int, children: int, expansions: int) -> float:
-    """Nodes of trees in which no two paths meet."""
-    return roots * sum(float(children) ** level for level in range(expansions + 1))

@@ -13,7 +13,7 @@ from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.empirical import Drawn, Share
 from pgts_torch.search.expectimax import expectimax
-from pgts_torch.search.lookahead import MAX_NODES, Leaf, Lookahead
+from pgts_torch.search.lookahead import MAX_NODES, Leaf, Lookahead, check_finite
 from pgts_torch.search.mcts import mcts
 from pgts_torch.search.sampled import sampled
 from pgts_torch.search.topology import Topology
@@ -48,8 +48,12 @@ class Search(ABC):
 
         Args:
             generator: drawn from only by searches that draw outcomes or noise; equal states of it give equal searches.
+
+        Raises:
+            NotFinite: the value of the best action of a root is not finite.
         """
         look = self._look(root_B, depth, q_leaf, v_leaf, generator)
+        check_finite("lookahead", "the lookahead", look.q_BA, root_B)
         self.model_calls += look.model_calls
         return look
 

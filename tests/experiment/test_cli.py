@@ -263,6 +263,7 @@ def test_train_py_is_pgts_train(shell: Callable[..., "subprocess.CompletedProces
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.fault("reader that leaves early")
 def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pgts_torch.experiment.cli", "train", "--help"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
