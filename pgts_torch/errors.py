@@ -15,3 +15,16 @@ class MissingModel(PgtsError):
 
 class RandomOutcomes(PgtsError):
     """A model that lists outcomes where it is certain of them was asked where chance decides."""
+
+
+class Stopped(Exception):
+    """A signal has ended a training early; what was learned is saved.
+
+    Args:
+        message: what can be done about it.
+        signal: its number.
+    """
+
+    def __init__(self, message: str, signal: int) -> None:
+        super().__init__(message)
+        self.signal = signal
