@@ -49,9 +49,7 @@ class Damaged(PgtsError):
 
 
 def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
-    """Add a checkpoint to a run folder, then remove all but the newest `keep`.
-
-    What was found damaged lies ahead of this one, and is removed too.
+    """Add a checkpoint to a run folder, and `tidy` it.
 
     Raises:
         PgtsError: it cannot be written; then the others are as they were.
@@ -73,10 +71,7 @@ def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
         raise PgtsError(f"the checkpoint {path} cannot be written: {error.strerror}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    older = [each for each in listed(run) if each.name <= path.name]
-    for each in listed(run):
-        if each not in older[-keep:]:
-            shutil.rmtree(each, ignore_errors=True)
+    tidy(run, path, keep=keep)
     return path
 
 
@@ -128,8 +123,13 @@ def listed(run: Path) -> list[Path]:
     return sorted(path for path in (run / CHECKPOINTS).glob("*") if path.name.isdecimal())
 
 
-def remove_partial(run: Path) -> None:
-    """Remove what a process that was killed has left half written. Nobody else may be writing."""
+def tidy(run: Path, last: Path, *, keep: int) -> None:
+    """Remove all checkpoints but `last` and the newest before it, `keep` in all; those ahead of it are damaged. And
+    what a process that was killed has left half written: nobody else may be writing."""
+    kept = [path for path in listed(run) if path.name <= last.name][-keep:]
+    for path in listed(run):
+        if path not in kept:
+            shutil.rmtree(path, ignore_errors=True)
     for folder in (run, run / CHECKPOINTS):
         for path in folder.glob(f".*{saving.PARTIAL}"):
             if path.is_dir():

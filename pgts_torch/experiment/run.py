@@ -20,7 +20,7 @@ from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import Stopped
 from pgts_torch.experiment import checkpoint, diagnostics
-from pgts_torch.experiment.checkpoint import Notes, remove_partial
+from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.evaluate import KINDS
 from pgts_torch.experiment.pictures import policy_picture
@@ -123,7 +123,7 @@ def train(config: Config, *, strict_resume: bool = False) -> Summary:
         if start is None:
             clear_folder(path)
         else:
-            remove_partial(path)
+            checkpoint.tidy(path, start.path, keep=config.log.keep)
             algorithm.load_state_dict(dict(start.state))
             print(f"going on from {start.path}", file=sys.stderr)
         if config.critic.type == "exact":
