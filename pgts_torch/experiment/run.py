@@ -41,6 +41,9 @@ from pgts_torch.experiment.tracking import (
 )
 from pgts_torch.tabular import exact, stationary
 
+MOST_SECONDS = 60
+"""An iteration that ends later than this after the last checkpoint is followed by one, too."""
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -169,7 +172,8 @@ class _Recorder:
         self.truth = diagnostics.Truth(algorithm) if algorithm.world.mdp is not None else None
         self.report = Reporter(config.total_steps)
         self._clock = time.perf_counter()
-        self._started, self._saved_at = self._clock, -1
+        self._started = self._saved_clock = self._clock
+        self._saved_at = -1
         self._pi_SA = self._table()
         self._deepest, self._certificate = 0, math.inf
         self._evaluations = _evaluations(config.eval, config.seed, folder)
@@ -196,7 +200,8 @@ class _Recorder:
             or (target is not None and iteration.certificate <= target)
         )
         every = self.config.log.checkpoint_every
-        if every and k % every == 0 and not self.finished:  # the last one waits until the training has ended
+        is_due = every and (k % every == 0 or time.perf_counter() - self._saved_clock > MOST_SECONDS)
+        if is_due and not self.finished:  # the last one waits until the training has ended
             self.save()
         self._pi_SA = self._table()
         self._clock = time.perf_counter()
@@ -223,7 +228,7 @@ class _Recorder:
             progress=progress,
         )
         checkpoint.write(self.folder.path, self.algorithm, notes, keep=self.config.log.keep)
-        self._saved_at = self.algorithm.num_env_steps
+        self._saved_at, self._saved_clock = self.algorithm.num_env_steps, time.perf_counter()
 
     def load(self, notes: Notes) -> None:
         """Go on from what `save` wrote; the algorithm has been loaded."""

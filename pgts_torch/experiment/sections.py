@@ -516,8 +516,9 @@ class LogConfig(Section):
     every: Count = 1
     """Iterations from one line of metrics to the next."""
 
-    checkpoint_every: Natural = 10
-    """Iterations from one checkpoint to the next; 0: only after the last, and where a signal ends the training."""
+    checkpoint_every: Natural = 20
+    """Iterations from one checkpoint to the next, fewer where they take more than a minute; 0: only after the last, and
+    where a signal ends the training."""
 
     keep: Count = 3
     """Checkpoints that are kept, the newest; the best model is a matter of eval.keep_best."""

@@ -39,7 +39,7 @@ class RunFolder:
     def __init__(self, path: Path, *, tensorboard: bool, metrics_bytes: int = 0, after_step: int | None = None) -> None:
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
-        self._metrics = (path / METRICS_FILE).open("ab")
+        self._metrics = (path / METRICS_FILE).open("ab", buffering=0)
         self._metrics.truncate(metrics_bytes)
         purge_step = None if after_step is None else after_step + 1
         self._events = SummaryWriter(str(path), purge_step=purge_step) if tensorboard else None
@@ -55,10 +55,15 @@ class RunFolder:
             self._events.close()
 
     def log(self, step: int, tags: dict[str, float]) -> None:
-        """One line of metrics.jsonl, and the same numbers as TensorBoard scalars."""
+        """One line of metrics.jsonl, and the same numbers as TensorBoard scalars; PgtsError if the disk is full."""
         line = {"step": step} | {tag: value if math.isfinite(value) else None for tag, value in tags.items()}
-        self._metrics.write(json.dumps(line).encode() + b"\n")
-        self._metrics.flush()
+        raw = json.dumps(line).encode() + b"\n"
+        try:
+            whole = self._metrics.write(raw) == len(raw)
+        except OSError:
+            whole = False
+        if not whole:
+            raise PgtsError(f"{self.path / METRICS_FILE} cannot be written to at step {step}; is the disk full?")
         if self._events is not None:
             for tag, value in tags.items():
                 self._events.add_scalar(tag, value, step)

@@ -243,6 +243,31 @@ def test_a_folder_that_cannot_be_written_to_is_named(tmp_path, monkeypatch, caps
     assert capsys.readouterr().err.splitlines()[1:] == [mistake]
 
 
+def test_a_disk_that_is_full_ends_the_training_and_the_checkpoint_stays(cut, monkeypatch, capsys):
+    log = RunFolder.log
+    with Path("/dev/full").open("ab", buffering=0) as full, monkeypatch.context() as patch:
+
+        def log_to_full_disk(folder: RunFolder, *args: Any) -> None:
+            folder._metrics.close()
+            folder._metrics = full
+            log(folder, *args)
+
+        patch.setattr(RunFolder, "log", log_to_full_disk)
+        assert main(arguments()) == 2
+    assert capsys.readouterr().err.endswith(
+        "error: cut/metrics.jsonl cannot be written to at step 180; is the disk full?\n"
+    )
+    assert main(arguments()) == 0
+    assert [line["step"] for line in read_metrics(cut)] == [60, 120, 180, 240, 300]
+
+
+def test_slow_iterations_are_saved_more_often(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "MOST_SECONDS", -1)
+    run.train(configured(tmp_path / "slow", *QUIET, "--log.checkpoint_every", "100", "--log.keep", "9"))
+    run.train(configured(tmp_path / "last", *QUIET, "--log.checkpoint_every", "0", "--log.keep", "9"))
+    assert [len(checkpoint.listed(tmp_path / name)) for name in ("slow", "last")] == [5, 1]
+
+
 def test_a_second_process_is_told_who_has_the_folder(cut, capsys):
     before = content(cut)
     with tracking.RunLock(cut):
