@@ -33,3 +33,16 @@ def failure(where: str, error: Exception) -> PgtsError:
     """The error that says where another one happened; NotFinite stays NotFinite."""
     story = f"{where}: {error}" if isinstance(error, PgtsError) else f"{where}: {type(error).__name__}: {error}"
     return NotFinite(story, what=error.what) if isinstance(error, NotFinite) else PgtsError(story)
+
+
+class Stopped(Exception):
+    """A signal has ended a training early; what was learned is saved.
+
+    Args:
+        message: what can be done about it.
+        signal: its number.
+    """
+
+    def __init__(self, message: str, signal: int) -> None:
+        super().__init__(message)
+        self.signal = signal

@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.errors import NotFinite, PgtsError, Stopped
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.fields import INT64_MAX
 from pgts_torch.experiment.figures import PARTS
@@ -42,7 +42,8 @@ def main(arguments: Arguments | None = None) -> int:
 
     Returns:
         The exit code: 0; 1 if `check-model` found something missing, a run of a sweep failed or a number in training
-        was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C.
+        was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C, 143
+        after SIGTERM.
     """
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by whoever started us: what is said goes nowhere
@@ -59,6 +60,9 @@ def main(arguments: Arguments | None = None) -> int:
         # Nobody reads on: what is still in the buffer goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
+    except Stopped as stopped:
+        print(stopped, file=sys.stderr)
+        return 128 + stopped.signal
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -67,22 +71,32 @@ def main(arguments: Arguments | None = None) -> int:
 @command
 def train(arguments: Arguments) -> None:
     """Train a policy with tree search."""
-    parser = _Parser("train", train, usage="%(prog)s [--config FILE] [--print-config] [--json] [--KEY VALUE ...]")
+    usage = "%(prog)s [--config FILE | --resume RUN_DIR] [--KEY VALUE ...]"
+    parser = _Parser("train", train, usage=usage)
     parser.add_argument("--config", metavar="FILE", help="YAML file with any of the keys below; none: the defaults")
+    parser.add_argument("--resume", metavar="RUN_DIR", type=_run_folder, help="go on with an unfinished run")
+    parser.add_argument(
+        "--strict-resume", action="store_true", help="refuse a last checkpoint that is damaged or of other versions"
+    )
     parser.add_argument("--print-config", action="store_true", help="print the whole configuration as YAML and stop")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     if {"-h", "--help"} & set(arguments):
         parser.epilog = "\n".join(_describe(Schema(Config).options()))
     fixed, overrides = parser.parse_known_args(arguments)
-    config = load(fixed.config, overrides)
+    if fixed.resume is not None:
+        for name in ("config", "run.dir", "run.overwrite"):
+            if any(given.partition("=")[0] == f"--{name}" for given in arguments):
+                parser.error(f"--{name} does not go with --resume, which takes it from the run")
+        overrides += [f"--run.dir={fixed.resume}", "--run.overwrite=false"]
+    config = load(fixed.config or (fixed.resume and fixed.resume / "config.yaml"), overrides)
     if fixed.print_config:
         sys.stdout.write(dump(config))
         return
-    if fixed.config is None:
+    if fixed.config is None and fixed.resume is None:
         print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
     from pgts_torch.experiment import run
 
-    summary = run.train(config)
+    summary = run.train(config, strict_resume=fixed.strict_resume)
     print(json.dumps(asdict(summary)) if fixed.json else run.describe(summary))
 
 

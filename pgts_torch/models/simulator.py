@@ -250,7 +250,9 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         self._check("action", action, self.num_actions)
         asked = self._snapshots[state].key, action
         if asked in self._sure:
-            return self._sure[asked]
+            step = self._sure[asked]
+            self._known(step.child, step.shown)  # now, so that numbers do not depend on what is remembered
+            return step
         taken = self.actions[action]
         try:
             self.adapter.set_state(self.env, self._snapshots[state].data)

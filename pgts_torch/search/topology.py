@@ -158,7 +158,7 @@ class Topology:
         self._check_nodes(levels, expansions, expansions, max_nodes)
         return levels
 
-    # What these three make outlives the call: it must be ordinary tensors even if the caller is in inference mode.
+    # What these make outlives the call: it must be ordinary tensors even if the caller is in inference mode.
     @torch.inference_mode(False)
     @torch.no_grad()
     def step(self, state_N: Int[Tensor, "N"]) -> tuple[Outcomes, Int[Tensor, "C"]]:
@@ -177,6 +177,23 @@ class Topology:
         counts_NAK = counting(outcomes)
         children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
         return self._renumbered(outcomes, counts_NAK, children), children
+
+    @property
+    def asked(self) -> Int[Tensor, "N"]:
+        """The states that the model has been asked about, ascending."""
+        return torch.nonzero(self._row_S >= 0).flatten()
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def recall(self, state_N: Int[Tensor, "N"]) -> None:
+        """Have the outcomes of these states ready, as if they had been asked about before; `model_calls` does not
+        count them."""
+        self._grow_tables()
+        calls_before = self.model_calls
+        if len(state_N):
+            check_states(state_N, self.model.num_states)
+            self._outcomes(state_N)
+        self.model_calls = calls_before
 
     @torch.inference_mode(False)
     @torch.no_grad()
