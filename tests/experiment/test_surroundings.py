@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import run
+from pgts_torch.experiment import progress, run
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.tracking import read_metrics, versions
 
@@ -38,7 +38,7 @@ def test_without_a_terminal_and_in_the_c_locale_a_run_prints_a_few_plain_lines(t
     done = started(tmp_path, "", "train", *FEW, "--run.dir=run", "--run.tensorboard=false")
     assert done.returncode == 0, done.stderr
     lines = done.stderr.splitlines()[1:]
-    assert 2 <= len(lines) <= 2 * run.PLAIN_LINES
+    assert 2 <= len(lines) <= 2 * progress.PLAIN_LINES
     assert all(line.startswith("step ") for line in lines)
     assert "return of the policy" in done.stdout
     assert (tmp_path / "run" / "summary.json").exists()

@@ -58,7 +58,7 @@ def test_the_memory_of_a_narrow_lookahead_is_that_of_a_level():
 
 def test_the_search_that_chooses_narrows_until_it_fits():
     search = AutoSearch(TabularModel(GARNET))
-    search._topology = Topology(TabularModel(GARNET), max_bytes=table_bytes(50, A, K, torch.float64))
+    search.topology = Topology(TabularModel(GARNET), max_bytes=table_bytes(50, A, K, torch.float64))
     look = search(ROOT, depth=5, v_leaf=zeros, generator=stream(0, "search"))
     assert max(look.nodes_per_level) > 50 > look.model_calls / A / 5
     assert float(look.pruned_BA.max()) > 0
