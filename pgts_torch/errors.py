@@ -15,3 +15,34 @@ class MissingModel(PgtsError):
 
 class RandomOutcomes(PgtsError):
     """A model that lists outcomes where it is certain of them was asked where chance decides."""
+
+
+class NotFinite(PgtsError):
+    """A number that training stands on is infinite or not a number. The policy has not been moved by it.
+
+    what: which number: observation, state, reward, discount, value, lookahead, advantage, weight, probability, loss or
+        gradient.
+    """
+
+    def __init__(self, message: str, *, what: str = "number") -> None:
+        super().__init__(message)
+        self.what = what
+
+
+def failure(where: str, error: Exception) -> PgtsError:
+    """The error that says where another one happened; NotFinite stays NotFinite."""
+    story = f"{where}: {error}" if isinstance(error, PgtsError) else f"{where}: {type(error).__name__}: {error}"
+    return NotFinite(story, what=error.what) if isinstance(error, NotFinite) else PgtsError(story)
+
+
+class Stopped(Exception):
+    """A signal has ended a training early; what was learned is saved.
+
+    Args:
+        message: what can be done about it.
+        signal: its number.
+    """
+
+    def __init__(self, message: str, signal: int) -> None:
+        super().__init__(message)
+        self.signal = signal

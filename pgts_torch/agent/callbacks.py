@@ -1,11 +1,12 @@
 """What `PGTS.learn` can be told to do after its iterations."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
-from pgts_torch.agent.evaluate import Evaluation, evaluate
+from pgts_torch.agent.evaluate import Evaluation, Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.optimisers import check_count
 from pgts_torch.agent.pgts import PGTS
@@ -79,3 +80,17 @@ class EvalCallback:
             if self.best_path is not None:
                 algorithm.save(self.best_path)
         return self.stop_at_return is None or latest.mean < self.stop_at_return
+
+    def state_dict(self) -> dict[str, Any]:
+        """The evaluations so far, as plain values."""
+        return {"history": [asdict(made) for made in self.history]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take over what `state_dict` gave."""
+        self.history = [Evaluated(made["env_steps"], _evaluation(**made["evaluation"])) for made in state["history"]]
+        self.best = max(self.history, key=lambda made: made.mean, default=None)
+
+
+def _evaluation(episodes: int, **scores: Mapping[str, Any]) -> Evaluation:
+    made = {name: Score(**score) for name, score in scores.items()}
+    return Evaluation(episodes, made["episodic_return"], made["discounted_return"], made["episodic_length"])

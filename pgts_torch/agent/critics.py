@@ -1,5 +1,6 @@
 """Estimates of Q^pi or v^pi, each from what it is allowed to see."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, final
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from pgts_torch.agent.policies import Policy, fitting, listed
 from pgts_torch.agent.rollout import GeometricHorizon, Horizon, Rollout, simulated_returns
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
@@ -139,6 +140,7 @@ class TabularCritic(Critic):
         """Move every visited cell toward the mean of its targets; returns the mean squared error before."""
         self._policy = policy
         target_TB = self._targets(rollout)[rollout.alive_TB]
+        check_targets(target_TB)
         cell_TB = rollout.state_TB
         if self.target == "q":
             cell_TB = cell_TB * self.num_actions + rollout.action_TB
@@ -265,6 +267,12 @@ def lambda_returns(
     for t in reversed(range(len(row_TB) - 1)):
         row_TB[t] += later_TB[t] * row_TB[t + 1]
     return torch.from_numpy(row_TB).to(returns_TB.device)
+
+
+def check_targets(target_V: Float[Tensor, "V"]) -> None:
+    """NotFinite unless a critic can learn from these."""
+    if not math.isfinite(target_V.sum()):
+        raise NotFinite("a target of the critic is not finite; it has learned nothing from this rollout", what="value")
 
 
 def _fitted(learned: Learned | None) -> Learned:

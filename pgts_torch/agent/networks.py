@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
 from pgts_torch.agent.policies import fitting
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 
 Activation = Literal["tanh", "relu"]
 
@@ -61,7 +61,8 @@ class RunningNorm(nn.Module):
         x_ND = x.reshape(-1, x.shape[-1]).double()
         mean_D, total = x_ND.mean(0), self.count + len(x_ND)
         if not bool(mean_D.isfinite().all()):
-            raise PgtsError(f"the mean of the observations is {mean_D.tolist()}; observations must be finite")
+            message = f"the mean of the observations is {mean_D.tolist()}; observations must be finite"
+            raise NotFinite(message, what="observation")
         apart_D = mean_D - self.mean_D
         self.square_D += (x_ND - mean_D).square().sum(0) + apart_D.square() * self.count * len(x_ND) / total
         self.mean_D += apart_D * len(x_ND) / total

@@ -9,7 +9,16 @@ from gymnasium.spaces import Space
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.critics import Critic, Method, MonteCarlo, Target, TDLambda, check_target, lambda_returns
+from pgts_torch.agent.critics import (
+    Critic,
+    Method,
+    MonteCarlo,
+    Target,
+    TDLambda,
+    check_target,
+    check_targets,
+    lambda_returns,
+)
 from pgts_torch.agent.networks import MLP, Network, NetworkDescription, Trunk
 from pgts_torch.agent.optimisers import Optimiser, check_count, minibatches
 from pgts_torch.agent.policies import Policy
@@ -136,8 +145,7 @@ class NetworkCritic(Critic):
         observation_V, action_V = rollout.observe(rollout.state_TB[alive_TB]), rollout.action_TB[alive_TB]
         v_TB, target_TB = self._targets(rollout)
         target_V = target_TB[alive_TB]
-        if not math.isfinite(target_V.sum()):
-            raise PgtsError("a target of the critic is not finite; it has learned nothing from this rollout")
+        check_targets(target_V)
         if self._lags or self.target == "q":
             error_V = target_V - self._taken(self._values(self.network, observation_V), action_V)
         else:

@@ -24,7 +24,8 @@ from pgts_torch.agent.optimisers import Optimiser, check_count, check_positive, 
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import StateWeight
 from pgts_torch.agent.updates import Update, check_state_weight
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.search.lookahead import check_finite
 
 
 class Batch(NamedTuple):
@@ -93,16 +94,34 @@ class NetworkUpdate(Update):
             the mean KL(pi_old || pi).
 
         Raises:
-            PgtsError: an advantage or a weight is not finite, no state counts, or a loss or its gradient is not finite.
-                The step in question moves nothing.
+            NotFinite: an advantage, a weight, a loss, a gradient or what the policy would become is not finite. The
+                policy and what the optimiser remembers are as before.
+            PgtsError: no state counts.
         """
         assert isinstance(policy, NetworkPolicy)
         _check_numbers(advantage_NA, weight_N)
+        before = policy.state_dict(), self.state_dict()
+        try:
+            return self._moved(policy, observation_N, advantage_NA, weight_N, generator)
+        except NotFinite:
+            policy.load_state_dict(before[0])
+            self.load_state_dict(before[1])
+            raise
+
+    def _moved(
+        self,
+        policy: NetworkPolicy,
+        observation_N: Tensor,
+        advantage_NA: Float[Tensor, "N A"],
+        weight_N: Float[Tensor, "N"],
+        generator: torch.Generator,
+    ) -> dict[str, float]:
         network, encoder = policy.network, policy.network.trunk.encoder
         if fresh := encoder.fresh:
             encoder.absorb(observation_N)
         batch = Batch(network.encode(observation_N), advantage_NA.float(), weight_N.float())
         old_NA, new_NA, losses = self.move(network, batch, generator)
+        check_finite("probability", "the next policy", new_NA, None)
         share_N = batch.weight_N / batch.weight_N.sum()
         losses["entropy"] = float(share_N @ entropy(new_NA))
         losses["kl"] = float(share_N @ divergence(old_NA, new_NA))
@@ -321,7 +340,10 @@ def _check_numbers(advantage_NA: Tensor, weight_N: Tensor) -> None:
             off = torch.nonzero(~torch.isfinite(value))
             if len(off):
                 place = tuple(off[0].tolist())
-                raise PgtsError(f"{name}[{', '.join(map(str, place))}] is {float(value[place])}; it must be finite")
+                where = ", ".join(map(str, place))
+                raise NotFinite(
+                    f"{name}[{where}] is {float(value[place])}; it must be finite", what=name.partition("_")[0]
+                )
     if not float(weight_N.sum()) > 0 or bool((weight_N < 0).any()):
         raise PgtsError(f"weight_N is {weight_N.tolist()[:8]}; weights are at least 0, and some state must count")
 

@@ -10,7 +10,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from pgts_torch.agent.copies import env_name
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 
 
 @final
@@ -56,7 +56,8 @@ class Observations:
         if array.shape[max(0, array.ndim - len(self.space.shape)) :] != self.space.shape:
             raise PgtsError(f"an observation has shape {array.shape}; its space is {self.space}")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise PgtsError(f"an observation is not finite: {array[~np.isfinite(array)][:3].tolist()}")
+            off = array[~np.isfinite(array)][:3].tolist()
+            raise NotFinite(f"an observation is not finite: {off}", what="observation")
         return torch.from_numpy(np.array(array)).to(self.device)
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from pgts_torch.agent.policies import fitting
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 
 _BETAS = 0.9, 0.999
 _EPSILON = 1e-8
@@ -59,20 +59,20 @@ class Optimiser:
                 autograd does. The loss then needs no gradient of its own.
 
         Raises:
-            PgtsError: the loss or its gradient is not finite, or the moments are those of other parameters. Nothing
-                has moved then.
+            NotFinite: the loss, its gradient or the step is not finite. No parameter has moved then.
+            PgtsError: the moments are those of other parameters.
         """
         output, gradient = (loss, None) if through is None else through
         gradients = torch.autograd.grad(output, parameters, gradient)
         with torch.no_grad():
             gradient_D = torch.cat([piece.reshape(-1) for piece in gradients])
             norm = float(torch.linalg.vector_norm(gradient_D))
-            for what, value in (("", float(loss.detach())), ("the gradient of ", norm)):
-                if not math.isfinite(value):
-                    raise PgtsError(f"{what}the {name} loss is {value}; nothing has been moved by it")
+            _check_finite("loss", f"the {name} loss", float(loss.detach()))
+            _check_finite("gradient", f"the gradient of the {name} loss", norm)
             if self.max_grad_norm is not None and norm > self.max_grad_norm:
                 gradient_D *= self.max_grad_norm / norm
             step_D = self._adam(gradient_D) if self.method == "adam" else gradient_D.mul_(-self.learning_rate)
+            _check_finite("gradient", f"the step down the {name} loss", float(step_D.sum()))
             moved: list[Tensor] = list(parameters)
             pieces = step_D.split([parameter.numel() for parameter in moved])
             torch._foreach_add_(moved, [piece.view_as(like) for piece, like in zip(pieces, moved, strict=True)])
@@ -115,6 +115,11 @@ class Optimiser:
             raise PgtsError(f"{self.method} cannot take over {sorted(state)} with num_steps = {num_steps}")
         second_D = fitting(state, "second_D", first_D)
         self._num_steps, self._first_D, self._second_D = num_steps, first_D.clone(), second_D
+
+
+def _check_finite(what: str, name: str, value: float) -> None:
+    if not math.isfinite(value):
+        raise NotFinite(f"{name} is {value}; nothing has been moved by it", what=what)
 
 
 def minibatches(columns: Sequence[Tensor], size: int, *, generator: torch.Generator) -> Iterator[tuple[Tensor, ...]]:

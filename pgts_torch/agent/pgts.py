@@ -39,7 +39,7 @@ from pgts_torch.agent.world import make_world
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.search.engine import Search
-from pgts_torch.search.lookahead import Leaf, Lookahead
+from pgts_torch.search.lookahead import Leaf, Lookahead, check_finite
 from pgts_torch.seeding import stream
 from pgts_torch.tabular.mdp import TabularMDP
 
@@ -188,6 +188,7 @@ class PGTS:
         pi_NA = self.policy.probs(self.world.observe(states))
         shallow = self.lookahead(states, depth=0)
         v_N = (pi_NA * shallow.q_BA).sum(-1)
+        check_finite("value", "the policy's value", v_N, states)
         _, occupancy_N = experience.visits("occupancy")
         for depth in self.depths:
             look = self.lookahead(states, depth=depth) if depth else shallow
@@ -340,7 +341,8 @@ class PGTS:
     ) -> Self:
         """The model that `save` wrote; it trains on exactly as the saved one would have.
 
-        Only the lookahead starts anew: it asks the model again for what it had seen, and `num_model_calls` counts that.
+        Where a lookahead remembers the outcomes of states it asks the model for them again; `num_model_calls` does not
+        count that.
 
         Args:
             env: the environment, where it was given to the saved model as an object; default its id.
@@ -365,8 +367,10 @@ class PGTS:
         return model
 
     def state_dict(self) -> dict[str, Any]:
-        """Policy, critic and counters, as tensors on the CPU and plain values."""
+        """Policy, critic, update, what the search remembers, and counters, as tensors on the CPU and plain values."""
+        search = {} if self.search is None else self.search.state_dict(with_states=self.world.mdp is not None)
         return {
+            "search": search,
             "policy": self.policy.state_dict(),
             "critic": self.critic.state_dict(),
             "update": self.update.state_dict(),
@@ -380,6 +384,8 @@ class PGTS:
         self.policy.load_state_dict(state["policy"])
         self.critic.load_state_dict(state["critic"])
         self.update.load_state_dict(state["update"])
+        if self.search is not None:
+            self.search.load_state_dict(state["search"])
         self.num_iterations = state["num_iterations"]
         self.num_env_steps = state["num_env_steps"]
         self.num_model_calls = state["num_model_calls"]

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.seeding import stream
 
 
@@ -81,12 +81,14 @@ class Policy(ABC):
         takes five times as long to check its probabilities.
 
         Raises:
-            PgtsError: a probability is not a number.
+            NotFinite: a probability is not finite.
         """
         pi_NA = self.probs(observation_N)
         score_N, action_N = (pi_NA / torch.empty_like(pi_NA).exponential_(generator=generator)).max(-1)
-        if math.isnan(score_N.sum()):
-            raise PgtsError(f"the policy has no probabilities, but {pi_NA[score_N.isnan()][0].tolist()}")
+        if not math.isfinite(score_N.sum()):
+            off_N = score_N.isnan() | ~pi_NA.isfinite().all(-1)
+            if bool(off_N.any()):
+                raise NotFinite(f"the policy has no probabilities, but {pi_NA[off_N][0].tolist()}", what="probability")
         return action_N
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from pgts_torch.agent.copies import env_name
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.world import World
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError, failure
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.seeding import draw_keys, seed_sequence
 
@@ -217,8 +217,7 @@ def rollout(
 
 
 def _failure(env: VectorEnv, when: str, seeds: list[int], error: Exception) -> PgtsError:
-    what = str(error) if isinstance(error, PgtsError) else f"{type(error).__name__}: {error}"
-    return PgtsError(f"{env_name(env)} failed {when} of the episodes with the seeds {seeds}: {what}")
+    return failure(f"{env_name(env)} failed {when} of the episodes with the seeds {seeds}", error)
 
 
 def _step(
@@ -229,8 +228,10 @@ def _step(
     observation, rewards, terminated, truncated, info = env.step(action_B)
     reward_B = np.array(rewards, dtype=np.float64)
     if not np.isfinite(reward_B).all():
-        raise PgtsError(f"the rewards are {reward_B.tolist()}; they must be finite")
+        raise NotFinite(f"the rewards are {reward_B.tolist()}; they must be finite", what="reward")
     discount_B = np.where(terminated, 0.0, info.get("discount", world.gamma))
+    if not np.isfinite(discount_B).all():
+        raise NotFinite(f"the discounts are {discount_B.tolist()}; they must be finite", what="discount")
     observation_B, read_B = world.encode(observation), world.read(env, observation)
     over = terminated | truncated
     if over.any():

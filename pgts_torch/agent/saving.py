@@ -1,5 +1,6 @@
 """One file that knows whether it is whole: a checksum, then tensors and plain values."""
 
+import contextlib
 import hashlib
 import io
 import os
@@ -10,7 +11,10 @@ import torch
 
 from pgts_torch.errors import PgtsError
 
-_MAGIC = b"pgts_torch 1\n"
+PARTIAL = ".partial"
+"""The end of the name of a file, or a folder, that is being written."""
+
+_MAGIC = b"pgts_torch 2\n"
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -20,20 +24,32 @@ def write(path: str | Path, content: dict[str, Any]) -> None:
     Raises:
         PgtsError: `content` holds something else, for instance a numpy number.
     """
-    path = Path(path)
     buffer = io.BytesIO()
     torch.save(content, buffer)
     payload = buffer.getvalue()
     _parse(payload, path)  # what could not be read again must not replace what can
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    replace(path, _MAGIC + hashlib.sha256(payload).digest() + payload)
+
+
+def replace(path: str | Path, raw: bytes) -> None:
+    """Write a file, to the disk; whoever reads `path` meanwhile finds the old file or the new one.
+
+    Raises:
+        PgtsError: it cannot be written; then nothing has changed.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
     try:
         with partial.open("wb") as file:
-            file.write(_MAGIC + hashlib.sha256(payload).digest() + payload)
+            file.write(raw)
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
+    except OSError as error:
+        raise PgtsError(f"{path} cannot be written: {error.strerror}") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 def read(path: str | Path) -> dict[str, Any]:
@@ -46,6 +62,11 @@ def read(path: str | Path) -> dict[str, Any]:
         raw = Path(path).read_bytes()
     except OSError as error:
         raise PgtsError(f"{path} cannot be read: {error.strerror}") from error
+    return decode(raw, path)
+
+
+def decode(raw: bytes, path: str | Path) -> dict[str, Any]:
+    """What the content of a file holds; `path` is its name in errors, which are those of `read`."""
     if not raw.startswith(_MAGIC):
         raise PgtsError(f"{path} is not a file saved by pgts_torch")
     digest, payload = raw[len(_MAGIC) : len(_MAGIC) + _DIGEST], raw[len(_MAGIC) + _DIGEST :]

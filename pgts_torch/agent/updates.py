@@ -12,6 +12,7 @@ from torch import Tensor
 from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.rollout import StateWeight
 from pgts_torch.errors import PgtsError
+from pgts_torch.search.lookahead import check_finite
 from pgts_torch.tabular.ascent import mirror_step, projected_step, softmax_direction
 
 
@@ -85,7 +86,14 @@ class TabularUpdate(Update):
         *,
         generator: torch.Generator,
     ) -> dict[str, float]:
-        """Nothing is drawn, and there is no loss."""
+        """Nothing is drawn, and there is no loss.
+
+        Raises:
+            NotFinite: step_size w(s) adv(s, a) is not finite for the best action of a state, or what the policy would
+                become is not.
+        """
+        step_NA = self.step_size * weight_N[:, None] * advantage_NA
+        check_finite("advantage", "the step along the advantages", step_NA, observation_N)
         self.step(policy, observation_N, advantage_NA, weight_N)
         return {}
 
@@ -109,7 +117,7 @@ class ProjectedUpdate(TabularUpdate):
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
         assert isinstance(policy, SimplexPolicy)
-        policy.probs_SA[state_N] = projected_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size)
+        _replace(policy.probs_SA, state_N, projected_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size))
 
 
 @final
@@ -121,7 +129,8 @@ class SoftmaxUpdate(TabularUpdate):
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
         assert isinstance(policy, SoftmaxPolicy)
-        policy.logits_SA[state_N] += self.step_size * softmax_direction(policy.probs(state_N), q_NA, weight_N)
+        step_NA = self.step_size * softmax_direction(policy.probs(state_N), q_NA, weight_N)
+        _replace(policy.logits_SA, state_N, policy.logits_SA[state_N] + step_NA)
 
 
 @final
@@ -134,10 +143,17 @@ class MirrorUpdate(TabularUpdate):
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
         if isinstance(policy, SoftmaxPolicy):
             advantage_NA = q_NA - q_NA.amax(-1, keepdim=True)
-            policy.logits_SA[state_N] += self.step_size * weight_N[:, None] * advantage_NA
+            step_NA = self.step_size * weight_N[:, None] * advantage_NA
+            _replace(policy.logits_SA, state_N, policy.logits_SA[state_N] + step_NA)
         else:
             assert isinstance(policy, SimplexPolicy)
-            policy.probs_SA[state_N] = mirror_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size)
+            _replace(policy.probs_SA, state_N, mirror_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size))
+
+
+def _replace(table_SA: Float[Tensor, "S A"], state_N: Int[Tensor, "N"], row_NA: Float[Tensor, "N A"]) -> None:
+    """Write the rows; NotFinite, and nothing written, if they are no logits or probabilities."""
+    check_finite("probability", "the next policy", row_NA, state_N)
+    table_SA[state_N] = row_NA
 
 
 def check_state_weight(state_weight: str) -> None:

@@ -15,14 +15,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError, Stopped
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.fields import INT64_MAX
 from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.schema import Option, Schema
 
-CHECK_FAILED, USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
+CHECK_FAILED = NOT_FINITE = 1
+USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 WIDTH = 79
 
 Arguments = Sequence[str]
@@ -40,9 +41,13 @@ def main(arguments: Arguments | None = None) -> int:
     """Run `pgts` with these arguments (default: those of the process).
 
     Returns:
-        The exit code: 0; 1 if `check-model` found something missing or a run of a sweep failed; 2 after a mistake of
-        the caller, which stands on stderr, a line each; 130 after Ctrl-C.
+        The exit code: 0; 1 if `check-model` found something missing, a run of a sweep failed or a number in training
+        was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C, 143
+        after SIGTERM.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started us: what is said goes nowhere
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
         code = _dispatch(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()  # meets a broken pipe here, not while the interpreter shuts down
@@ -50,11 +55,14 @@ def main(arguments: Arguments | None = None) -> int:
     except PgtsError as error:
         for line in str(error).splitlines():
             print(f"error: {line}", file=sys.stderr)
-        return USAGE_ERROR
+        return NOT_FINITE if isinstance(error, NotFinite) else USAGE_ERROR
     except BrokenPipeError:
         # Nobody reads on: what is still in the buffer goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
+    except Stopped as stopped:
+        print(stopped, file=sys.stderr)
+        return 128 + stopped.signal
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -63,22 +71,32 @@ def main(arguments: Arguments | None = None) -> int:
 @command
 def train(arguments: Arguments) -> None:
     """Train a policy with tree search."""
-    parser = _Parser("train", train, usage="%(prog)s [--config FILE] [--print-config] [--json] [--KEY VALUE ...]")
+    usage = "%(prog)s [--config FILE | --resume RUN_DIR] [--KEY VALUE ...]"
+    parser = _Parser("train", train, usage=usage)
     parser.add_argument("--config", metavar="FILE", help="YAML file with any of the keys below; none: the defaults")
+    parser.add_argument("--resume", metavar="RUN_DIR", type=_run_folder, help="go on with an unfinished run")
+    parser.add_argument(
+        "--strict-resume", action="store_true", help="refuse a last checkpoint that is damaged or of other versions"
+    )
     parser.add_argument("--print-config", action="store_true", help="print the whole configuration as YAML and stop")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     if {"-h", "--help"} & set(arguments):
         parser.epilog = "\n".join(_describe(Schema(Config).options()))
     fixed, overrides = parser.parse_known_args(arguments)
-    config = load(fixed.config, overrides)
+    if fixed.resume is not None:
+        for name in ("config", "run.dir", "run.overwrite"):
+            if any(given.partition("=")[0] == f"--{name}" for given in arguments):
+                parser.error(f"--{name} does not go with --resume, which takes it from the run")
+        overrides += [f"--run.dir={fixed.resume}", "--run.overwrite=false"]
+    config = load(fixed.config or (fixed.resume and fixed.resume / "config.yaml"), overrides)
     if fixed.print_config:
         sys.stdout.write(dump(config))
         return
-    if fixed.config is None:
+    if fixed.config is None and fixed.resume is None:
         print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
     from pgts_torch.experiment import run
 
-    summary = run.train(config)
+    summary = run.train(config, strict_resume=fixed.strict_resume)
     print(json.dumps(asdict(summary)) if fixed.json else run.describe(summary))
 
 

@@ -7,7 +7,7 @@ import torch
 from pgts_torch.agent.evaluate import Evaluation, evaluate
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.tracking import CHECKPOINTS
+from pgts_torch.experiment.checkpoint import MODEL_FILE, newest
 
 KINDS = {"deterministic": True, "sampled": False}
 """How actions are taken: the most probable one, or drawn from pi."""
@@ -24,8 +24,8 @@ def evaluate_run(run: str | Path, *, episodes: int, seed: int) -> dict[str, Eval
 
 
 def last_checkpoint(run: Path) -> Path:
-    """The newest checkpoint of a run folder; PgtsError if there is none."""
-    checkpoints = sorted((run / CHECKPOINTS).glob("*.pt"))
-    if not checkpoints:
+    """The model in the newest intact checkpoint of a run folder; PgtsError if there is none."""
+    found = newest(run)
+    if found is None:
         raise PgtsError(f"{run} holds no checkpoint; it must be the folder of a run")
-    return checkpoints[-1]
+    return found[0] / MODEL_FILE

@@ -2,42 +2,49 @@
 
 import json
 import math
-import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
+from pgts_torch.agent import saving
 from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.evaluate import Evaluation, Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.experiment import diagnostics
+from pgts_torch.errors import NotFinite, Stopped, failure
+from pgts_torch.experiment import checkpoint, diagnostics
+from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.evaluate import KINDS
 from pgts_torch.experiment.pictures import policy_picture
+from pgts_torch.experiment.progress import Reporter
+from pgts_torch.experiment.resume import Start, find, flat
 from pgts_torch.experiment.sections import EvalConfig
+from pgts_torch.experiment.signals import StopFlag
 from pgts_torch.experiment.tracking import (
     BEST_FILE,
-    CHECKPOINTS,
     CONFIG_FILE,
+    FAILURE_FILE,
     SUMMARY_FILE,
     VERSIONS_FILE,
     RunFolder,
-    prepare_folder,
+    RunLock,
+    check_folder,
+    clear_folder,
+    event_writer,
     versions,
 )
 from pgts_torch.tabular import exact, stationary
 
-PLAIN_LINES = 20
-"""About how many lines a run prints where there is no terminal to draw a progress bar on."""
+MOST_SECONDS = 60
+"""An iteration that ends later than this after the last checkpoint is followed by one, too."""
 
 
 @dataclass(frozen=True)
@@ -99,34 +106,69 @@ def build(config: Config) -> PGTS:
     )
 
 
-def train(config: Config) -> Summary:
+def train(config: Config, *, strict_resume: bool = False) -> Summary:
     """Run a configuration to its end and leave a run folder.
+
+    If the folder holds an unfinished run of this configuration, the training goes on from its last checkpoint, and
+    ends with the same bits as if it had never been cut off.
+
+    Args:
+        strict_resume: refuse a last checkpoint that is damaged or of other versions, which otherwise is a warning.
 
     Raises:
         PgtsError: something in the configuration cannot be built, or the folder is taken; nothing was written.
+        NotFinite: training met a number that is not finite; what and where stands in failure.json.
+        Stopped: SIGTERM or SIGINT came; the iteration was finished and saved.
     """
     torch.set_num_threads(config.threads)
-    algorithm = build(config)
+    if config.run.tensorboard:
+        event_writer()
     path = Path(config.run.dir) if config.run.dir else _new_folder(config)
-    prepare_folder(path, overwrite=config.run.overwrite)
-    if path.exists():
-        shutil.rmtree(path)
-    if config.critic.type == "exact":
-        print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
-    with RunFolder(path, tensorboard=config.run.tensorboard) as folder:
-        folder.text(CONFIG_FILE, dump(config))
-        folder.text(VERSIONS_FILE, json.dumps(versions() | {"threads": config.threads}, indent=2) + "\n")
-        summary = _loop(config, algorithm, folder)
-        folder.text(SUMMARY_FILE, json.dumps(asdict(summary), indent=2) + "\n")
+    check_folder(path)
+    algorithm = build(config)
+    with RunLock(path), StopFlag() as stop:
+        start = None if config.run.overwrite else find(config, path, strict=strict_resume)
+        if start is None:
+            clear_folder(path)
+        else:
+            checkpoint.tidy(path, start.path, keep=config.log.keep)
+            algorithm.load_state_dict(dict(start.state))
+            print(f"going on from {start.path}", file=sys.stderr)
+        if config.critic.type == "exact":
+            print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
+        saving.replace(path / CONFIG_FILE, dump(config).encode())  # before all else: it makes this the folder of a run
+        position = (
+            {} if start is None else {"metrics_bytes": start.notes.metrics_bytes, "after_step": start.notes.env_steps}
+        )
+        with RunFolder(path, tensorboard=config.run.tensorboard, **position) as folder:
+            folder.text(VERSIONS_FILE, json.dumps(versions() | {"threads": config.threads}, indent=2) + "\n")
+            summary = _loop(config, algorithm, folder, start, stop)
+            folder.text(SUMMARY_FILE, json.dumps(asdict(summary), indent=2) + "\n")
     return summary
 
 
-def _loop(config: Config, algorithm: PGTS, folder: RunFolder) -> Summary:
-    recorder = _Recorder(config, algorithm, folder)
-    algorithm.learn(config.total_steps, callback=recorder)
-    recorder.report.close()
-    _save(algorithm, folder)
-    return recorder.finish()
+def _loop(config: Config, algorithm: PGTS, folder: RunFolder, start: Start | None, stop: StopFlag) -> Summary:
+    recorder = _Recorder(config, algorithm, folder, stop)
+    if start is not None:
+        recorder.load(start.notes)
+    try:
+        try:
+            if not recorder.finished:
+                algorithm.learn(config.total_steps, callback=recorder)
+        finally:
+            recorder.report.close()
+        recorder.save()
+        if not recorder.finished:
+            assert stop.signal is not None
+            raise Stopped(
+                f"stopped at step {algorithm.num_env_steps}; `pgts train --resume {folder.path}` goes on", stop.signal
+            )
+        return recorder.finish()
+    except NotFinite as error:
+        where = {"iteration": algorithm.num_iterations, "env_step": algorithm.num_env_steps, "seed": config.seed}
+        record = where | {"tensor": error.what, "message": str(error)}
+        folder.text(FAILURE_FILE, json.dumps(record, indent=2) + "\n")
+        raise failure(f"iteration {algorithm.num_iterations} of {folder.path} stopped", error) from error
 
 
 class _Recorder:
@@ -135,13 +177,14 @@ class _Recorder:
     The tags of an iteration speak of the policy that made its episodes, which is the one before its update.
     """
 
-    def __init__(self, config: Config, algorithm: PGTS, folder: RunFolder) -> None:
-        self.config = config
-        self.algorithm = algorithm
-        self.folder = folder
+    def __init__(self, config: Config, algorithm: PGTS, folder: RunFolder, stop: StopFlag) -> None:
+        self.config, self.algorithm, self.folder, self.stop = config, algorithm, folder, stop
+        self.finished = False
         self.truth = diagnostics.Truth(algorithm) if algorithm.world.mdp is not None else None
-        self.report = _Reporter(config.total_steps)
-        self.started = self._clock = time.perf_counter()
+        self.report = Reporter(config.total_steps)
+        self._clock = time.perf_counter()
+        self._started = self._saved_clock = self._clock
+        self._saved_at = -1
         self._pi_SA = self._table()
         self._deepest, self._certificate = 0, math.inf
         self._evaluations = _evaluations(config.eval, config.seed, folder)
@@ -161,11 +204,53 @@ class _Recorder:
         go_on = [evaluation(algorithm, iteration) for evaluation in self._evaluations.values()]
         if tags := {tag: value for kind in self._evaluations for tag, value in self._scores(kind, step)}:
             self.folder.log(step, tags)
-        if self.config.log.checkpoint_every and k % self.config.log.checkpoint_every == 0:
-            _save(algorithm, self.folder)
+        target = self.config.search.stop_at
+        self.finished = (
+            not all(go_on)
+            or step >= self.config.total_steps
+            or (target is not None and iteration.certificate <= target)
+        )
+        every = self.config.log.checkpoint_every
+        is_due = every and (k % every == 0 or time.perf_counter() - self._saved_clock > MOST_SECONDS)
+        if is_due and not self.finished:  # the last one waits until the training has ended
+            self.save()
         self._pi_SA = self._table()
         self._clock = time.perf_counter()
-        return all(go_on)
+        return not self.finished and self.stop.signal is None
+
+    def save(self) -> None:
+        """A checkpoint, unless the last one was taken just now."""
+        if self._saved_at == self.algorithm.num_env_steps:
+            return
+        progress = {
+            "depth": self._deepest,
+            "certificate": None if math.isinf(self._certificate) else self._certificate,
+            "seconds": time.perf_counter() - self._started,
+            "evaluations": {kind: evaluation.state_dict() for kind, evaluation in self._evaluations.items()},
+        }
+        notes = Notes(
+            iterations=self.algorithm.num_iterations,
+            env_steps=self.algorithm.num_env_steps,
+            model_calls=self.algorithm.num_model_calls,
+            config=flat(self.config),
+            versions=versions(),
+            metrics_bytes=self.folder.flush(),
+            finished=self.finished,
+            progress=progress,
+        )
+        checkpoint.write(self.folder.path, self.algorithm, notes, keep=self.config.log.keep)
+        self._saved_at, self._saved_clock = self.algorithm.num_env_steps, time.perf_counter()
+
+    def load(self, notes: Notes) -> None:
+        """Go on from what `save` wrote; the algorithm has been loaded."""
+        progress = notes.progress
+        self.finished, self._saved_at = notes.finished, notes.env_steps
+        self._deepest = progress["depth"]
+        self._certificate = math.inf if progress["certificate"] is None else progress["certificate"]
+        self._started -= progress["seconds"]
+        for kind, evaluation in self._evaluations.items():
+            if kind in progress["evaluations"]:
+                evaluation.load_state_dict(progress["evaluations"][kind])
 
     def _scores(self, kind: str, step: int) -> Iterator[tuple[str, float]]:
         """The tags of the evaluation that was made just now, if one was."""
@@ -185,7 +270,7 @@ class _Recorder:
 
     def finish(self) -> Summary:
         """The picture and the summary of the trained policy."""
-        seconds = time.perf_counter() - self.started
+        seconds = time.perf_counter() - self._started
         config, algorithm, exactly = self.config, self.algorithm, dict[str, float | None]()
         if self.truth is not None:
             pi_SA = algorithm.policy_table()
@@ -229,39 +314,10 @@ def _evaluations(config: EvalConfig, seed: int, folder: RunFolder) -> dict[str, 
     return {"deterministic": greedy, "sampled": EvalCallback(**shared, deterministic=False)}
 
 
-def _save(algorithm: PGTS, folder: RunFolder) -> None:
-    algorithm.save(folder.path / CHECKPOINTS / f"{algorithm.num_env_steps:012d}.pt")
-
-
 def _new_folder(config: Config) -> Path:
     stem = f"{config.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     names = (stem, *(f"{stem}-{n}" for n in range(2, 1000)))
     return next(path for path in (Path("runs") / name for name in names) if not path.exists())
-
-
-class _Reporter:
-    """A progress bar on a terminal, a line now and then elsewhere."""
-
-    def __init__(self, total_steps: int) -> None:
-        self._total = total_steps
-        self._terminal = sys.stderr.isatty()
-        self._bar = tqdm(total=total_steps, unit="step", disable=not self._terminal, dynamic_ncols=True)
-        self._next = 0
-
-    def line(self, step: int, tags: Mapping[str, float]) -> None:
-        """What a person wants to see while it runs."""
-        shown_as = {"charts/episodic_return": "return", "exact/J": "J", "search/stationarity_gap": "gap"}
-        numbers = {name: tags[tag] for tag, name in shown_as.items() if tag in tags}
-        if self._terminal:
-            self._bar.set_postfix({name: f"{value:.3g}" for name, value in numbers.items()}, refresh=False)
-            self._bar.update(min(step, self._total) - self._bar.n)
-        elif step >= self._next:
-            self._next = step + self._total // PLAIN_LINES
-            shown = "  ".join(f"{name} {value:8.3f}" for name, value in numbers.items())
-            print(f"step {step:>9}  {shown}", file=sys.stderr)
-
-    def close(self) -> None:
-        self._bar.close()
 
 
 def describe(summary: Summary) -> str:

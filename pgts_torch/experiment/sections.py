@@ -516,8 +516,12 @@ class LogConfig(Section):
     every: Count = 1
     """Iterations from one line of metrics to the next."""
 
-    checkpoint_every: Natural = 0
-    """Iterations from one checkpoint to the next; 0: only after the last."""
+    checkpoint_every: Natural = 20
+    """Iterations from one checkpoint to the next, fewer where they take more than a minute; 0: only after the last, and
+    where a signal ends the training."""
+
+    keep: Count = 3
+    """Checkpoints that are kept, the newest; the best model is a matter of eval.keep_best."""
 
 
 class EvalConfig(Section):
@@ -557,7 +561,8 @@ class RunConfig(Section):
     """Its path; null: a new one in runs/, named after the run, its seed and the time."""
 
     overwrite: bool = False
-    """Replace an earlier run in run.dir, which is refused otherwise."""
+    """Replace an earlier run in run.dir. Otherwise one of the same configuration goes on where it was cut off, and
+    any other is refused."""
 
     tensorboard: bool = True
     """Write TensorBoard events beside metrics.jsonl."""

@@ -1,24 +1,31 @@
 """The folder that a run leaves: its configuration, metrics, TensorBoard events and checkpoints."""
 
+import fcntl
 import json
 import math
+import os
 import platform
+import shutil
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from matplotlib.figure import Figure
-from torch.utils.tensorboard import SummaryWriter
 
+from pgts_torch.agent import saving
 from pgts_torch.errors import PgtsError
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
 SUMMARY_FILE = "summary.json"
+FAILURE_FILE = "failure.json"
 VERSIONS_FILE = "versions.json"
-CHECKPOINTS = "checkpoints"
 BEST_FILE = "best.pt"
+LOCK_FILE = ".lock"
 _PACKAGES = ("pgts_torch", "torch", "numpy", "scipy", "gymnasium", "tensorboard")
 
 
@@ -28,13 +35,18 @@ class RunFolder:
     Args:
         path: the folder; made here, with all parents.
         tensorboard: write events beside metrics.jsonl.
+        metrics_bytes: what is kept of metrics.jsonl; the rest is cut off.
+        after_step: the last step whose events are kept; TensorBoard hides later ones of a process that was killed.
     """
 
-    def __init__(self, path: Path, *, tensorboard: bool) -> None:
+    def __init__(self, path: Path, *, tensorboard: bool, metrics_bytes: int = 0, after_step: int | None = None) -> None:
         self.path = path
-        (path / CHECKPOINTS).mkdir(parents=True)
-        self._metrics = (path / METRICS_FILE).open("w", encoding="utf-8", buffering=1)
-        self._events = SummaryWriter(str(path)) if tensorboard else None
+        path.mkdir(parents=True, exist_ok=True)
+        (path / FAILURE_FILE).unlink(missing_ok=True)
+        self._metrics = (path / METRICS_FILE).open("ab", buffering=0)
+        self._metrics.truncate(metrics_bytes)
+        purge_step = None if after_step is None else after_step + 1
+        self._events = event_writer()(str(path), purge_step=purge_step) if tensorboard else None
 
     def __enter__(self) -> Self:
         return self
@@ -47,16 +59,29 @@ class RunFolder:
             self._events.close()
 
     def log(self, step: int, tags: dict[str, float]) -> None:
-        """One line of metrics.jsonl, and the same numbers as TensorBoard scalars."""
+        """One line of metrics.jsonl, and the same numbers as TensorBoard scalars; PgtsError if the disk is full."""
         line = {"step": step} | {tag: value if math.isfinite(value) else None for tag, value in tags.items()}
-        self._metrics.write(json.dumps(line) + "\n")
+        raw = json.dumps(line).encode() + b"\n"
+        try:
+            whole = self._metrics.write(raw) == len(raw)
+        except OSError:
+            whole = False
+        if not whole:
+            raise PgtsError(f"{self.path / METRICS_FILE} cannot be written to at step {step}; is the disk full?")
         if self._events is not None:
             for tag, value in tags.items():
                 self._events.add_scalar(tag, value, step)
 
+    def flush(self) -> int:
+        """Have all that was logged on the disk; how many bytes metrics.jsonl holds."""
+        os.fsync(self._metrics.fileno())
+        if self._events is not None:
+            self._events.flush()
+        return os.fstat(self._metrics.fileno()).st_size
+
     def text(self, name: str, content: str) -> None:
-        """A text file."""
-        (self.path / name).write_text(content, encoding="utf-8")
+        """A text file, which is whole or not there."""
+        saving.replace(self.path / name, content.encode())
 
     def picture(self, name: str, figure: Figure, step: int) -> None:
         """`name`.png, and the same picture in TensorBoard."""
@@ -65,24 +90,89 @@ class RunFolder:
             self._events.add_figure(name, figure, step)
 
 
-def prepare_folder(path: Path, *, overwrite: bool) -> None:
-    """Make sure that `path` can become the folder of a new run.
+def event_writer() -> "type[SummaryWriter]":
+    """What writes TensorBoard events; PgtsError where TensorBoard is missing."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise PgtsError(
+            f"TensorBoard cannot be imported ({error}): pip install tensorboard, or set run.tensorboard to false"
+        ) from error
+    return SummaryWriter
+
+
+class RunLock:
+    """Keeps other processes from a run folder, as long as this one lives. Use it as a context.
+
+    Args:
+        path: the folder; made here, with all parents.
 
     Raises:
-        PgtsError: it is a file, or holds something and `overwrite` is not set or does not look like a run.
+        PgtsError: it cannot be made or written to; or another process has it, naming its id.
     """
-    if path.is_dir() and any(path.iterdir()):
-        if not (path / CONFIG_FILE).is_file():
-            raise PgtsError(f"run.dir {path} holds files that no run has left; choose another folder")
-        if not overwrite:
-            raise PgtsError(f"run.dir {path} holds an earlier run; choose another folder, or set run.overwrite")
-    elif path.exists() and not path.is_dir():
+
+    def __init__(self, path: Path) -> None:
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self._file = (path / LOCK_FILE).open("a+")
+        except OSError as error:
+            raise PgtsError(f"run.dir {path} cannot be written to: {error.strerror}") from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._file.seek(0)
+            holder = self._file.read().strip() or "unknown"
+            self._file.close()
+            raise PgtsError(f"run.dir {path} is in use by the process {holder}") from None
+        self._file.truncate(0)
+        self._file.write(f"{os.getpid()}\n")
+        self._file.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+
+def check_folder(path: Path) -> None:
+    """Make sure that `path` can be the folder of a run.
+
+    Raises:
+        PgtsError: it is a file, or holds something that no run has left.
+    """
+    if path.exists() and not path.is_dir():
         raise PgtsError(f"run.dir {path} is a file; it must be a folder or not exist")
+    if path.is_dir() and not (path / CONFIG_FILE).is_file() and any(not _is_ours(each) for each in path.iterdir()):
+        raise PgtsError(f"run.dir {path} holds files that no run has left; choose another folder")
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file comes from a run that was killed before it had written its configuration."""
+    return path.name == LOCK_FILE or path.name.endswith(saving.PARTIAL)
+
+
+def clear_folder(path: Path) -> None:
+    """Remove what a run has left, all but the lock; the configuration last, so that it remains the folder of a run."""
+    for each in sorted(path.iterdir(), key=lambda each: (each.name == CONFIG_FILE, each.name != SUMMARY_FILE)):
+        if each.is_dir() and not each.is_symlink():
+            shutil.rmtree(each)
+        elif each.name != LOCK_FILE:
+            each.unlink()
 
 
 def versions() -> dict[str, Any]:
-    """Python and the packages that numbers depend on."""
-    return {"python": platform.python_version()} | {name: metadata.version(name) for name in _PACKAGES}
+    """Python and the packages that numbers depend on; None: it is not installed."""
+    return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

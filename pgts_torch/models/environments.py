@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces, wrappers
 from gymnasium.envs.registration import EnvSpec
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.seeding import numpy_stream
 
@@ -136,32 +136,33 @@ def _bounds(space: spaces.Space) -> tuple[np.ndarray, np.ndarray]:
     return space.low, space.high
 
 
-def wrong_answer(space: spaces.Space, observation: Any, reward: float) -> str:
-    """What is wrong with what a step gave; empty if nothing is."""
+def check_step(space: spaces.Space, observation: Any, reward: float) -> None:
+    """PgtsError, NotFinite where that is it, unless a step may give this."""
     if not math.isfinite(reward):
-        return f"the reward is {reward}"
-    return _wrong_observation(space, observation)
+        raise NotFinite(f"the reward is {reward}", what="reward")
+    _check_observation(space, observation)
 
 
-def _wrong_observation(space: spaces.Space, value: Any) -> str:
+def _check_observation(space: spaces.Space, value: Any) -> None:
     if isinstance(space, spaces.Box):
         shape = np.shape(value)
         if shape != space.shape:
-            return f"the observation has shape {shape}; {space.shape} is declared"
+            raise PgtsError(f"the observation has shape {shape}; {space.shape} is declared")
         if space.dtype.kind == "f" and not np.isfinite(value).all():
-            return f"the observation is {np.asarray(value).tolist()}; it must be finite"
+            shown = np.asarray(value).tolist()
+            raise NotFinite(f"the observation is {shown}; it must be finite", what="observation")
     elif isinstance(space, spaces.Dict):
         if not isinstance(value, dict) or value.keys() != space.keys():
-            return f"the observation is no dict of {', '.join(map(str, space.keys()))}"
-        return next((wrong for name in space if (wrong := _wrong_observation(space[name], value[name]))), "")
+            raise PgtsError(f"the observation is no dict of {', '.join(map(str, space.keys()))}")
+        for name in space:
+            _check_observation(space[name], value[name])
     elif isinstance(space, spaces.Tuple):
         if not isinstance(value, tuple) or len(value) != len(space):
-            return f"the observation is no tuple of {len(space)} parts"
-        parts = zip(space, value, strict=True)
-        return next((wrong for part, content in parts if (wrong := _wrong_observation(part, content))), "")
+            raise PgtsError(f"the observation is no tuple of {len(space)} parts")
+        for part, content in zip(space, value, strict=True):
+            _check_observation(part, content)
     elif isinstance(space, spaces.Discrete) and not space.contains(value):
-        return f"the observation is {value!r}, which is not in {space}"
-    return ""
+        raise PgtsError(f"the observation is {value!r}, which is not in {space}")
 
 
 def with_torques(env: gymnasium.Env, count: int = 5) -> gymnasium.Env:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Int, Num
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.seeding import mix
 
 Merge = Literal["auto"] | bool
@@ -172,7 +172,7 @@ class Numbering:
         bad_N = row_ND.isnan().any(-1)
         if bool(bad_N.any()):
             n = int(torch.nonzero(bad_N)[0, 0])
-            raise PgtsError(f"row {n} is {row_ND[n].tolist()}; what is not a number equals nothing")
+            raise NotFinite(f"row {n} is {row_ND[n].tolist()}; what is not a number equals nothing", what="state")
         return row_ND + 0.0
 
     def _hashed(self, row_ND: Tensor) -> Int[Tensor, "N"]:

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import PgtsError, RandomOutcomes
+from pgts_torch.errors import PgtsError, RandomOutcomes, failure
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
-from pgts_torch.models.environments import EnvSource, all_actions, make_env, wrong_answer
+from pgts_torch.models.environments import EnvSource, all_actions, check_step, make_env
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, env_name, generator_state
 
 _KEY_OF_CERTAINTY = 0
@@ -99,7 +99,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         try:
             self.env.reset(seed=0)  # to have a state at all, which the first snapshot replaces
         except Exception as error:
-            raise PgtsError(f"{self.name} failed in reset with seed 0: {type(error).__name__}: {error}") from error
+            raise failure(f"{self.name} failed in reset with seed 0", error) from error
         self._show = self.adapter.blindfold(self.env)
         self._sure: dict[tuple[bytes, int], _Step] = {}
         self._sure_bytes = 0
@@ -250,7 +250,9 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         self._check("action", action, self.num_actions)
         asked = self._snapshots[state].key, action
         if asked in self._sure:
-            return self._sure[asked]
+            step = self._sure[asked]
+            self._known(step.child, step.shown)  # now, so that numbers do not depend on what is remembered
+            return step
         taken = self.actions[action]
         try:
             self.adapter.set_state(self.env, self._snapshots[state].data)
@@ -265,10 +267,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             if self._observations[child] is None:
                 self._see(child, observation if self._show is None else self._checked(self._show(), total))
         except Exception as error:
-            what = str(error) if type(error) is PgtsError else f"{type(error).__name__}: {error}"
-            raise PgtsError(
-                f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}: {what}"
-            ) from error
+            where = f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}"
+            raise failure(where, error) from error
         step = _Step(total, discount, self._snapshots[child], self._observations[child], random)
         if not random:
             self._sure[asked] = step
@@ -292,8 +292,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
 
     def _checked(self, observation: Any, reward: float) -> Any:
         """The observation; PgtsError unless it and the reward are what the environment declares."""
-        if wrong := wrong_answer(self.env.observation_space, observation, reward):
-            raise PgtsError(wrong)
+        check_step(self.env.observation_space, observation, reward)
         return observation
 
     def _check(self, what: str, number: int, count: int) -> None:

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int, Num
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.numbering import Merge, Numbering
 
@@ -152,8 +152,9 @@ class TensorModel(EnumeratingModel, SamplingModel):
         counts_N = (discount_N > 0) & (reward_N > -torch.inf)
         if bool((bad_N := next_ND.isnan().any(-1) & counts_N).any()):
             n = int(torch.nonzero(bad_N)[0, 0])
-            raise PgtsError(
+            raise NotFinite(
                 f"step leads from state {state_ND[n].tolist()} by action {int(action_N[n])} to {next_ND[n].tolist()}; "
-                "what is not a number equals nothing"
+                "what is not a number equals nothing",
+                what="state",
             )
         return reward_N, discount_N, next_ND

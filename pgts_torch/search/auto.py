@@ -11,7 +11,7 @@ from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.engine import SampledSearch, Search
 from pgts_torch.search.expectimax import expectimax
 from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead
-from pgts_torch.search.topology import Topology
+from pgts_torch.search.topology import Topology, tree_nodes
 
 MOST_SAMPLES = 32
 
@@ -36,34 +36,36 @@ class AutoSearch(Search):
         NodeBudgetExceeded: from a search, where even one state a level, or one sample of each action, is too much.
     """
 
+    choices = ("_width", "_too_much", "_samples", "_most_asked", "_picked")
+
     def __init__(self, model: Model, *, max_nodes: int = MAX_NODES) -> None:
         super().__init__(model)
         self.max_nodes = max_nodes
-        self._topology = Topology(model) if isinstance(model, EnumeratingModel) else None
+        self.topology = Topology(model) if isinstance(model, EnumeratingModel) else None
         self._width = max(1, max_nodes)
         self._too_much: tuple[int, int] | None = None
         self._samples = 0
         self._most_asked = 0, 0
         self._picked = "nothing yet"
-        self.keeps_bounds = self._topology is not None
+        self.keeps_bounds = self.topology is not None
 
     def _look(
         self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator
     ) -> Lookahead:
         expansions = Leaves(self.model, depth, q_leaf, v_leaf).expansions
-        if self._topology is not None:
+        if self.topology is not None:
             try:
                 return self._listed(root_B, depth, expansions, q_leaf, v_leaf)
             except RandomOutcomes:
                 if not isinstance(self.model, SamplingModel):
                     raise
-                self._topology, self.keeps_bounds = None, False
+                self.topology, self.keeps_bounds = None, False
         return self._sampled(root_B, depth, expansions, q_leaf, v_leaf, generator)
 
     def _listed(
         self, root_B: Tensor, depth: int, expansions: int, q_leaf: Leaf | None, v_leaf: Leaf | None
     ) -> Lookahead:
-        topology = self._topology
+        topology = self.topology
         assert topology is not None
         calls_before = topology.model_calls
 
@@ -98,7 +100,10 @@ class AutoSearch(Search):
         if float(narrow.pruned_BA.max()) == 0:
             self._picked = f"expectimax: the model lists its outcomes, and {narrow.nodes} nodes hold all paths"
         else:
-            self._picked = f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes"
+            self._picked = (
+                f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes, "
+                "or too much memory"
+            )
         if 2 * max(self._width, narrow.nodes) <= self.max_nodes:
             self._width *= 2
         return replace(narrow, model_calls=topology.model_calls - calls_before)
@@ -141,13 +146,8 @@ class AutoSearch(Search):
         return look
 
     def forget(self) -> None:
-        if self._topology is not None:
-            self._topology = Topology(self._topology.model)
+        if self.topology is not None:
+            self.topology = Topology(self.topology.model)
 
     def __str__(self) -> str:
         return self._picked
-
-
-def tree_nodes(roots: int, children: int, expansions: int) -> float:
-    """Nodes of trees in which no two paths meet."""
-    return roots * sum(float(children) ** level for level in range(expansions + 1))

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import final
+from typing import Any, final
 
 import torch
 from jaxtyping import Int
@@ -13,7 +13,7 @@ from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.empirical import Drawn, Share
 from pgts_torch.search.expectimax import expectimax
-from pgts_torch.search.lookahead import MAX_NODES, Leaf, Lookahead
+from pgts_torch.search.lookahead import MAX_NODES, Leaf, Lookahead, check_finite
 from pgts_torch.search.mcts import mcts
 from pgts_torch.search.sampled import sampled
 from pgts_torch.search.topology import Topology
@@ -27,9 +27,13 @@ class Search(ABC):
 
     model_calls: how many (state, action) it has asked so far.
     keeps_bounds: whether, with upper bounds of v* at the leaves, its values are upper bounds of q*.
+    topology: what it has asked of a model that lists outcomes; None: it remembers no outcomes.
+    choices: the names of the attributes by which earlier searches decide how later ones are made.
     """
 
     keeps_bounds: bool
+    topology: Topology | None = None
+    choices: tuple[str, ...] = ()
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -48,8 +52,12 @@ class Search(ABC):
 
         Args:
             generator: drawn from only by searches that draw outcomes or noise; equal states of it give equal searches.
+
+        Raises:
+            NotFinite: the value of the best action of a root is not finite.
         """
         look = self._look(root_B, depth, q_leaf, v_leaf, generator)
+        check_finite("lookahead", "the lookahead", look.q_BA, root_B)
         self.model_calls += look.model_calls
         return look
 
@@ -61,6 +69,28 @@ class Search(ABC):
     @abstractmethod
     def forget(self) -> None:
         """Forget what was asked: the model has begun to number its states anew."""
+
+    def state_dict(self, *, with_states: bool) -> dict[str, Any]:
+        """What later searches depend on: plain values, and a tensor on the CPU.
+
+        Args:
+            with_states: whether states keep their numbers, so that those it asked about can be named.
+        """
+        asked = self.topology.asked.cpu() if with_states and self.topology is not None else torch.empty(0).long()
+        return {
+            "choices": {name: getattr(self, name) for name in self.choices},
+            "lists": self.topology is not None,
+            "asked": asked,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave: later searches are, and count, those of the search that gave it."""
+        for name in self.choices:
+            setattr(self, name, state["choices"][name])
+        if not state["lists"]:
+            self.topology, self.keeps_bounds = None, False
+        elif self.topology is not None:
+            self.topology.recall(state["asked"].to(self.model.device))
 
     @abstractmethod
     def __str__(self) -> str:
@@ -82,7 +112,7 @@ class ExpectimaxSearch(Search):
     def __init__(self, model: Model, *, max_nodes: int = MAX_NODES, max_width: int | None = None) -> None:
         super().__init__(model)
         self._model = listing(model, "expectimax")
-        self.topology = Topology(self._model)
+        self.topology: Topology = Topology(self._model)
         self.max_nodes, self.max_width = max_nodes, max_width
 
     def _look(
@@ -164,11 +194,20 @@ class MCTSSearch(Search):
         merge: whether paths that meet are one node.
         samples: how many drawn outcomes of each action stand for all, anew in each search. Default: all are listed, or
             4 where the model only draws.
+        max_nodes: the most nodes of one search.
     """
 
-    def __init__(self, model: Model, *, simulations: int = 64, merge: bool = True, samples: int | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        *,
+        simulations: int = 64,
+        merge: bool = True,
+        samples: int | None = None,
+        max_nodes: int = MAX_NODES,
+    ) -> None:
         super().__init__(model)
-        self.simulations, self.merge = simulations, merge
+        self.simulations, self.merge, self.max_nodes = simulations, merge, max_nodes
         if samples is not None and samples < 1:
             raise PgtsError(f"samples is {samples}; it must be at least 1")
         lists = samples is None and isinstance(model, EnumeratingModel)
@@ -196,6 +235,7 @@ class MCTSSearch(Search):
             merge=self.merge,
             topology=topology,
             generator=generator,
+            max_nodes=self.max_nodes,
         )
         return replace(look, model_calls=look.model_calls * calls_each)
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.tabular.exact import check_depth
 
@@ -18,6 +18,9 @@ Leaf = Callable[[Tensor], Tensor]
 """A critic as a search asks it: states [N] to values [N, A] (of Q^pi) or [N] (of v^pi)."""
 
 MAX_NODES = 10_000_000
+
+MAX_BYTES = 4 * 2**30
+"""How much memory the outcomes of one lookahead may take; at its peak it needs about three times as much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,15 +114,21 @@ class Leaves:
         if values.shape != shape:
             given, asked = tuple(values.shape), len(state_N)
             raise PgtsError(f"the critic answered with shape {given}; {asked} leaves ask for {shape}")
-        if math.isfinite(values.sum()):  # one cheap call; only a sum that overflows makes it look closer in vain
-            return values
-        best_N = values if values.ndim == 1 else values.amax(-1)
-        off = torch.nonzero(~best_N.isfinite())
-        if len(off):
-            row = int(off[0, 0])
-            value = values[row].tolist()
-            raise PgtsError(f"the critic's value of state {int(state_N[row])} is {value}; it must be finite")
+        check_finite("value", "the critic's value", values, state_N)
         return values
+
+
+def check_finite(what: str, name: str, value_N: Float[Tensor, "N ..."], state_N: Int[Tensor, "N"] | None) -> None:
+    """NotFinite if a value is, naming its state, or else its row. Of several values of a state the best must be finite,
+    the others may be -inf: an action that is not allowed."""
+    if math.isfinite(value_N.sum()):  # one cheap call; only a sum that overflows makes it look closer in vain
+        return
+    best_N = value_N if value_N.ndim == 1 else value_N.amax(-1)
+    off = torch.nonzero(~best_N.isfinite())
+    if len(off):
+        row = int(off[0, 0])
+        where = f"in row {row}" if state_N is None else f"of state {int(state_N[row])}"
+        raise NotFinite(f"{name} {where} is {value_N[row].tolist()}; it must be finite", what=what)
 
 
 def check_vector(root_B: Tensor) -> None:

@@ -1,5 +1,6 @@
 """Which states a lookahead meets at which level. Transitions do not depend on the policy: this outlives a call."""
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import final
@@ -9,9 +10,9 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import NodeBudgetExceeded, PgtsError
+from pgts_torch.errors import NodeBudgetExceeded, NotFinite, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model
-from pgts_torch.search.lookahead import check_states, check_vector
+from pgts_torch.search.lookahead import MAX_BYTES, check_states, check_vector
 
 _REMEMBERED_ROOTS = 8
 """How many different batches of roots keep their levels."""
@@ -69,6 +70,11 @@ class _Rows:
         self._table: Outcomes | None = None
         self._count = 0
 
+    @property
+    def num_outcomes(self) -> int:
+        """The largest K so far; 1 where nothing was added."""
+        return 1 if self._table is None else self._table.num_outcomes
+
     def rows(self, row_N: Int[Tensor, "N"]) -> Outcomes:
         """Some of the rows that were added, in the order asked for."""
         assert self._table is not None
@@ -111,10 +117,11 @@ class Topology:
 
     Args:
         model: the model that answers.
+        max_bytes: the most memory that the outcomes of one lookahead may take, see `table_bytes`.
     """
 
-    def __init__(self, model: EnumeratingModel) -> None:
-        self.model = model
+    def __init__(self, model: EnumeratingModel, *, max_bytes: int = MAX_BYTES) -> None:
+        self.model, self.max_bytes = model, max_bytes
         self.model_calls = 0
         self._generation = model.generation
         self._known = _Rows()
@@ -132,7 +139,8 @@ class Topology:
 
         Raises:
             PgtsError: no roots, or one that is not a state of the model; the model has forgotten its states since.
-            NodeBudgetExceeded: the levels hold more nodes than that; the model has not been asked about them.
+            NodeBudgetExceeded: the levels hold more nodes than that, or what follows them would take more memory than
+                `max_bytes`; the model has not been asked about them.
         """
         self._check_generation()
         check_vector(root_B)
@@ -144,12 +152,13 @@ class Topology:
                 self._levels.popitem(last=False)
         self._levels.move_to_end(key)
         while levels.closed is None and len(levels.outcomes) < expansions:
-            _check_budget(levels, len(levels.outcomes), max_nodes)
+            nodes = self._check_nodes(levels, len(levels.outcomes), expansions, max_nodes)
+            self._check_memory(nodes, f"levels 0 to {len(levels.outcomes)} of the {expansions}")
             self._expand(levels)
-        _check_budget(levels, expansions, max_nodes)
+        self._check_nodes(levels, expansions, expansions, max_nodes)
         return levels
 
-    # What these three make outlives the call: it must be ordinary tensors even if the caller is in inference mode.
+    # What these make outlives the call: it must be ordinary tensors even if the caller is in inference mode.
     @torch.inference_mode(False)
     @torch.no_grad()
     def step(self, state_N: Int[Tensor, "N"]) -> tuple[Outcomes, Int[Tensor, "C"]]:
@@ -157,13 +166,34 @@ class Topology:
 
         Nothing but the answers of the model is remembered. Where every outcome ends there are no children, and the
         outcomes cannot be backed up.
+
+        Raises:
+            NodeBudgetExceeded: what follows these states would take more memory than `max_bytes`.
         """
         self._check_generation()
+        self._check_memory(len(state_N), "one level")
         self._grow_tables()
         outcomes = self._outcomes(state_N)
         counts_NAK = counting(outcomes)
         children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
         return self._renumbered(outcomes, counts_NAK, children), children
+
+    @property
+    def asked(self) -> Int[Tensor, "N"]:
+        """The states that the model has been asked about, ascending."""
+        return torch.nonzero(self._row_S >= 0).flatten()
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def recall(self, state_N: Int[Tensor, "N"]) -> None:
+        """Have the outcomes of these states ready, as if they had been asked about before; `model_calls` does not
+        count them."""
+        self._grow_tables()
+        calls_before = self.model_calls
+        if len(state_N):
+            check_states(state_N, self.model.num_states)
+            self._outcomes(state_N)
+        self.model_calls = calls_before
 
     @torch.inference_mode(False)
     @torch.no_grad()
@@ -234,6 +264,29 @@ class Topology:
         self._scratch_S[states] = torch.arange(len(states), device=self.model.device)
         return self._scratch_S
 
+    def _check_nodes(self, levels: Levels, level: int, expansions: int, max_nodes: int) -> int:
+        """How many nodes there are on levels 0 to `level`; NodeBudgetExceeded, saying how many there may be on all of
+        them, if these are more than `max_nodes`."""
+        nodes = levels.nodes(level)
+        if nodes <= max_nodes:
+            return nodes
+        size = f"the lookahead has {nodes} nodes on levels 0 to {level}; max_nodes is {max_nodes}"
+        if level < expansions:
+            last, children = len(levels.frontiers[level]), self.model.num_actions * self._known.num_outcomes
+            most = nodes - last + tree_nodes(last, children, expansions - level)
+            size += f", and levels 0 to {expansions} hold up to {most:.3g}"
+        raise NodeBudgetExceeded(f"{size}: {_SMALLER}")
+
+    def _check_memory(self, states: int, which: str) -> None:
+        """NodeBudgetExceeded if the outcomes of so many states would not fit."""
+        A, K = self.model.num_actions, self._known.num_outcomes
+        needed = table_bytes(states, A, K, self.model.dtype)
+        if needed > self.max_bytes:
+            raise NodeBudgetExceeded(
+                f"the outcomes of {which} of the lookahead ({states} nodes, {A} actions, {K} outcomes of each: up to "
+                f"{states * A * K} children) would take {_gib(needed)}; the limit is {_gib(self.max_bytes)}: {_SMALLER}"
+            )
+
     def _check_generation(self) -> None:
         if self.model.generation != self._generation:
             raise PgtsError("the model has forgotten its states since this topology was made: make a new topology")
@@ -266,9 +319,10 @@ def check_answer(model: Model, state_N: Int[Tensor, "N"], answer: Outcomes) -> N
     best_N = answer.reward_NA.amax(-1)
     if not bool(best_N.isfinite().all()):
         n = int(torch.nonzero(~best_N.isfinite())[0, 0])
-        raise PgtsError(
+        raise NotFinite(
             f"the model's rewards in state {int(state_N[n])} are {answer.reward_NA[n].tolist()}; they must be "
-            "numbers, or -inf where an action is not allowed, and one action must be"
+            "numbers, or -inf where an action is not allowed, and one action must be",
+            what="reward",
         )
     total_NA = torch.where(answer.reward_NA > -torch.inf, answer.prob_NAK.sum(-1), 1.0)
     fair_NA = (total_NA - 1).abs() <= _TOLERANCE
@@ -296,10 +350,23 @@ def check_answer(model: Model, state_N: Int[Tensor, "N"], answer: Outcomes) -> N
         )
 
 
-def _check_budget(levels: Levels, expansions: int, max_nodes: int) -> None:
-    nodes = levels.nodes(expansions)
-    if nodes > max_nodes:
-        raise NodeBudgetExceeded(
-            f"the lookahead has {nodes} nodes on levels 0 to {expansions}; max_nodes is {max_nodes}: "
-            "lower the depth, ask for fewer roots or raise the budget"
-        )
+_SMALLER = "set a smaller depth or max_width, fewer environments, or the search sampled"
+
+
+def table_bytes(num_states: int, num_actions: int, num_outcomes: int, dtype: torch.dtype) -> int:
+    """How much memory the outcomes of so many states take: N A (s + K (2 s + 8)), where a number takes s."""
+    return num_states * num_actions * (dtype.itemsize + num_outcomes * (2 * dtype.itemsize + 8))
+
+
+def tree_nodes(roots: int, children: int, expansions: int) -> float:
+    """Nodes of trees in which no two paths meet."""
+    if children == 1:
+        return roots * (expansions + 1.0)
+    try:
+        return roots * (float(children) ** (expansions + 1) - 1) / (children - 1)
+    except OverflowError:
+        return math.inf
+
+
+def _gib(num_bytes: int) -> str:
+    return f"{num_bytes / 2**30:.3g} GiB"

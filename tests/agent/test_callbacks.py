@@ -117,6 +117,14 @@ def test_an_evaluation_is_the_mean_of_its_episodes_with_the_interval_of_student(
     assert (score.mean, score.half_width) == (3.0, pytest.approx(4.302653 * math.sqrt(7 / 3), abs=1e-5))
 
 
+@pytest.mark.fault("no time limit and no horizon")
+def test_an_evaluation_without_a_time_limit_ends_at_our_own(monkeypatch):
+    monkeypatch.setattr("pgts_torch.agent.evaluate.UNLIMITED_LENGTH", 30)
+    model = PGTS("CliffWalking-v1", depth=0, num_envs=2, seed=0)
+    assert model.time_limit is None
+    assert evaluate(model, episodes=2, deterministic=True).episodic_length.mean == 30
+
+
 def test_an_environment_given_as_an_object_is_evaluated_in_copies_of_its_own():
     given = [
         gymnasium.make("FrozenLake-v1", is_slippery=False),

@@ -108,14 +108,17 @@ FAILURES = {
     Unborn: r"at the start .* an observation is not finite: \[nan, nan, nan\]",
     Misborn: "at the start .* Output array is the wrong shape",
 }
+NOT_FINITE = {Unseen: "observation", Worthless: "reward", Unborn: "observation"}
 
 
+@pytest.mark.fault("environment raises an error")
 @pytest.mark.parametrize("env", FAILURES)
 @pytest.mark.parametrize("options", [{}, {"depth": 1, "estimator": "lookahead"}], ids=["plain", "lookahead"])
 def test_what_fails_in_a_rollout_is_named_with_its_step_and_seeds(env, options):
     with pytest.raises(PgtsError, match=f"^{env.__name__} failed {FAILURES[env]}") as caught:
         make(env, **options).iterate()
     assert f"the seeds {seeds('iteration', 0)}: " in str(caught.value)
+    assert getattr(caught.value, "what", None) == NOT_FINITE.get(env)
     assert make(Clock, **options).iterate().experience.num_steps == 12
 
 
@@ -137,10 +140,12 @@ def test_what_fails_in_an_evaluation_is_named_too():
 def test_what_fails_in_a_lookahead_is_named_with_its_environment(env):
     short = {"depth": 2, "estimator": "lookahead", "horizon": {"type": "fixed", "length": 2}}
     assert make(env, **short | {"depth": 1}).iterate().depth == 1
-    with pytest.raises(PgtsError, match=f"{env.__name__}"):
+    with pytest.raises(PgtsError, match=f"{env.__name__}") as caught:
         make(env, **short).iterate()
+    assert getattr(caught.value, "what", None) == NOT_FINITE.get(env)
 
 
+@pytest.mark.fault("environment without a model")
 def test_an_environment_without_a_model_is_refused_where_a_lookahead_needs_one_and_not_elsewhere():
     class Unknown(Clock):
         get_state = set_state = None

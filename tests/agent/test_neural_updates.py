@@ -119,6 +119,9 @@ def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo():
             policy.network.head.bias.data.copy_(torch.tensor([0.7, 0.3]).log())
             return 0.0
 
+        def state_dict(self):
+            return {}
+
     update = PPOUpdate(num_epochs=2, minibatch_size=4, clip_range=0.2, normalize_advantage=False)
     update._optimiser = Step()
     losses = update(policy, states, advantage_NA, torch.full((4,), 0.25), generator=stream(0, "update"))

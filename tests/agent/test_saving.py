@@ -57,8 +57,7 @@ def test_a_loaded_model_trains_on_bit_for_bit_like_the_uninterrupted_one(kind, e
         assert_same_tensors(whole.state_dict()[part], loaded.state_dict()[part])
     assert loaded.num_env_steps == whole.num_env_steps
     assert loaded.num_iterations == 6
-    # It asked its model anew for what the saved one remembered, at most for every state and action.
-    assert 0 <= loaded.num_model_calls - whole.num_model_calls <= whole.mdp.num_states * whole.mdp.num_actions
+    assert loaded.num_model_calls == whole.num_model_calls
     other = make(env, **KINDS[kind] | {"seed": 8})
     assert not same_bits(other.iterate().experience, make(env, **KINDS[kind]).iterate().experience)
 
@@ -98,6 +97,7 @@ def test_a_model_saved_over_itself_leaves_one_file(tmp_path):
     assert PGTS.load(path).num_env_steps == model.num_env_steps
 
 
+@pytest.mark.fault("flipped bits and missing ends of a saved model")
 def test_every_flipped_bit_and_every_missing_end_is_noticed(tmp_path):
     path = tmp_path / "model.pt"
     make().save(path)
@@ -136,6 +136,7 @@ def sealed(payload: bytes) -> bytes:
     return saving._MAGIC + hashlib.sha256(payload).digest() + payload
 
 
+@pytest.mark.fault("pickled payload in a saved model")
 def test_a_pickled_payload_is_refused_and_not_executed(tmp_path):
     trace, path = tmp_path / "trace", tmp_path / "model.pt"
     torch.save({"arguments": Bomb(trace), "state": {}}, tmp_path / "bomb.pt")
@@ -149,6 +150,7 @@ def test_a_pickled_payload_is_refused_and_not_executed(tmp_path):
     assert trace.exists()
 
 
+@pytest.mark.fault("foreign content in a saved model")
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")
 @pytest.mark.parametrize("payload", [b"", b"\x80", b"PK\x03\x04", b"hello", bytes(range(256)), b"\x80\x02]q\x00."])
 def test_a_whole_file_with_foreign_content_is_refused(payload, tmp_path):

@@ -112,6 +112,7 @@ def test_a_mistake_is_one_line_with_exit_code_2(arguments, own_environments, cap
     assert err.startswith(f"error: {MISTAKES[arguments]}")
 
 
+@pytest.mark.fault("missing extra")
 def test_a_missing_extra_is_named(monkeypatch, capsys):
     for module, id, extra in [("minigrid", "MiniGrid-Empty-5x5-v0", "envs"), ("ale_py", "ALE/Pong-v5", "atari")]:
         monkeypatch.setitem(sys.modules, module, None)

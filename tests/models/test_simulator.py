@@ -167,6 +167,18 @@ def test_answers_outlive_the_numbers_of_states_unless_they_take_much_memory(most
     assert (steps[2] > steps[1]) == asked_again
 
 
+def test_numbers_do_not_depend_on_what_is_remembered():
+    fresh, knowing = (SimulatorModel("CliffWalking-v1", gamma=0.9) for _ in range(2))
+    knowing.outcomes(every_state("CliffWalking-v1", knowing, 48)[[30]])
+    knowing.clear()
+    answers = []
+    for model in (fresh, knowing):
+        env = standing_in("CliffWalking-v1", 30), standing_in("CliffWalking-v1", 14)
+        answers.append(model.outcomes(model.roots(env, [30, 14])).child_NAK)
+    assert torch.equal(*answers)
+    assert knowing.simulator_steps == fresh.simulator_steps == 8
+
+
 @pytest.mark.parametrize(
     "id", ["MiniGrid-DoorKey-5x5-v0", "MiniGrid-Dynamic-Obstacles-5x5-v0", "MiniGrid-MemoryS7-v0", "BabyAI-GoToObj-v0"]
 )

@@ -203,6 +203,7 @@ def test_a_batch_of_roots_that_is_used_again_is_not_forgotten():
 # The budget
 
 
+@pytest.mark.fault("lookahead of too many nodes")
 def test_a_lookahead_beyond_its_budget_is_refused_before_the_model_is_asked_about_the_level_that_breaks_it():
     model = WatchedModel(InterningModel(paths, [()], num_actions=2))
     topology, root = Topology(model), torch.tensor([0])

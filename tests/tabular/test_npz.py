@@ -98,6 +98,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.fault("rows that do not sum to one", "negative probability", "NaN in an MDP", "wrong shape")
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_in_a_file_is_named_with_its_array_its_index_and_its_value(mistake, tmp_path):
     path = written(tmp_path, **MISTAKES[mistake])
@@ -112,6 +113,7 @@ class Harmful:
         return os.mkdir, ("opened",)
 
 
+@pytest.mark.fault("pickled payload in an MDP")
 def test_a_pickled_payload_is_not_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = written(tmp_path, R=np.array([[Harmful()]], dtype=object))
@@ -156,6 +158,7 @@ def test_an_array_larger_than_memory_is_refused(tmp_path):
         TabularMDP.load_npz(path)
 
 
+@pytest.mark.fault("damaged MDP file")
 def test_a_damaged_file_is_either_refused_or_read_as_an_mdp(tmp_path):
     buffer, random, verdicts = io.BytesIO(), numpy_stream(0, "damage"), []
     np.savez_compressed(buffer, **TWO_STATES)

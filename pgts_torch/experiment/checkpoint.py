@@ -1,0 +1,163 @@
+"""Checkpoints of a run: a directory each, which is whole or not there, and proves it before anything in it is used.
+
+`checkpoints/STEP/` holds the model as `PGTS.save` writes it and a manifest with its SHA-256, written last; one rename
+puts the directory in its place. The manifest is sealed by a SHA-256 of its own.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pgts_torch.agent import saving
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.errors import PgtsError
+
+CHECKPOINTS = "checkpoints"
+MODEL_FILE, MANIFEST_FILE = "model.pt", "manifest.json"
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Notes:
+    """What a checkpoint says beside the model, in plain values.
+
+    config: every key of the configuration, dotted, with its value.
+    versions: of the packages that numbers depend on.
+    metrics_bytes: the length of metrics.jsonl when it was taken.
+    finished: whether the training had come to its end.
+    progress: what the loop around the algorithm goes on from.
+    """
+
+    iterations: int
+    env_steps: int
+    model_calls: int
+    config: Mapping[str, Any]
+    versions: Mapping[str, str]
+    metrics_bytes: int
+    finished: bool
+    progress: Mapping[str, Any]
+
+
+class Damaged(PgtsError):
+    """A checkpoint does not hold what was written."""
+
+
+def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
+    """Add a checkpoint to a run folder, and `tidy` it.
+
+    Raises:
+        PgtsError: it cannot be written; then the others are as they were.
+    """
+    path = run / CHECKPOINTS / f"{notes.env_steps:012d}"
+    partial = path.with_name(f".{path.name}{saving.PARTIAL}")
+    try:
+        path.parent.mkdir(exist_ok=True)
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        algorithm.save(partial / MODEL_FILE)
+        files = {MODEL_FILE: hashlib.sha256((partial / MODEL_FILE).read_bytes()).hexdigest()}
+        saving.replace(partial / MANIFEST_FILE, _sealed({"format": _FORMAT, "files": files, "notes": asdict(notes)}))
+        _sync(partial)
+        shutil.rmtree(path, ignore_errors=True)
+        partial.rename(path)
+        _sync(path.parent)
+    except OSError as error:
+        raise PgtsError(f"the checkpoint {path} cannot be written: {error.strerror}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    tidy(run, path, keep=keep)
+    return path
+
+
+def read(path: Path) -> tuple[Notes, dict[str, Any]]:
+    """The notes of a checkpoint and what `PGTS.save` wrote; nothing is decoded before its checksum is right.
+
+    Raises:
+        Damaged: a file is missing, or does not hold what was written.
+        PgtsError: it is of another format.
+    """
+    try:
+        manifest, model = (path / MANIFEST_FILE).read_bytes(), (path / MODEL_FILE).read_bytes()
+    except OSError as error:
+        raise Damaged(f"the checkpoint {path} is damaged: {error.filename}: {error.strerror}") from error
+    content = _unsealed(manifest)
+    if content is None:
+        raise Damaged(f"the checkpoint {path} is damaged: the checksum of {MANIFEST_FILE} does not fit")
+    if content["format"] != _FORMAT:
+        raise PgtsError(f"the checkpoint {path} has the format {content['format']}; this version reads {_FORMAT}")
+    if content["files"] != {MODEL_FILE: hashlib.sha256(model).hexdigest()}:
+        raise Damaged(f"the checkpoint {path} is damaged: the checksum of {MODEL_FILE} does not fit")
+    return Notes(**content["notes"]), saving.decode(model, path / MODEL_FILE)
+
+
+def newest(run: Path, *, strict: bool = False) -> tuple[Path, Notes, dict[str, Any]] | None:
+    """The newest intact checkpoint of a run folder, as `read` gives it, with its path; None if there is none at all.
+
+    Args:
+        strict: refuse a damaged one; else it is named on stderr, and the one before it is used.
+
+    Raises:
+        PgtsError: none is intact, or `strict` and the newest is not.
+    """
+    paths = listed(run)
+    for path in reversed(paths):
+        try:
+            return path, *read(path)
+        except Damaged as error:
+            if strict:
+                raise
+            print(f"warning: {error}", file=sys.stderr)
+    if paths:
+        raise PgtsError(f"{run} has no checkpoint that is intact")
+    return None
+
+
+def listed(run: Path) -> list[Path]:
+    """The checkpoints of a run folder, oldest first, intact or not."""
+    return sorted(path for path in (run / CHECKPOINTS).glob("*") if path.name.isdecimal())
+
+
+def tidy(run: Path, last: Path, *, keep: int) -> None:
+    """Remove all checkpoints but `last` and the newest before it, `keep` in all; those ahead of it are damaged. And
+    what a process that was killed has left half written: nobody else may be writing."""
+    kept = [path for path in listed(run) if path.name <= last.name][-keep:]
+    for path in listed(run):
+        if path not in kept:
+            shutil.rmtree(path, ignore_errors=True)
+    for folder in (run, run / CHECKPOINTS):
+        for path in folder.glob(f".*{saving.PARTIAL}"):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+
+def _sealed(content: Mapping[str, Any]) -> bytes:
+    """JSON that holds its own checksum; each content has one such text, so that no bit of it may differ."""
+    plain = json.dumps(content, sort_keys=True)
+    seal = hashlib.sha256(plain.encode()).hexdigest()
+    return (json.dumps({"content": content, "sha256": seal}, sort_keys=True, indent=1) + "\n").encode()
+
+
+def _unsealed(raw: bytes) -> dict[str, Any] | None:
+    """What was sealed; None if this is not exactly what `_sealed` made."""
+    try:
+        content = json.loads(raw)["content"]
+        return content if _sealed(content) == raw else None
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+
+
+def _sync(folder: Path) -> None:
+    """Have the names in a folder on the disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

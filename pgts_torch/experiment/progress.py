@@ -1,0 +1,34 @@
+"""What a person sees while a training runs."""
+
+import sys
+from collections.abc import Mapping
+
+from tqdm import tqdm
+
+PLAIN_LINES = 20
+"""About how many lines a run prints where there is no terminal to draw a progress bar on."""
+
+
+class Reporter:
+    """A progress bar on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, total_steps: int) -> None:
+        self._total = total_steps
+        self._terminal = sys.stderr.isatty()
+        self._bar = tqdm(total=total_steps, unit="step", disable=not self._terminal, dynamic_ncols=True)
+        self._next = 0
+
+    def line(self, step: int, tags: Mapping[str, float]) -> None:
+        """What a person wants to see while it runs."""
+        shown_as = {"charts/episodic_return": "return", "exact/J": "J", "search/stationarity_gap": "gap"}
+        numbers = {name: tags[tag] for tag, name in shown_as.items() if tag in tags}
+        if self._terminal:
+            self._bar.set_postfix({name: f"{value:.3g}" for name, value in numbers.items()}, refresh=False)
+            self._bar.update(min(step, self._total) - self._bar.n)
+        elif step >= self._next:
+            self._next = step + self._total // PLAIN_LINES
+            shown = "  ".join(f"{name} {value:8.3f}" for name, value in numbers.items())
+            print(f"step {step:>9}  {shown}", file=sys.stderr)
+
+    def close(self) -> None:
+        self._bar.close()

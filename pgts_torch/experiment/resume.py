@@ -1,0 +1,103 @@
+"""Whether a run folder holds a training that goes on, and from where."""
+
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment import checkpoint
+from pgts_torch.experiment.config import Config
+from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.tracking import CONFIG_FILE, METRICS_FILE, SUMMARY_FILE, versions
+
+FREE_SECTIONS = ("run", "log")
+FREE_KEYS = ("name", "eval.every", "eval.episodes", "eval.keep_best")
+"""What may differ when a run goes on: no bit of its training depends on it."""
+
+_ADVICE = "choose another folder, or set run.overwrite"
+
+
+@dataclass(frozen=True)
+class Start:
+    """A checkpoint that a training goes on from.
+
+    state: for `PGTS.load_state_dict`.
+    """
+
+    path: Path
+    notes: checkpoint.Notes
+    state: Mapping[str, Any]
+
+
+def find(config: Config, run: Path, *, strict: bool) -> Start | None:
+    """Where the training of a configuration begins in its run folder; None: at the beginning.
+
+    Raises:
+        PgtsError: the folder holds a finished run, or one of another configuration, naming what differs; or no
+            checkpoint in it is intact; or, if `strict`, the newest one is not, or other versions made it.
+    """
+    if not (run / CONFIG_FILE).is_file():
+        return None
+    if (run / SUMMARY_FILE).is_file():
+        raise PgtsError(f"run.dir {run} holds a finished run; {_ADVICE}")
+    try:
+        found = checkpoint.newest(run, strict=strict)
+    except PgtsError as error:
+        raise PgtsError(f"{error}\n{_ADVICE}") from error
+    earlier = flat(load(run / CONFIG_FILE)) if found is None else found[1].config
+    if differing := list(_differing(flat(config), earlier)):
+        lines = (f"{key} is {_shown(now)}; in run.dir {run} it is {_shown(before)}" for key, now, before in differing)
+        raise PgtsError("\n".join([*lines, f"run.dir {run} holds an earlier run of another configuration; {_ADVICE}"]))
+    if found is None:
+        return None
+    path, notes, content = found
+    _check_metrics(run / METRICS_FILE, notes.metrics_bytes, path)
+    _check_versions(notes.versions, path, strict=strict)
+    return Start(path, notes, content["state"])
+
+
+def flat(config: Config) -> dict[str, Any]:
+    """Every key of a configuration, dotted, with its value as JSON has it."""
+    return dict(_flat("", json.loads(json.dumps(config.model_dump(by_alias=True)))))
+
+
+def _flat(prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(f"{prefix}{name}.", value)
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _differing(now: Mapping[str, Any], before: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """(key, value now, value before) where it matters; a key that is missing on one side has None there."""
+    for key in dict.fromkeys((*now, *before)):
+        free = key in FREE_KEYS or key.partition(".")[0] in FREE_SECTIONS
+        if not free and now.get(key) != before.get(key):
+            yield key, now.get(key), before.get(key)
+
+
+def _shown(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _check_metrics(path: Path, metrics_bytes: int, taken: Path) -> None:
+    size = path.stat().st_size if path.is_file() else 0
+    if size < metrics_bytes:
+        raise PgtsError(f"{path} has {size} bytes; it had {metrics_bytes} when {taken} was written; {_ADVICE}")
+
+
+def _check_versions(before: Mapping[str, str], path: Path, *, strict: bool) -> None:
+    now = versions()
+    lines = [
+        f"{name} is {now.get(name)}; {path} was written with {before.get(name)}"
+        for name in dict.fromkeys((*now, *before))
+        if now.get(name) != before.get(name)
+    ]
+    if lines and strict:
+        raise PgtsError("\n".join(lines))
+    for line in lines:
+        print(f"warning: {line}: the last bits may differ", file=sys.stderr)

@@ -1,0 +1,256 @@
+"""A number that is not finite stops training before it moves the policy, wherever it comes from."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from pgts_torch import PGTS
+from pgts_torch.agent.networks import MLP
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.neural_updates import GradientUpdate
+from pgts_torch.agent.optimisers import Optimiser
+from pgts_torch.agent.policies import Biased, SimplexPolicy, SoftmaxPolicy
+from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate
+from pgts_torch.bellman import Outcomes
+from pgts_torch.errors import NotFinite
+from pgts_torch.seeding import stream
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+KINDS = {
+    "tables": {"env": "pgts/Random-v0", "policy": "softmax", "update": "softmax"},
+    "simplex": {"env": "pgts/Random-v0", "policy": "simplex", "update": "projected"},
+    "networks": {"env": "CartPole-v1", "policy": "mlp", "update": "ppo"},
+    "mirror": {"env": "CartPole-v1", "policy": "mlp", "update": "mirror"},
+    "sampled": {"env": "CartPole-v1", "policy": "mlp", "update": "gradient", "estimator": "sampled", "depth": 0},
+}
+
+
+def make(kind: str) -> PGTS:
+    return PGTS(**{"depth": 1, "num_envs": 2, "horizon": {"type": "fixed", "length": 5}, "seed": 3} | KINDS[kind])
+
+
+def spoiled(function: Callable[..., Tensor], value: float) -> Callable[..., Tensor]:
+    """The function, with one number of its answer replaced."""
+
+    def wrapped(*args, **kwargs):
+        answer = function(*args, **kwargs).clone()
+        answer.view(-1)[-1] = value
+        return answer
+
+    return wrapped
+
+
+def in_rewards(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    step = model.world.env.step
+
+    def wrapped(actions):
+        observation, reward, *rest = step(actions)
+        return observation, np.where(np.arange(len(reward)) == 1, value, reward), *rest
+
+    patch.setattr(model.world.env, "step", wrapped)
+
+
+def in_discounts(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    step = model.world.env.step
+
+    def wrapped(actions):
+        *answer, info = step(actions)
+        return *answer, info | {"discount": np.full(2, value)}
+
+    patch.setattr(model.world.env, "step", wrapped)
+
+
+def in_observations(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    step = model.world.env.step
+
+    def wrapped(actions):
+        observation, *rest = step(actions)
+        return np.where(np.arange(observation.size).reshape(observation.shape) == 1, value, observation), *rest
+
+    patch.setattr(model.world.env, "step", wrapped)
+
+
+def in_rewards_of_the_model(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    asked = model.world.model.outcomes
+
+    def wrapped(state_N):
+        answer = asked(state_N)
+        return Outcomes(
+            torch.full_like(answer.reward_NA, value),
+            answer.prob_NAK,
+            answer.discount_NAK,
+            answer.child_NAK,
+            answer.num_children,
+        )
+
+    patch.setattr(model.world.model, "outcomes", wrapped)
+
+
+def in_values(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    patch.setattr(model.critic, "v", spoiled(model.critic.v, value))
+
+
+def in_targets(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    targets = model.critic._targets
+
+    def wrapped(rollout):
+        answer = targets(rollout)
+        answer = answer[-1] if isinstance(answer, tuple) else answer
+        answer = torch.full_like(answer, value)
+        return (answer, answer) if "Network" in type(model.critic).__name__ else answer
+
+    patch.setattr(model.critic, "_targets", wrapped)
+
+
+def in_lookaheads(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    search = model.search
+    assert search is not None
+    look = search._look
+
+    def wrapped(*args):
+        answer = look(*args)
+        answer.q_BA[-1] = value
+        return answer
+
+    patch.setattr(search, "_look", wrapped)
+
+
+def in_logits(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    patch.setattr(model.policy, "probs", spoiled(model.policy.probs, value))
+
+
+def in_parameters(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    state = model.policy.state_dict()
+    state[list(state)[-1]].view(-1)[:] = value
+    model.policy.load_state_dict(state)
+
+
+def in_losses(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    step = Optimiser.step
+
+    def wrapped(self, parameters, loss, name, **kwargs):
+        return step(self, parameters, loss * value if name == "policy" else loss, name, **kwargs)
+
+    patch.setattr(Optimiser, "step", wrapped)
+
+
+def in_gradients(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
+    """From the second minibatch of the update on, where it has several."""
+    calls = iter(range(100))
+    late = type(model.update).__name__ != "GradientUpdate"
+    model.policy.network.weights[0].register_hook(lambda grad: grad * value if next(calls) >= late else grad)
+
+
+ALL, NETWORKS = list(KINDS), ["networks", "mirror", "sampled"]
+PLACES = {
+    in_observations: ("observation", NETWORKS),
+    in_rewards: ("reward", ALL),
+    in_discounts: ("discount", ALL),
+    in_rewards_of_the_model: ("reward", ["tables", "simplex", "networks", "mirror"]),
+    in_values: ("value", ["tables", "simplex", "networks", "mirror"]),
+    in_targets: ("value", ALL),
+    in_lookaheads: ("lookahead", ["tables", "simplex", "networks", "mirror"]),
+    in_logits: ("probability", ALL),
+    in_parameters: ("probability", ["tables", "simplex"]),
+    in_losses: ("loss", NETWORKS),
+    in_gradients: ("gradient", NETWORKS),
+}
+CASES = [(place, kind) for place, (_, kinds) in PLACES.items() for kind in kinds]
+
+
+def remembered(model: PGTS) -> list[Tensor]:
+    """What the policy and its optimiser consist of."""
+    states = (model.policy.state_dict(), model.update.state_dict())
+    return [torch.as_tensor(value).clone() for state in states for value in state.values()]
+
+
+@pytest.mark.fault(
+    "observation that is not finite",
+    "reward that is not finite",
+    "discount that is not finite",
+    "value that is not finite",
+    "lookahead that is not finite",
+    "probability that is not finite",
+    "loss that is not finite",
+    "gradient that is not finite",
+)
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize(("place", "kind"), CASES, ids=lambda case: getattr(case, "__name__", case))
+def test_a_number_that_is_not_finite_stops_training_before_the_policy_moves(place, kind, value, monkeypatch):
+    model = make(kind)
+    with monkeypatch.context() as patch:
+        place(patch, model, value)
+        before = remembered(model)
+        with pytest.raises(NotFinite) as caught:
+            model.iterate()
+    assert caught.value.what == PLACES[place][0]
+    after = remembered(model)
+    assert len(before) == len(after)
+    assert all(torch.equal(x, y) for x, y in zip(before, after, strict=True) if x.isfinite().all())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_such_a_number_the_policy_moves(kind):
+    model = make(kind)
+    before = remembered(model)
+    model.iterate()
+    assert not all(map(torch.equal, before, remembered(model)))
+
+
+@pytest.mark.fault("step that overflows")
+@pytest.mark.parametrize(
+    ("policy", "update"),
+    [
+        (SoftmaxPolicy(3, 2), SoftmaxUpdate(1e308)),
+        (SoftmaxPolicy(3, 2), MirrorUpdate(1e308)),
+        (SimplexPolicy(3, 2), ProjectedUpdate(1e308)),
+    ],
+)
+def test_a_tabular_step_that_overflows_leaves_the_table_as_it_is(policy, update):
+    before, states, weight_N = policy.table(), torch.tensor([0, 2]), torch.ones(2, dtype=torch.float64)
+    advantage_NA = torch.tensor([[1.0, -1.0], [1e3, -1e3]], dtype=torch.float64)
+    with pytest.raises(
+        NotFinite, match=r"the step along the advantages of state 2 is \[inf, -inf\]; it must be finite"
+    ):
+        update(policy, states, advantage_NA, weight_N, generator=stream(0, "update"))
+    assert torch.equal(policy.table(), before)
+    update(policy, states[:1], advantage_NA[:1] / 1e308, weight_N[:1], generator=stream(0, "update"))
+    assert not torch.equal(policy.table(), before)
+
+
+@pytest.mark.fault("step that overflows")
+def test_a_direction_that_overflows_leaves_the_table_as_it_is():
+    policy = SoftmaxPolicy(3, 2, init=Biased(action=1, probability=0.9))
+    before, weight_N = policy.table(), torch.ones(1, dtype=torch.float64)
+    advantage_NA = torch.tensor([[1.7e308, -1.7e308]], dtype=torch.float64)
+    with pytest.raises(NotFinite, match=r"the next policy of state 1 is \[inf, .*\]; it must be finite"):
+        SoftmaxUpdate(0.1)(policy, torch.tensor([1]), advantage_NA, weight_N, generator=stream(0, "update"))
+    assert torch.equal(policy.table(), before)
+
+
+def test_an_action_that_is_not_allowed_may_be_worth_minus_infinity():
+    policy, states, weight_N = SoftmaxPolicy(3, 2), torch.tensor([1]), torch.ones(1, dtype=torch.float64)
+    advantage_NA = torch.tensor([[0.0, -math.inf]], dtype=torch.float64)
+    MirrorUpdate(1.0)(policy, states, advantage_NA, weight_N, generator=stream(0, "update"))
+    assert policy.table()[1].tolist() == [1.0, 0.0]
+    with pytest.raises(NotFinite, match=r"the step along the advantages of state 1 is \[-inf, -inf\]"):
+        MirrorUpdate(1.0)(policy, states, advantage_NA.fill_(-math.inf), weight_N, generator=stream(0, "update"))
+
+
+@pytest.mark.fault("step that overflows")
+@pytest.mark.parametrize(("learning_rate", "what"), [(1e20, "probability"), (1e39, "gradient")])
+def test_steps_of_a_network_that_overflow_are_taken_back(learning_rate, what):
+    policy = NetworkPolicy(spaces.Box(-math.inf, math.inf, (3,)), 2, network=MLP(activation="relu"))
+    update = GradientUpdate(learning_rate=learning_rate, optimizer="sgd", max_grad_norm=None)
+    before = policy.state_dict()
+    question = torch.ones(2, 3), torch.tensor([[1.0, -1.0], [2.0, -2.0]]), torch.ones(2)
+    with pytest.raises(NotFinite) as caught:
+        update(policy, *question, generator=stream(0, "update"))
+    assert caught.value.what == what
+    assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())

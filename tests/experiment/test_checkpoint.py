@@ -1,0 +1,176 @@
+"""No bit of a checkpoint can be wrong unnoticed; nothing in it is executed; what is damaged is not used."""
+
+import errno
+import hashlib
+import json
+import os
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pgts_torch.agent import saving
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment import checkpoint
+from pgts_torch.experiment.checkpoint import MANIFEST_FILE, MODEL_FILE, Damaged, Notes
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+
+def notes(env_steps: int, *, metrics_bytes: int = 17) -> Notes:
+    return Notes(
+        iterations=1,
+        env_steps=env_steps,
+        model_calls=3,
+        config={"search.depth": 2, "update.step_size": 0.1},
+        versions={"torch": "1"},
+        metrics_bytes=metrics_bytes,
+        finished=False,
+        progress={"certificate": None},
+    )
+
+
+def model() -> PGTS:
+    return PGTS("pgts/Ladder-v0", depth=1, num_envs=2, horizon={"type": "fixed", "length": 5}, seed=0)
+
+
+def written(run: Path, *steps: int, keep: int = 9) -> list[Path]:
+    algorithm = model()
+    return [checkpoint.write(run, algorithm, notes(step), keep=keep) for step in steps]
+
+
+def test_a_checkpoint_says_what_was_written_and_the_newest_is_found(tmp_path):
+    first, second = written(tmp_path, 90, 1000)
+    assert checkpoint.listed(tmp_path) == [first, second]
+    path, found, content = checkpoint.newest(tmp_path, strict=True)
+    assert (path, found) == (second, notes(1000))
+    assert content["state"].keys() == model().state_dict().keys()
+    assert PGTS.load(second / MODEL_FILE).num_env_steps == 0
+    assert checkpoint.newest(tmp_path / "elsewhere") is None
+
+
+def test_the_newest_are_kept_and_those_ahead_are_removed(tmp_path):
+    written(tmp_path, 10, 20, 30, 40, 50)
+    written(tmp_path, 35, keep=3)
+    assert [int(path.name) for path in checkpoint.listed(tmp_path)] == [20, 30, 35]
+    written(tmp_path, 35, keep=1)
+    assert [int(path.name) for path in checkpoint.listed(tmp_path)] == [35]
+
+
+@pytest.mark.parametrize("flips", [400, pytest.param(3000, marks=pytest.mark.long)])
+def test_no_flipped_bit_is_accepted(flips, tmp_path):
+    [path] = written(tmp_path, 10)
+    whole = {name: (path / name).read_bytes() for name in (MODEL_FILE, MANIFEST_FILE)}
+    random = np.random.default_rng(0)
+    for flip in range(flips):
+        name = MANIFEST_FILE if flip % 2 else MODEL_FILE
+        damaged = bytearray(whole[name])
+        damaged[int(random.integers(len(damaged)))] ^= 1 << int(random.integers(8))
+        (path / name).write_bytes(damaged)
+        with pytest.raises(Damaged, match=r"0010 is damaged"):
+            checkpoint.read(path)
+        (path / name).write_bytes(whole[name])
+    checkpoint.read(path)
+
+
+@pytest.mark.parametrize("cuts", [60, pytest.param(400, marks=pytest.mark.long)])
+def test_no_missing_end_no_longer_end_and_no_missing_file_is_accepted(cuts, tmp_path):
+    [path] = written(tmp_path, 10)
+    random = np.random.default_rng(0)
+    for name in (MODEL_FILE, MANIFEST_FILE):
+        whole = (path / name).read_bytes()
+        lengths = [0, 1, len(whole) - 1, *random.integers(len(whole), size=cuts // 2).tolist()]
+        for damaged in (*(whole[:length] for length in lengths), whole + b"\n"):
+            (path / name).write_bytes(damaged)
+            with pytest.raises(Damaged):
+                checkpoint.read(path)
+        (path / name).unlink()
+        with pytest.raises(Damaged, match=f"{name}: No such file"):
+            checkpoint.read(path)
+        (path / name).write_bytes(whole)
+    checkpoint.read(path)
+
+
+def test_the_model_of_another_checkpoint_is_not_accepted(tmp_path):
+    first, _ = written(tmp_path, 10)[0], (algorithm := model()).iterate()
+    second = checkpoint.write(tmp_path, algorithm, notes(20), keep=9)
+    shutil.copy(first / MODEL_FILE, second / MODEL_FILE)
+    with pytest.raises(Damaged, match=f"the checksum of {MODEL_FILE}"):
+        checkpoint.read(second)
+
+
+class Bomb:
+    """Unpickling it writes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_a_pickle_is_not_executed_even_where_all_checksums_are_right(tmp_path):
+    trace, [path] = tmp_path / "trace", written(tmp_path, 10)
+    torch.save({"arguments": Bomb(trace), "state": {}}, tmp_path / "bomb")
+    for payload in ((tmp_path / "bomb").read_bytes(), pickle.dumps(Bomb(trace))):
+        raw = saving._MAGIC + hashlib.sha256(payload).digest() + payload
+        (path / MODEL_FILE).write_bytes(raw)
+        content = json.loads((path / MANIFEST_FILE).read_text())["content"]
+        content["files"] = {MODEL_FILE: hashlib.sha256(raw).hexdigest()}
+        (path / MANIFEST_FILE).write_bytes(checkpoint._sealed(content))
+        with pytest.raises(PgtsError, match="holds something other than tensors and plain values"):
+            checkpoint.read(path)
+    assert not trace.exists()
+    pickle.loads(pickle.dumps(Bomb(trace))).close()
+    assert trace.exists()
+
+
+def test_another_format_is_named(tmp_path):
+    [path] = written(tmp_path, 10)
+    content = json.loads((path / MANIFEST_FILE).read_text())["content"] | {"format": 7}
+    (path / MANIFEST_FILE).write_bytes(checkpoint._sealed(content))
+    with pytest.raises(PgtsError, match="has the format 7; this version reads 1") as raised:
+        checkpoint.read(path)
+    assert not isinstance(raised.value, Damaged)
+
+
+def test_the_one_before_a_damaged_checkpoint_is_used_with_a_warning_unless_that_is_refused(tmp_path, capsys):
+    first, second = written(tmp_path, 10, 20)
+    (second / MODEL_FILE).write_bytes(b"")
+    assert checkpoint.newest(tmp_path)[0] == first
+    warning = f"warning: the checkpoint {second} is damaged: the checksum of {MODEL_FILE} does not fit\n"
+    assert capsys.readouterr() == ("", warning)
+    with pytest.raises(Damaged):
+        checkpoint.newest(tmp_path, strict=True)
+    (first / MANIFEST_FILE).unlink()
+    with pytest.raises(PgtsError, match="has no checkpoint that is intact"):
+        checkpoint.newest(tmp_path)
+
+
+def test_a_disk_that_is_full_leaves_the_others_as_they_are(tmp_path, monkeypatch):
+    [path] = written(tmp_path, 10)
+
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(PgtsError, match=r"cannot be written: No space left on device"):
+        written(tmp_path, 20, keep=1)
+    assert list((tmp_path / "checkpoints").iterdir()) == [path]
+    checkpoint.read(path)
+
+
+def test_what_was_left_half_written_is_removed(tmp_path):
+    [path] = written(tmp_path, 10)
+    (tmp_path / "checkpoints" / ".000000000020.partial").mkdir()
+    (tmp_path / "checkpoints" / ".000000000020.partial" / MODEL_FILE).write_bytes(b"half")
+    (tmp_path / ".best.pt.123.partial").write_bytes(b"half")
+    (tmp_path / "best.pt").write_bytes(b"whole")
+    assert checkpoint.newest(tmp_path)[0] == path
+    checkpoint.tidy(tmp_path, path, keep=1)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["best.pt", "checkpoints"]
+    assert list((tmp_path / "checkpoints").iterdir()) == [path]

@@ -1,0 +1,186 @@
+"""Processes that are killed, stopped or interrupted while they train: nothing is lost and no bit differs."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pgts_torch.agent.iteration import Iteration
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.experiment import checkpoint, run
+from pgts_torch.experiment.cli import main
+from pgts_torch.experiment.tracking import read_metrics
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+assert run.train  # imported before any child is made, so that none has to
+ROOT = Path(__file__).parents[2]
+SMALL = ["--env.id", "CartPole-v1", "--policy.type", "mlp", "--policy.hidden", "[8]", "--search.depth", "1"]
+SHORT = ["--total_steps", "100", "--rollout.num_envs", "2", "--rollout.horizon.length", "10", "--eval.episodes", "2"]
+OFTEN = ["--log.checkpoint_every", "1", "--eval.every", "20", "--eval.keep_best", "--run.tensorboard", "false"]
+
+
+def arguments(folder: Path) -> list[str]:
+    return ["train", *SMALL, *SHORT, *OFTEN, "--run.dir", str(folder)]
+
+
+def in_child(work: Callable[[], int]) -> int:
+    """The exit code of a process that does this; minus the signal that killed it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads: the child needs none of them
+        pid = os.fork()
+    if pid == 0:
+        code = 70
+        try:
+            code = work()
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def training(folder: Path, *, kill_at: int = -1, counted: Path | None = None) -> int:
+    """Train in a process of its own; its exit code.
+
+    Args:
+        kill_at: the call of a function, counted from the start, at which it is killed.
+        counted: where it writes down how many there were.
+    """
+    calls = 0
+
+    def count(frame: Any, event: str, argument: Any) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def work() -> int:
+        sys.setprofile(count if kill_at > 0 or counted is not None else None)
+        code = main(arguments(folder))
+        sys.setprofile(None)
+        if counted is not None:
+            counted.write_text(str(calls))
+        return code
+
+    return in_child(work)
+
+
+def signalled(folder: Path, *numbers: int) -> int:
+    """Train in a process that gets these signals in its third iteration; its exit code."""
+
+    def work() -> int:
+        iterate = PGTS.iterate
+
+        def iterate_under_fire(self: PGTS) -> Iteration:
+            for number in numbers if self.num_iterations == 2 else ():
+                os.kill(os.getpid(), number)
+            return iterate(self)
+
+        PGTS.iterate = iterate_under_fire  # type: ignore[method-assign]  # in this process, which ends here
+        return main(arguments(folder))
+
+    return in_child(work)
+
+
+def left(folder: Path) -> dict[str, Any]:
+    """Every byte that a run leaves, without what the clock, the process and the name of the folder change."""
+    files: dict[str, Any] = {name: (folder / name).read_bytes() for name in ("best.pt", "versions.json")}
+    files |= {str(path.relative_to(folder)): (path / "model.pt").read_bytes() for path in checkpoint.listed(folder)}
+    summary = json.loads((folder / "summary.json").read_text())
+    lines = read_metrics(folder)
+    for line in lines:
+        line.pop("charts/SPS", None)
+    files |= {"summary": {name: summary[name] for name in summary if name not in ("seconds", "run")}, "metrics": lines}
+    return files | {"names": sorted(path.name for path in folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> tuple[dict[str, Any], int]:
+    """What an uninterrupted run leaves, and how many calls of functions it makes."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert training(folder / "run", counted=folder / "calls") == 0
+    return left(folder / "run"), int((folder / "calls").read_text())
+
+
+@pytest.mark.parametrize("kills", [3, pytest.param(25, marks=pytest.mark.long)])
+def test_after_kills_at_random_moments_every_byte_is_that_of_an_uninterrupted_run(kills, whole, tmp_path):
+    expected, calls = whole
+    random = np.random.default_rng(kills)
+    killed, folder = 0, tmp_path / "0"
+    while killed < kills:
+        code = training(folder, kill_at=int(random.integers(1, calls // 2)))
+        assert code in (0, -signal.SIGKILL)
+        killed += code != 0
+        if code == 0:
+            assert left(folder) == expected
+            folder = tmp_path / str(killed)
+    assert training(folder) in (0, 2)  # 2: it was finished already
+    assert left(folder) == expected
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(25, marks=pytest.mark.long)])
+def test_after_kills_while_a_checkpoint_is_written_the_one_before_is_intact(kills, whole, tmp_path, monkeypatch):
+    random, write, calls, kill_at = np.random.default_rng(0), checkpoint.write, 0, 0
+
+    def count(frame: Any, event: str, argument: Any) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def write_under_fire(folder: Path, *args: Any, **kwargs: Any) -> Path:
+        sys.setprofile(count if checkpoint.listed(folder) else None)
+        try:
+            return write(folder, *args, **kwargs)
+        finally:
+            sys.setprofile(None)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "write", write_under_fire)
+        for number in range(kills):
+            folder, kill_at = tmp_path / str(number), int(random.integers(1, 3000))
+            assert in_child(lambda folder=folder: main(arguments(folder))) == -signal.SIGKILL
+            assert checkpoint.newest(folder, strict=True) is not None
+    assert training(folder) == 0
+    assert left(folder) == whole[0]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_finishes_the_iteration_saves_and_says_how_to_go_on(number, code, whole, tmp_path, capfd):
+    folder = tmp_path / "run"
+    assert signalled(folder, number) == code
+    _, notes, _ = checkpoint.newest(folder, strict=True)
+    assert notes.iterations == 3
+    assert read_metrics(folder)[-1]["step"] == notes.env_steps
+    assert f"stopped at step {notes.env_steps}; `pgts train --resume {folder}` goes on\n" in capfd.readouterr().err
+    assert training(folder) == 0
+    assert left(folder) == whole[0]
+
+
+def test_a_second_signal_ends_the_process_at_once(whole, tmp_path, capfd):
+    folder = tmp_path / "run"
+    assert signalled(folder, signal.SIGINT, signal.SIGINT) == 130
+    assert checkpoint.newest(folder, strict=True)[1].iterations == 2
+    assert "stopped at step" not in capfd.readouterr().err
+    assert training(folder) == 0
+    assert left(folder) == whole[0]
+
+
+def test_the_command_stops_at_a_signal_and_goes_on(tmp_path):
+    command = [sys.executable, "train.py", *arguments(tmp_path / "run")[1:], "--total_steps", "100000"]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        while not checkpoint.listed(tmp_path / "run"):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.terminate()
+        assert "goes on" in process.communicate()[1]
+    assert process.returncode == 143
+    assert main(["train", "--resume", str(tmp_path / "run"), "--total_steps", "300"]) == 2  # another configuration

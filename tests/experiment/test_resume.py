@@ -1,0 +1,278 @@
+"""A training that was cut off ends with the bits of one that was not; what cannot go on says why."""
+
+import errno
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.experiment import checkpoint, resume, run, tracking
+from pgts_torch.experiment.cli import main
+from pgts_torch.experiment.config import Config
+from pgts_torch.experiment.evaluate import last_checkpoint
+from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.tracking import RunFolder, read_metrics
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+SHORT = ["--total_steps", "300", "--rollout.num_envs", "4", "--rollout.horizon.length", "15", "--eval.episodes", "2"]
+QUIET = ["--run.tensorboard", "false"]
+NETWORK = [*QUIET, "--rollout.num_envs", "2", "--rollout.horizon.length", "10", "--search.depth", "1"]
+SMALL_MLP = ["--policy.type", "mlp", "--policy.hidden", "[8]", "--total_steps", "80", "--env.id", "CartPole-v1"]
+SMALL_CNN = "{type: cnn, scale: 10, channels: [4], hidden: [8]}"
+MINIGRID = ["--env.id", "MiniGrid-Empty-5x5-v0", "--env.observation_key", "image", "--policy", SMALL_CNN]
+WATCHED = ["--eval.every", "60", "--eval.keep_best", "--search.depth", "adaptive"]
+KINDS: dict[str, list[str]] = {
+    "certified": [*QUIET, "--search.depth", "2", "--search.stop_at", "5.9", "--critic", "{type: exact}"],
+    "tree": [*QUIET, "--search.kind", "mcts", "--search.simulations", "4"],
+    "budget": [*NETWORK, *SMALL_MLP, "--policy.normalize", "--search.max_nodes", "100"],
+    "simulator": [*NETWORK, *MINIGRID, "--total_steps", "60"],
+    "sampled": [*NETWORK, *SMALL_MLP, "--search.depth", "0", "--estimator.type", "sampled"],
+}
+
+
+def configured(folder: Path, *arguments: str) -> Config:
+    """About five iterations, with a checkpoint after each."""
+    return load(None, [*SHORT, "--log.checkpoint_every", "1", "--run.dir", str(folder), *arguments])
+
+
+class Killed(BaseException):
+    """Stands for `kill -9`: nothing is written after it."""
+
+
+def cut_off(config: Config, monkeypatch: pytest.MonkeyPatch, *, after: int, logs: int = 1) -> None:
+    """Train until so many checkpoints are written, and after that so many lines of metrics, then die."""
+    written = {"checkpoints": 0, "logs": 0}
+    write, log = checkpoint.write, RunFolder.log
+
+    def counted_write(*args: Any, **kwargs: Any) -> Path:
+        written["checkpoints"] += 1
+        return write(*args, **kwargs)
+
+    def counted_log(*args: Any) -> None:
+        log(*args)
+        written["logs"] += written["checkpoints"] >= after
+        if written["logs"] >= logs:
+            raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "write", counted_write)
+        patch.setattr(RunFolder, "log", counted_log)
+        with pytest.raises(Killed):
+            run.train(config)
+
+
+def left(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], dict[str, Any], list[tuple[int, float]]]:
+    """Weights and counters, metrics, summary and a TensorBoard curve, without what the clock says."""
+    state = PGTS.load(last_checkpoint(folder)).state_dict()
+    lines = [{tag: value for tag, value in line.items() if tag != "charts/SPS"} for line in read_metrics(folder)]
+    summary = json.loads((folder / "summary.json").read_text())
+    for name in ("seconds", "run"):
+        del summary[name]
+    return state, lines, summary, curve(folder)
+
+
+def curve(folder: Path) -> list[tuple[int, float]]:
+    """What TensorBoard shows of a tag; nothing where there are no events."""
+    if not list(folder.glob("events*")):
+        return []
+    events = EventAccumulator(str(folder)).Reload().Scalars("search/model_calls")
+    return [(event.step, event.value) for event in events]
+
+
+def same_bits(first: Any, second: Any) -> bool:
+    if isinstance(first, torch.Tensor):
+        return torch.equal(first, second) and first.dtype == second.dtype
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same_bits(first[key], second[key]) for key in first)
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(same_bits, first, second))
+    return first == second or (first != first and second != second)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_training_cut_off_anywhere_ends_with_the_bits_of_one_that_was_not(kind, tmp_path, monkeypatch):
+    if kind == "simulator":
+        pytest.importorskip("minigrid")
+    run.train(configured(tmp_path / "whole", *KINDS[kind]))
+    config = configured(tmp_path / "cut", *KINDS[kind])
+    cut_off(config, monkeypatch, after=0)
+    cut_off(config, monkeypatch, after=1)
+    assert len(read_metrics(tmp_path / "cut")) == 2  # one more than the checkpoint knows
+    run.train(config)
+    assert same_bits(left(tmp_path / "whole"), left(tmp_path / "cut"))
+
+
+def test_tensorboard_shows_every_step_once_and_evaluations_and_the_best_model_are_the_same(tmp_path, monkeypatch):
+    run.train(configured(tmp_path / "whole", *WATCHED))
+    config = configured(tmp_path / "cut", *WATCHED)
+    cut_off(config, monkeypatch, after=3)
+    run.train(config)
+    assert [step for step, _ in curve(tmp_path / "cut")] == [60, 120, 180, 240, 300]
+    assert same_bits(left(tmp_path / "cut"), left(tmp_path / "whole"))
+    best = [PGTS.load(tmp_path / name / "best.pt").state_dict() for name in ("whole", "cut")]
+    assert same_bits(*best)
+    other = run.build(configured(tmp_path / "other", "--seed", "1")).learn(60).state_dict()
+    assert not same_bits(best[0], other)
+
+
+@pytest.fixture
+def cut(tmp_path, monkeypatch):
+    """The folder of a run that was cut off after its second checkpoint, and where it is."""
+    monkeypatch.chdir(tmp_path)
+    cut_off(configured(Path("cut"), *QUIET), monkeypatch, after=2)
+    return Path("cut")
+
+
+def arguments(*more: str) -> list[str]:
+    return ["train", *SHORT, *QUIET, "--log.checkpoint_every", "1", "--run.dir", "cut", *more]
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+    return {str(path): path.read_bytes() for path in files}
+
+
+def test_another_configuration_is_refused_key_by_key_and_nothing_is_lost(cut, capsys):
+    before = content(cut)
+    other = [
+        "--seed",
+        "3",
+        "--update",
+        "{type: mirror}",
+        "--policy.init",
+        "{type: biased, probability: 0.5}",
+        "--eval.every",
+        "60",
+    ]
+    assert main(arguments(*other)) == 2
+    where = "in run.dir cut it is"
+    assert capsys.readouterr().err.splitlines()[1:] == [
+        f"error: seed is 3; {where} 0",
+        f"error: policy.init.type is biased; {where} uniform",
+        f"error: policy.init.action is 0; {where} null",
+        f"error: policy.init.probability is 0.5; {where} null",
+        f"error: update.type is mirror; {where} softmax",
+        f"error: update.state_weight is null; {where} occupancy",
+        f"error: update.step_size is null; {where} 0.1",
+        "error: run.dir cut holds an earlier run of another configuration; choose another folder, or set run.overwrite",
+    ]
+    assert content(cut) == before
+
+
+def test_what_no_bit_of_training_depends_on_may_differ(cut, tmp_path, capsys):
+    assert main(arguments("--name", "x", "--log.keep", "1", "--log.every", "2", "--eval.every", "60")) == 0
+    assert "going on from cut/checkpoints/000000000120" in capsys.readouterr().err
+    run.train(configured(tmp_path / "whole", *QUIET))
+    assert same_bits(*(PGTS.load(last_checkpoint(tmp_path / name)).state_dict() for name in ("cut", "whole")))
+    assert len(checkpoint.listed(cut)) == 1
+    assert load(cut / "config.yaml").name == "x"
+
+
+def test_a_run_goes_on_by_its_folder_alone_and_then_is_finished(cut, capsys):
+    moved = cut.rename("moved")
+    assert main(["train", "--resume", "moved", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert "going on from moved/checkpoints/000000000120" in err
+    assert json.loads(out)["env_steps"] == 300
+    before = content(moved)
+    for again in (["--resume", "moved"], [*arguments()[1:], "--run.dir", "moved"]):
+        assert main(["train", *again]) == 2
+        finished = "run.dir moved holds a finished run; choose another folder, or set run.overwrite"
+        assert f"error: {finished}\n" in capsys.readouterr().err
+    assert content(moved) == before
+
+
+@pytest.mark.parametrize("given", [["--config", "x.yaml"], ["--run.dir=x"], ["--run.overwrite"]])
+def test_what_the_run_says_itself_is_not_said_again(given, cut, capsys):
+    assert main(["train", "--resume", "cut", *given]) == 2
+    name = given[0].partition("=")[0]
+    mistake = f"error: {name} does not go with --resume, which takes it from the run (see pgts train --help)\n"
+    assert capsys.readouterr().err == mistake
+
+
+def test_overwriting_starts_anew(cut):
+    assert main(arguments("--run.overwrite", "--seed", "1")) == 0
+    assert [line["step"] for line in read_metrics(cut)] == [60, 120, 180, 240, 300]
+    assert load(cut / "config.yaml").seed == 1
+
+
+def test_after_a_damaged_checkpoint_the_one_before_leads_to_the_same_bits(cut, tmp_path, capsys):
+    newest = checkpoint.listed(cut)[-1]
+    (newest / checkpoint.MODEL_FILE).write_bytes(b"")
+    before = content(cut)
+    assert main(arguments("--strict-resume")) == 2
+    damaged = f"the checkpoint {newest} is damaged: the checksum of model.pt does not fit"
+    assert f"error: {damaged}\n" in capsys.readouterr().err
+    assert content(cut) == before
+    assert main(arguments()) == 0
+    err = capsys.readouterr().err
+    assert f"warning: {damaged}\ngoing on from cut/checkpoints/000000000060" in err
+    run.train(configured(tmp_path / "whole", *QUIET))
+    assert same_bits(left(cut), left(tmp_path / "whole"))
+
+
+def test_lost_metrics_are_noticed(cut, capsys):
+    (cut / "metrics.jsonl").write_bytes((cut / "metrics.jsonl").read_bytes()[:100])
+    assert main(arguments()) == 2
+    assert "cut/metrics.jsonl has 100 bytes; it had " in capsys.readouterr().err
+
+
+def test_other_versions_are_a_warning_or_refused(cut, monkeypatch, capsys):
+    now = tracking.versions()
+    monkeypatch.setattr(resume, "versions", lambda: now | {"torch": "0.1"})
+    line = f"torch is 0.1; cut/checkpoints/000000000120 was written with {now['torch']}"
+    assert main(arguments("--strict-resume")) == 2
+    assert f"error: {line}\n" in capsys.readouterr().err
+    assert main(arguments()) == 0
+    assert f"warning: {line}: the last bits may differ\n" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path, monkeypatch, capsys):
+    def read_only(path: Path, *args: Any, **kwargs: Any) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(Path, "mkdir", read_only)
+    assert main(["train", "--run.dir", str(tmp_path / "run")]) == 2
+    mistake = f"error: run.dir {tmp_path / 'run'} cannot be written to: Read-only file system"
+    assert capsys.readouterr().err.splitlines()[1:] == [mistake]
+
+
+def test_a_disk_that_is_full_ends_the_training_and_the_checkpoint_stays(cut, monkeypatch, capsys):
+    log = RunFolder.log
+    with Path("/dev/full").open("ab", buffering=0) as full, monkeypatch.context() as patch:
+
+        def log_to_full_disk(folder: RunFolder, *args: Any) -> None:
+            folder._metrics.close()
+            folder._metrics = full
+            log(folder, *args)
+
+        patch.setattr(RunFolder, "log", log_to_full_disk)
+        assert main(arguments()) == 2
+    assert capsys.readouterr().err.endswith(
+        "error: cut/metrics.jsonl cannot be written to at step 180; is the disk full?\n"
+    )
+    assert main(arguments()) == 0
+    assert [line["step"] for line in read_metrics(cut)] == [60, 120, 180, 240, 300]
+
+
+def test_slow_iterations_are_saved_more_often(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "MOST_SECONDS", -1)
+    run.train(configured(tmp_path / "slow", *QUIET, "--log.checkpoint_every", "100", "--log.keep", "9"))
+    run.train(configured(tmp_path / "last", *QUIET, "--log.checkpoint_every", "0", "--log.keep", "9"))
+    assert [len(checkpoint.listed(tmp_path / name)) for name in ("slow", "last")] == [5, 1]
+
+
+def test_a_second_process_is_told_who_has_the_folder(cut, capsys):
+    before = content(cut)
+    with tracking.RunLock(cut):
+        for more in ([], ["--run.overwrite"]):
+            assert main(arguments(*more)) == 2
+            assert f"error: run.dir cut is in use by the process {os.getpid()}\n" in capsys.readouterr().err
+    assert content(cut) == before
+    assert main(arguments()) == 0

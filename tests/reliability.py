@@ -1,0 +1,150 @@
+"""What can go wrong, what happens then, and which tests make it happen.
+
+`python -m tests.reliability` writes docs/reliability.md from FAULTS, the `@pytest.mark.fault` marks of the tests, and
+the results that the long forms of tests have recorded.
+"""
+
+import ast
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+DOCUMENT = ROOT / "docs" / "reliability.md"
+RESULTS = ROOT / "tests" / "long_results.json"
+
+ONE_LINE = "one line for each mistake, exit code 2, nothing written"
+NAMED = "refused by name, exit code 2"
+STOPPED = "stops before the policy moves; checkpoints stay, `failure.json`, exit code 1"
+
+FAULTS: dict[str, dict[str, str]] = {
+    "Configuration": {
+        "unknown key": ONE_LINE,
+        "wrong type": ONE_LINE,
+        "value out of range": ONE_LINE,
+        "NaN or infinity in a configuration": ONE_LINE,
+        "duplicate keys": ONE_LINE,
+        "aliases": ONE_LINE,
+        "nesting 3,000 deep": ONE_LINE,
+        "integer of 5,000 digits": ONE_LINE,
+        "python tags": ONE_LINE,
+        "not UTF-8": ONE_LINE,
+        "empty file": ONE_LINE,
+        "missing file": ONE_LINE,
+        "directory in place of a file": ONE_LINE,
+        "any other damaged text": "a valid configuration or clear lines, in less than a second",
+    },
+    "Environment": {
+        "unknown environment": NAMED,
+        "deprecated environment": NAMED,
+        "missing extra": "the `pip install` that brings it, exit code 2",
+        "no time limit and no horizon": "the guard of the geometric horizon, or of evaluations, ends it",
+        "autoreset in the next step": "refused with the mode that works",
+        "environment raises an error": "environment, step and seeds are named, exit code 2",
+        "environment without a model": "the two methods that it lacks are named, exit code 2",
+    },
+    "MDP files": {
+        "rows that do not sum to one": NAMED,
+        "negative probability": NAMED,
+        "NaN in an MDP": NAMED,
+        "wrong shape": NAMED,
+        "pickled payload in an MDP": "refused, not run",
+        "damaged MDP file": "refused, or read as an MDP",
+    },
+    "Numbers": {
+        "observation that is not finite": STOPPED,
+        "reward that is not finite": STOPPED,
+        "discount that is not finite": STOPPED,
+        "value that is not finite": STOPPED,
+        "lookahead that is not finite": STOPPED,
+        "probability that is not finite": STOPPED,
+        "loss that is not finite": STOPPED,
+        "gradient that is not finite": STOPPED,
+        "step that overflows": "taken back: policy and optimiser as before",
+    },
+    "Memory": {
+        "lookahead of too many nodes": "refused before the model is asked, with the number and what to set",
+        "lookahead larger than memory": "refused before the model is asked, with the number and what to set",
+    },
+    "Saved models": {
+        "flipped bits and missing ends of a saved model": "refused, none accepted",
+        "pickled payload in a saved model": "refused, not run",
+        "foreign content in a saved model": "refused",
+    },
+    "Processes": {
+        "folder that holds something else": "left as it is, exit code 2",
+        "closed output": "the run goes on and is whole",
+        "reader that leaves early": "exit code 141, no traceback",
+        "no terminal": "plain lines in place of a progress bar",
+        "C locale": "as in any other",
+        "TensorBoard missing": "one line that says what to do, nothing written; `run.tensorboard: false` trains",
+        "evaluation and logging": "on or off, the trained bits are the same",
+    },
+}
+"""By group: each fault, and what happens then."""
+
+
+def marked() -> dict[str, list[str]]:
+    """The tests of each fault that is named in a mark, as path::name, by the text of the test files."""
+    found = defaultdict[str, list[str]](list)
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                for fault in _faults_of(node):
+                    found[fault].append(f"{path.relative_to(ROOT)}::{node.name}")
+    return found
+
+
+def _faults_of(function: ast.FunctionDef) -> Iterator[str]:
+    for decorator in function.decorator_list:
+        if isinstance(decorator, ast.Call) and ast.unparse(decorator.func) == "pytest.mark.fault":
+            yield from (ast.literal_eval(name) for name in decorator.args)
+
+
+def document() -> str:
+    """The text of docs/reliability.md."""
+    tests = marked()
+    lines = [
+        "# What can go wrong",
+        "",
+        "Each fault below is made to happen by the tests beside it. `python -m tests.reliability` writes this page",
+        "from the marks of the tests; a test holds it to them.",
+    ]
+    for group, faults in FAULTS.items():
+        lines += ["", f"## {group}", "", "| fault | what happens | test |", "|---|---|---|"]
+        for fault, behaviour in faults.items():
+            links = "<br>".join(f"[{_sentence(test)}](../{test.partition('::')[0]})" for test in tests[fault])
+            lines.append(f"| {fault} | {behaviour} | {links} |")
+    lines += [
+        "",
+        "## Long forms",
+        "",
+        "`pytest -m long` runs the long forms of some of these tests and records what came of them:",
+        "",
+        "| what | result |",
+        "|---|---|",
+    ]
+    for name, result in sorted(json.loads(RESULTS.read_text(encoding="utf-8")).items()):
+        lines.append(f"| {name} | {', '.join(f'{key} {value}' for key, value in result.items())} |")
+    return "\n".join(lines) + "\n"
+
+
+def _sentence(test: str) -> str:
+    return test.partition("::test_")[2].replace("_", " ")
+
+
+def record(name: str, **result: float) -> None:
+    """Keep what the long form of a test found, and put it on the page."""
+    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+    RESULTS.write_text(json.dumps(results | {name: result}, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    write()
+
+
+def write() -> None:
+    """Write the page."""
+    DOCUMENT.write_text(document(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write()
