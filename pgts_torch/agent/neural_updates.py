@@ -11,6 +11,7 @@ A2C and `PPOUpdate` is PPO:
 import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, final
 
@@ -100,34 +101,30 @@ class NetworkUpdate(Update):
         """
         assert isinstance(policy, NetworkPolicy)
         _check_numbers(advantage_NA, weight_N)
+        with self._as_before_unless_finite(policy):
+            network, encoder = policy.network, policy.network.trunk.encoder
+            if fresh := encoder.fresh:
+                encoder.absorb(observation_N)
+            batch = Batch(network.encode(observation_N), advantage_NA.float(), weight_N.float())
+            old_NA, new_NA, losses = self.move(network, batch, generator)
+            check_finite("probability", "the next policy", new_NA, None)
+            share_N = batch.weight_N / batch.weight_N.sum()
+            losses["entropy"] = float(share_N @ entropy(new_NA))
+            losses["kl"] = float(share_N @ divergence(old_NA, new_NA))
+            if not fresh:
+                encoder.absorb(observation_N)
+        return losses
+
+    @contextmanager
+    def _as_before_unless_finite(self, policy: NetworkPolicy) -> Iterator[None]:
+        """Puts policy and optimiser back where a number was not finite."""
         before = policy.state_dict(), self.state_dict()
         try:
-            return self._moved(policy, observation_N, advantage_NA, weight_N, generator)
+            yield
         except NotFinite:
             policy.load_state_dict(before[0])
             self.load_state_dict(before[1])
             raise
-
-    def _moved(
-        self,
-        policy: NetworkPolicy,
-        observation_N: Tensor,
-        advantage_NA: Float[Tensor, "N A"],
-        weight_N: Float[Tensor, "N"],
-        generator: torch.Generator,
-    ) -> dict[str, float]:
-        network, encoder = policy.network, policy.network.trunk.encoder
-        if fresh := encoder.fresh:
-            encoder.absorb(observation_N)
-        batch = Batch(network.encode(observation_N), advantage_NA.float(), weight_N.float())
-        old_NA, new_NA, losses = self.move(network, batch, generator)
-        check_finite("probability", "the next policy", new_NA, None)
-        share_N = batch.weight_N / batch.weight_N.sum()
-        losses["entropy"] = float(share_N @ entropy(new_NA))
-        losses["kl"] = float(share_N @ divergence(old_NA, new_NA))
-        if not fresh:
-            encoder.absorb(observation_N)
-        return losses
 
     def state_dict(self) -> dict[str, Any]:
         return self._optimiser.state_dict()

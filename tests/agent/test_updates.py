@@ -109,7 +109,9 @@ def test_a_policy_that_an_update_cannot_move_is_refused(update, kind, fits):
 
 @pytest.mark.parametrize(("update", "kind", "step"), CASES)
 def test_a_policy_that_an_update_can_move_is_taken(update, kind, step):
-    update().check(kind(3, 2))
+    policy = kind(3, 2)
+    update().check(policy)
+    assert isinstance(policy, update.policies)
 
 
 @pytest.mark.parametrize("update", [ProjectedUpdate, SoftmaxUpdate, MirrorUpdate])
