@@ -162,6 +162,12 @@ def table(records: list[Record], sizes: list[int]) -> str:
     return "\n".join(lines)
 
 
+def soonest(records: list[Record], sizes: list[int]) -> str:
+    """After how many episodes the adaptive depth solves each size, medians over seeds."""
+    each = {n: [r["episodes"] for r in records if r["method"] == "pgts-adaptive" and r["size"] == n] for n in sizes}
+    return f"{label('pgts-adaptive')}, N:episodes  " + " ".join(f"{n}:{np.median(e):.0f}" for n, e in each.items() if e)
+
+
 def verdict(records: list[Record], sizes: list[int]) -> str:
     """How often the prediction was right, for the fixed depths."""
     fixed = [r for r in records if r["method"].startswith("pgts-") and r["method"] != "pgts-adaptive"]
@@ -215,7 +221,7 @@ def picture(records: list[Record]) -> Figure:
 
 def describe(records: list[Record]) -> str:
     sizes = _sizes(records)
-    return f"{table(records, sizes)}\n\n{verdict(records, sizes)}"
+    return f"{table(records, sizes)}\n\n{soonest(records, sizes)}\n{verdict(records, sizes)}"
 
 
 def _sizes(records: list[Record]) -> list[int]:
