@@ -239,9 +239,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         return (
             torch.tensor([step.reward for step in steps], dtype=self.dtype, device=self.device),
             torch.tensor([step.discount for step in steps], dtype=self.dtype, device=self.device),
-            torch.tensor(
-                [self._known(step.child, step.shown) for step in steps], dtype=torch.int64, device=self.device
-            ),
+            torch.tensor([self._number[step.child.key] for step in steps], dtype=torch.int64, device=self.device),
         )
 
     def _step(self, state: int, action: int, key: int) -> _Step:
