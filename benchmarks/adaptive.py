@@ -16,6 +16,7 @@ from typing import Any
 
 from pgts_torch.experiment import run
 from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.summary import Summary
 
 ROOT = Path(__file__).resolve().parent.parent
 LADDER_9 = ["--env.kwargs.n", "9", "--update.step_size", "5", "--total_steps", "240000"]
@@ -27,7 +28,7 @@ TASKS: dict[str, tuple[str, list[str], float, tuple[int, int]]] = {
 """Configuration, overrides, J*, and the two fixed depths."""
 
 
-def trained(config: str, overrides: list[str], seed: int, depth: str, stop_at: float) -> run.Summary:
+def trained(config: str, overrides: list[str], seed: int, depth: str, stop_at: float) -> Summary:
     """One run to the end of its steps or to its certificate."""
     with tempfile.TemporaryDirectory() as folder:
         fixed = ["--seed", str(seed), "--run.dir", f"{folder}/run", "--run.tensorboard", "false"]

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 from pgts_torch.experiment import run
 from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.summary import Summary
 from pgts_torch.experiment.tracking import read_metrics
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -26,7 +27,7 @@ CONFIGS = ("ladder", "tightrope", "random", "grid", "deep_sea")
 LADDER_DEPTHS = range(6)
 
 
-def trained(name: str, seed: int, depth: int | None = None) -> tuple[run.Summary, list[dict[str, Any]]]:
+def trained(name: str, seed: int, depth: int | None = None) -> tuple[Summary, list[dict[str, Any]]]:
     """One run of a shipped configuration, and its metrics."""
     with tempfile.TemporaryDirectory() as folder:
         overrides = ["--seed", str(seed), "--run.dir", f"{folder}/run", "--run.tensorboard", "false"]

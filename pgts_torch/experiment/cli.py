@@ -6,25 +6,33 @@ Torch is imported only after the arguments have proved themselves, so that mista
 import argparse
 import difflib
 import json
-import math
 import os
 import sys
-import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NoReturn
 
 from pgts_torch.errors import NotFinite, PgtsError, Stopped
+from pgts_torch.experiment.arguments import (
+    Parser,
+    depth_list,
+    describe_options,
+    json_object,
+    output_folder,
+    print_values,
+    run_folder,
+    share,
+    start,
+    whole,
+    whole_list,
+)
 from pgts_torch.experiment.config import Config, dump
-from pgts_torch.experiment.fields import INT64_MAX
 from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
-from pgts_torch.experiment.schema import Option, Schema
+from pgts_torch.experiment.schema import Schema
 
 CHECK_FAILED = NOT_FINITE = 1
 USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
-WIDTH = 79
 
 Arguments = Sequence[str]
 COMMANDS: dict[str, Callable[[Arguments], None]] = {}
@@ -72,16 +80,16 @@ def main(arguments: Arguments | None = None) -> int:
 def train(arguments: Arguments) -> None:
     """Train a policy with tree search."""
     usage = "%(prog)s [--config FILE | --resume RUN_DIR] [--KEY VALUE ...]"
-    parser = _Parser("train", train, usage=usage)
+    parser = Parser("train", train, usage=usage)
     parser.add_argument("--config", metavar="FILE", help="YAML file with any of the keys below; none: the defaults")
-    parser.add_argument("--resume", metavar="RUN_DIR", type=_run_folder, help="go on with an unfinished run")
+    parser.add_argument("--resume", metavar="RUN_DIR", type=run_folder, help="go on with an unfinished run")
     parser.add_argument(
         "--strict-resume", action="store_true", help="refuse a last checkpoint that is damaged or of other versions"
     )
     parser.add_argument("--print-config", action="store_true", help="print the whole configuration as YAML and stop")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     if {"-h", "--help"} & set(arguments):
-        parser.epilog = "\n".join(_describe(Schema(Config).options()))
+        parser.epilog = "\n".join(describe_options(Schema(Config).options()))
     fixed, overrides = parser.parse_known_args(arguments)
     if fixed.resume is not None:
         for name in ("config", "run.dir", "run.overwrite"):
@@ -95,20 +103,21 @@ def train(arguments: Arguments) -> None:
     if fixed.config is None and fixed.resume is None:
         print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
     from pgts_torch.experiment import run
+    from pgts_torch.experiment.summary import describe
 
     summary = run.train(config, strict_resume=fixed.strict_resume)
-    print(json.dumps(asdict(summary)) if fixed.json else run.describe(summary))
+    print(json.dumps(asdict(summary)) if fixed.json else describe(summary))
 
 
 @command
 def sweep(arguments: Arguments) -> None:
     """Train with several seeds at several depths, and compare."""
-    parser = _Parser("sweep", sweep, usage="%(prog)s --out DIR [--config FILE] [--KEY VALUE ...]")
-    parser.add_argument("--out", metavar="DIR", type=_output_folder, help="gets DIR/depth-D/seed-S, a table, a picture")
+    parser = Parser("sweep", sweep, usage="%(prog)s --out DIR [--config FILE] [--KEY VALUE ...]")
+    parser.add_argument("--out", metavar="DIR", type=output_folder, help="gets DIR/depth-D/seed-S, a table, a picture")
     parser.add_argument("--config", metavar="FILE", help="as for pgts train; none: the defaults")
-    parser.add_argument("--seeds", metavar="N", type=_whole(1), default=5, help="0 to N - 1 (default: %(default)s)")
-    parser.add_argument("--depths", metavar="LIST", type=_depth_list, default=(), help="as in 0,2,4 (default: its own)")
-    parser.add_argument("--jobs", metavar="N", type=_whole(1), default=1, help="runs at once (default: %(default)s)")
+    parser.add_argument("--seeds", metavar="N", type=whole(1), default=5, help="0 to N - 1 (default: %(default)s)")
+    parser.add_argument("--depths", metavar="LIST", type=depth_list, default=(), help="as in 0,2,4 (default: its own)")
+    parser.add_argument("--jobs", metavar="N", type=whole(1), default=1, help="runs at once (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the table as one JSON object")
     parser.epilog = SWEEP_HELP
     fixed, overrides = parser.parse_known_args(arguments)
@@ -135,28 +144,28 @@ named, the others go on, and the exit code is 1."""
 @command
 def evaluate(arguments: Arguments) -> None:
     """Measure the policy that a run has left, in fresh episodes."""
-    parser = _Parser("evaluate", evaluate)
-    parser.add_argument("run_dir", metavar="RUN_DIR", type=_run_folder, help="the folder of a run")
-    parser.add_argument("--episodes", metavar="N", type=_whole(1), default=100, help="how many (default: %(default)s)")
-    parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the episodes (default: %(default)s)")
+    parser = Parser("evaluate", evaluate)
+    parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run")
+    parser.add_argument("--episodes", metavar="N", type=whole(1), default=100, help="how many (default: %(default)s)")
+    parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the episodes (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
     given = parser.parse_args(arguments)
     from pgts_torch.experiment.evaluate import evaluate_run
 
     answer = evaluate_run(given.run_dir, episodes=given.episodes, seed=given.seed)
-    _answer({kind: asdict(evaluation) for kind, evaluation in answer.items()}, as_json=given.json)
+    print_values({kind: asdict(evaluation) for kind, evaluation in answer.items()}, as_json=given.json)
 
 
 @command
 def figures(arguments: Arguments) -> None:
     """Reproduce the figures and tables of the paper, and check what it says."""
-    parser = _Parser("figures", figures)
+    parser = Parser("figures", figures)
     parser.add_argument("--only", choices=PARTS, help="compute this part; keep the others as they are in --out")
     parser.add_argument(
         "--quick", action="store_true", help="minutes instead of half an hour: fewer seeds and readings"
     )
     parser.add_argument(
-        "--out", metavar="DIR", type=_output_folder, default=Path("docs"), help="where to write (default: %(default)s)"
+        "--out", metavar="DIR", type=output_folder, default=Path("docs"), help="where to write (default: %(default)s)"
     )
     parser.add_argument("--json", action="store_true", help="print the data as one JSON object")
     given = parser.parse_args(arguments)
@@ -181,17 +190,17 @@ STATIONARY_OPTIONS = {
 @command
 def stationary(arguments: Arguments) -> None:
     """Count the policies that tree search cannot improve, depth by depth."""
-    parser = _Parser("stationary", stationary, usage="%(prog)s WHAT [--OPTION VALUE ...]")
+    parser = Parser("stationary", stationary, usage="%(prog)s WHAT [--OPTION VALUE ...]")
     parser.add_argument("what", metavar="WHAT", type=_mdp_name, help=", ".join(STATIONARY_OPTIONS))
     for name, kind, meaning in [
-        ("n", _whole(1), "size: ladder (default 5), grid (3), deep_sea (3)"),
-        ("states", _whole(1), "of random (default 10)"),
-        ("actions", _whole(1), "of random (default 2)"),
-        ("branching", _whole(1), "successors of each state and action of random (default: all states)"),
-        ("mdp-seed", _whole(0), "of random (default 0)"),
-        ("traps", _whole_list, "states of the grid that cost 10, as in 1,5 (default: none)"),
-        ("gamma", _share, "discount (default 0.9; deep_sea 0.99; a file has its own)"),
-        ("start", _start, "a state, or uniform for all alike (default: state 0; a file has its own)"),
+        ("n", whole(1), "size: ladder (default 5), grid (3), deep_sea (3)"),
+        ("states", whole(1), "of random (default 10)"),
+        ("actions", whole(1), "of random (default 2)"),
+        ("branching", whole(1), "successors of each state and action of random (default: all states)"),
+        ("mdp-seed", whole(0), "of random (default 0)"),
+        ("traps", whole_list, "states of the grid that cost 10, as in 1,5 (default: none)"),
+        ("gamma", share, "discount (default 0.9; deep_sea 0.99; a file has its own)"),
+        ("start", start, "a state, or uniform for all alike (default: state 0; a file has its own)"),
     ]:
         parser.add_argument(f"--{name}", metavar="N", type=kind, help=meaning)
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
@@ -221,12 +230,12 @@ An end is a state that leads to itself and earns 0."""
 @command
 def check_model(arguments: Arguments) -> None:
     """Try out whether an environment can serve as a model of itself."""
-    parser = _Parser("check-model", check_model)
+    parser = Parser("check-model", check_model)
     parser.add_argument("env_id", metavar="ENV_ID", help="as in gymnasium.make; MODULE:ID imports MODULE first")
     parser.add_argument(
-        "--kwargs", metavar="JSON", type=_json_object, default={}, help='for gymnasium.make, as {"is_slippery": false}'
+        "--kwargs", metavar="JSON", type=json_object, default={}, help='for gymnasium.make, as {"is_slippery": false}'
     )
-    parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the walks (default: %(default)s)")
+    parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the walks (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
     parser.epilog = PROTOCOL_HELP
     given = parser.parse_args(arguments)
@@ -248,31 +257,6 @@ An environment of your own needs two methods:
 and draws from self.np_random only."""
 
 
-class _Parser(argparse.ArgumentParser):
-    """An argparse parser that reports a mistake in one line and takes no abbreviations."""
-
-    def __init__(self, name: str, function: Callable[..., Any], **settings: Any) -> None:
-        super().__init__(
-            prog=f"pgts {name}".strip(),
-            description=(function.__doc__ or "").partition("\n")[0],
-            allow_abbrev=False,
-            formatter_class=_Formatter,
-            **settings,
-        )
-
-    def print_help(self, file: Any = None) -> None:
-        """As argparse does, but without hiding that nobody reads."""
-        (file or sys.stdout).write(self.format_help())
-
-    def error(self, message: str) -> NoReturn:
-        raise PgtsError(f"{message} (see {self.prog} --help)")
-
-
-class _Formatter(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, width=WIDTH)
-
-
 def _dispatch(arguments: Arguments) -> int:
     """Run a subcommand and return its exit code; argparse leaves by SystemExit after --help."""
     try:
@@ -285,7 +269,7 @@ def _dispatch(arguments: Arguments) -> int:
 def _run_command(arguments: Arguments) -> None:
     """Hand the arguments after the subcommand to its function."""
     summaries = [f"  {name:<12}{(function.__doc__ or '').partition(chr(10))[0]}" for name, function in COMMANDS.items()]
-    parser = _Parser("", main, usage="pgts [-h] [--version] COMMAND ...")
+    parser = Parser("", main, usage="pgts [-h] [--version] COMMAND ...")
     parser.description = "Policy gradient with tree search."
     parser.epilog = "\n".join(["commands:", *summaries, "", "pgts COMMAND --help explains each."])
     parser.add_argument("--version", action="store_true", help="print the version and stop")
@@ -310,99 +294,6 @@ def _version() -> str:
     return version("pgts_torch")
 
 
-def _describe(options: Sequence[Option]) -> Iterator[str]:
-    """The keys of a configuration for --help, by section."""
-    yield "keys, each --KEY VALUE or --KEY=VALUE, with the value in YAML:"
-    yield from textwrap.wrap(
-        "A mapping replaces its whole section, as in --critic '{type: exact}'; a single key changes nothing but "
-        "itself. true may be left out.",
-        WIDTH,
-        initial_indent="  ",
-        subsequent_indent="  ",
-    )
-    section, when = None, ""
-    for option in options:
-        name = option.key.partition(".")[0] if "." in option.key else "general"
-        if name != section:
-            yield from ("", name)
-            when = ""
-        if option.when != when and option.when:
-            yield f"  with {option.when}:"
-        section, when = name, option.when
-        yield from _describe_option(option, "    " if option.when else "  ")
-
-
-def _describe_option(option: Option, indent: str) -> Iterator[str]:
-    deeper = indent + "    "
-    head = f"--{option.key}  {option.requirement} (default: {_value(option.default)})"
-    yield from textwrap.wrap(head, WIDTH, initial_indent=indent, subsequent_indent=deeper, break_on_hyphens=False)
-    yield from textwrap.wrap(option.meaning, WIDTH, initial_indent=deeper, subsequent_indent=deeper)
-    for value, meaning in option.choices:
-        yield from textwrap.wrap(
-            f"{value}: {meaning}", WIDTH, initial_indent=deeper + "  ", subsequent_indent=deeper + "    "
-        )
-
-
-def _value(value: Any) -> str:
-    """A default as it would be written on the command line."""
-    if isinstance(value, str):
-        return value
-    return f"{value:_}" if type(value) is int else json.dumps(value)
-
-
-def _whole(least: int) -> Callable[[str], int]:
-    """An argparse type: a whole number of at least `least`, below 2**63."""
-
-    def convert(text: str) -> int:
-        if not (text.isascii() and text.isdecimal() and len(text) < 20 and least <= int(text) <= INT64_MAX):
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number >= {least} and below 2**63")
-        return int(text)
-
-    return convert
-
-
-def _whole_list(text: str) -> tuple[int, ...]:
-    """An argparse type: whole numbers separated by commas."""
-    return tuple(_whole(0)(part) for part in text.split(","))
-
-
-def _depth_list(text: str) -> tuple[int | str, ...]:
-    """An argparse type: depths separated by commas, each a whole number or the word adaptive."""
-    return tuple(dict.fromkeys(part if part == "adaptive" else _whole(0)(part) for part in text.split(",")))
-
-
-def _json_object(text: str) -> dict[str, Any]:
-    """An argparse type: a JSON object."""
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        value = None
-    if not isinstance(value, dict):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a JSON object")
-    return value
-
-
-def _share(text: str) -> float:
-    """An argparse type: a number in [0, 1]."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number in [0, 1]")
-    return value
-
-
-def _start(text: str) -> int | str:
-    """An argparse type: a state, or the word uniform."""
-    if text == "uniform":
-        return text
-    try:
-        return _whole(0)(text)
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a state nor uniform") from None
-
-
 def _mdp_name(text: str) -> str:
     """An argparse type: the name of an MDP, or the path of a file that ends in .npz."""
     names = [name for name in STATIONARY_OPTIONS if not name.endswith(".npz")]
@@ -415,44 +306,6 @@ def _mdp_name(text: str) -> str:
     if not Path(text).is_file():
         raise argparse.ArgumentTypeError(f"{text!r} is not a file")
     return text
-
-
-def _output_folder(text: str) -> Path:
-    """An argparse type: a folder, or where one can be made."""
-    path = Path(text)
-    if path.exists() and not path.is_dir():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
-    return path
-
-
-def _run_folder(text: str) -> Path:
-    """An argparse type: a folder with the configuration of a run in it."""
-    path = Path(text)
-    if not path.is_dir():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
-    if not (path / "config.yaml").is_file():
-        raise argparse.ArgumentTypeError(f"{text!r} is not the folder of a run: it has no config.yaml")
-    return path
-
-
-def _answer(answer: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print named values, for a program or for a person."""
-    if as_json:
-        print(json.dumps(answer))
-        return
-    rows = list(_rows(answer))
-    width = max((len(name) for name, _ in rows), default=0)
-    for name, value in rows:
-        print(f"{name:<{width}}  {value:.6g}" if isinstance(value, float) else f"{name:<{width}}  {value}")
-
-
-def _rows(answer: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted name, value) of nested values."""
-    for name, value in answer.items():
-        if isinstance(value, Mapping):
-            yield from _rows(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", "none" if value is None else value
 
 
 if __name__ == "__main__":

@@ -3,10 +3,9 @@
 import json
 import math
 import sys
-import textwrap
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from pgts_torch.agent import saving
 from pgts_torch.agent.callbacks import EvalCallback
-from pgts_torch.agent.evaluate import Evaluation, Score, evaluate
+from pgts_torch.agent.evaluate import Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import NotFinite, Stopped, failure
@@ -28,6 +27,7 @@ from pgts_torch.experiment.progress import Reporter
 from pgts_torch.experiment.resume import Start, find, flat
 from pgts_torch.experiment.sections import EvalConfig
 from pgts_torch.experiment.signals import StopFlag
+from pgts_torch.experiment.summary import Summary
 from pgts_torch.experiment.tracking import (
     BEST_FILE,
     CONFIG_FILE,
@@ -45,35 +45,6 @@ from pgts_torch.tabular import exact, stationary
 
 MOST_SECONDS = 60
 """An iteration that ends later than this after the last checkpoint is followed by one, too."""
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What a finished run came to.
-
-    J, J_optimal: exact return of the trained policy and of the best one; None where nothing exact is known.
-    depth: m, the largest if it was adaptive.
-    search: how the lookahead was made, and why where it chose that itself.
-    stationarity_gap: max over visited states of the exact g_m; None likewise.
-    certificate: what the last iteration bounds J* - J^pi by; None: it knows no bound.
-    certificate_is_proved: whether that is a proof, because the critic is exact, or an estimate.
-    """
-
-    run: str
-    seed: int
-    depth: int
-    search: str
-    J: float | None
-    J_optimal: float | None
-    stationarity_gap: float | None
-    certificate: float | None
-    certificate_is_proved: bool
-    iterations: int
-    env_steps: int
-    model_calls: int
-    seconds: float
-    deterministic: Evaluation
-    sampled: Evaluation
 
 
 def build(config: Config) -> PGTS:
@@ -318,34 +289,3 @@ def _new_folder(config: Config) -> Path:
     stem = f"{config.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     names = (stem, *(f"{stem}-{n}" for n in range(2, 1000)))
     return next(path for path in (Path("runs") / name for name in names) if not path.exists())
-
-
-def describe(summary: Summary) -> str:
-    """The summary as a person reads it, within 80 columns."""
-    rows: dict[str, Any] = {}
-    if summary.J is not None and summary.J_optimal is not None:
-        share = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 <= summary.J else ""
-        rows |= {
-            "return of the policy, J": f"{summary.J:.4g}{share}",
-            "optimal return, J*": f"{summary.J_optimal:.4g}",
-            f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
-        }
-    if summary.certificate is not None:
-        kind = "proved" if summary.certificate_is_proved else "an estimate: the critic is learned"
-        rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({kind})"
-    rows |= {
-        "greedy episodes, return": _score_text(summary.deterministic),
-        "sampled episodes, return": _score_text(summary.sampled),
-        "search": textwrap.fill(summary.search, 50).replace("\n", "\n" + 28 * " "),
-        "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",
-        "model calls": summary.model_calls,
-        "seconds": f"{summary.seconds:.1f}",
-        "run folder": summary.run,
-    }
-    return "\n".join(f"{name:<28}{value}" for name, value in rows.items())
-
-
-def _score_text(evaluation: Evaluation) -> str:
-    score = evaluation.episodic_return
-    spread = "" if score.half_width is None else f" +- {score.half_width:.2g}"
-    return f"{score.mean:.4g}{spread} over {evaluation.episodes} episodes"

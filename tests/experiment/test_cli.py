@@ -14,7 +14,7 @@ import pytest
 
 from pgts_torch import experiment
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import strict_yaml
+from pgts_torch.experiment import strict_yaml, summary
 from pgts_torch.experiment.cli import COMMANDS, main
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import load
@@ -45,9 +45,6 @@ class FakeRun(types.ModuleType):
             raise self.error
         return Answer(0.5)
 
-    def describe(self, answer: Answer) -> str:
-        return f"mean: {answer.mean}"
-
 
 class FakeEvaluation(types.ModuleType):
     """Stands for the evaluation of a run, likewise."""
@@ -66,6 +63,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> FakeRun:
     fake = FakeRun()
     monkeypatch.setitem(sys.modules, "pgts_torch.experiment.run", fake)
     monkeypatch.setattr(experiment, "run", fake, raising=False)
+    monkeypatch.setattr(summary, "describe", lambda answer: f"mean: {answer.mean}")
     return fake
 
 

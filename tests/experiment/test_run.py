@@ -15,6 +15,7 @@ from pgts_torch.experiment import diagnostics, run
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import last_checkpoint
 from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
 from pgts_torch.tabular import exact, stationary
 from pgts_torch.tabular.ascent import mirror_step
@@ -206,7 +207,7 @@ def test_the_summary_states_exact_numbers(tmp_path):
     pi_SA = algorithm.policy.table()
     assert summary.J == exact.evaluate(algorithm.mdp, pi_SA).J
     assert summary.stationarity_gap == float(stationary.gap(algorithm.mdp, pi_SA, 4).max())
-    assert all(len(line) <= 80 for line in run.describe(summary).splitlines()[:-1])
+    assert all(len(line) <= 80 for line in describe(summary).splitlines()[:-1])
 
 
 def test_evaluation_runs_the_greedy_and_the_sampled_policy_to_the_time_limit():

@@ -18,6 +18,7 @@ from pgts_torch.experiment import run
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import evaluate_run, last_checkpoint
 from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import read_metrics
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -86,7 +87,7 @@ def test_a_network_run_leaves_a_whole_folder_and_claims_nothing_exact(tmp_path):
     assert (summary.J, summary.J_optimal, summary.stationarity_gap) == (None,) * 3
     assert json.loads((folder / "summary.json").read_text())["J"] is None
     assert set(EventAccumulator(str(folder)).Reload().Tags()["scalars"]) >= TAGS
-    text = run.describe(summary)
+    text = describe(summary)
     assert "optimal return" not in text
     assert all(len(line) <= 80 for line in text.splitlines()[:-1])
 

@@ -1,0 +1,172 @@
+"""What the command line is made of: its parser, the types of its arguments, and its answers."""
+
+import argparse
+import json
+import math
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.fields import INT64_MAX
+from pgts_torch.experiment.schema import Option
+
+WIDTH = 79
+
+
+class Parser(argparse.ArgumentParser):
+    """An argparse parser that reports a mistake in one line and takes no abbreviations."""
+
+    def __init__(self, name: str, function: Callable[..., Any], **settings: Any) -> None:
+        super().__init__(
+            prog=f"pgts {name}".strip(),
+            description=(function.__doc__ or "").partition("\n")[0],
+            allow_abbrev=False,
+            formatter_class=_Formatter,
+            **settings,
+        )
+
+    def print_help(self, file: Any = None) -> None:
+        """As argparse does, but without hiding that nobody reads."""
+        (file or sys.stdout).write(self.format_help())
+
+    def error(self, message: str) -> NoReturn:
+        raise PgtsError(f"{message} (see {self.prog} --help)")
+
+
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, width=WIDTH)
+
+
+def describe_options(options: Sequence[Option]) -> Iterator[str]:
+    """The keys of a configuration for --help, by section."""
+    yield "keys, each --KEY VALUE or --KEY=VALUE, with the value in YAML:"
+    yield from textwrap.wrap(
+        "A mapping replaces its whole section, as in --critic '{type: exact}'; a single key changes nothing but "
+        "itself. true may be left out.",
+        WIDTH,
+        initial_indent="  ",
+        subsequent_indent="  ",
+    )
+    section, when = None, ""
+    for option in options:
+        name = option.key.partition(".")[0] if "." in option.key else "general"
+        if name != section:
+            yield from ("", name)
+            when = ""
+        if option.when != when and option.when:
+            yield f"  with {option.when}:"
+        section, when = name, option.when
+        yield from _describe_option(option, "    " if option.when else "  ")
+
+
+def _describe_option(option: Option, indent: str) -> Iterator[str]:
+    deeper = indent + "    "
+    head = f"--{option.key}  {option.requirement} (default: {_value(option.default)})"
+    yield from textwrap.wrap(head, WIDTH, initial_indent=indent, subsequent_indent=deeper, break_on_hyphens=False)
+    yield from textwrap.wrap(option.meaning, WIDTH, initial_indent=deeper, subsequent_indent=deeper)
+    for value, meaning in option.choices:
+        yield from textwrap.wrap(
+            f"{value}: {meaning}", WIDTH, initial_indent=deeper + "  ", subsequent_indent=deeper + "    "
+        )
+
+
+def _value(value: Any) -> str:
+    """A default as it would be written on the command line."""
+    if isinstance(value, str):
+        return value
+    return f"{value:_}" if type(value) is int else json.dumps(value)
+
+
+def whole(least: int) -> Callable[[str], int]:
+    """An argparse type: a whole number of at least `least`, below 2**63."""
+
+    def convert(text: str) -> int:
+        if not (text.isascii() and text.isdecimal() and len(text) < 20 and least <= int(text) <= INT64_MAX):
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number >= {least} and below 2**63")
+        return int(text)
+
+    return convert
+
+
+def whole_list(text: str) -> tuple[int, ...]:
+    """An argparse type: whole numbers separated by commas."""
+    return tuple(whole(0)(part) for part in text.split(","))
+
+
+def depth_list(text: str) -> tuple[int | str, ...]:
+    """An argparse type: depths separated by commas, each a whole number or the word adaptive."""
+    return tuple(dict.fromkeys(part if part == "adaptive" else whole(0)(part) for part in text.split(",")))
+
+
+def json_object(text: str) -> dict[str, Any]:
+    """An argparse type: a JSON object."""
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        value = None
+    if not isinstance(value, dict):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a JSON object")
+    return value
+
+
+def share(text: str) -> float:
+    """An argparse type: a number in [0, 1]."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number in [0, 1]")
+    return value
+
+
+def start(text: str) -> int | str:
+    """An argparse type: a state, or the word uniform."""
+    if text == "uniform":
+        return text
+    try:
+        return whole(0)(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a state nor uniform") from None
+
+
+def output_folder(text: str) -> Path:
+    """An argparse type: a folder, or where one can be made."""
+    path = Path(text)
+    if path.exists() and not path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
+    return path
+
+
+def run_folder(text: str) -> Path:
+    """An argparse type: a folder with the configuration of a run in it."""
+    path = Path(text)
+    if not path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
+    if not (path / "config.yaml").is_file():
+        raise argparse.ArgumentTypeError(f"{text!r} is not the folder of a run: it has no config.yaml")
+    return path
+
+
+def print_values(answer: Mapping[str, Any], *, as_json: bool) -> None:
+    """Print named values, for a program or for a person."""
+    if as_json:
+        print(json.dumps(answer))
+        return
+    rows = list(_rows(answer))
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, value in rows:
+        print(f"{name:<{width}}  {value:.6g}" if isinstance(value, float) else f"{name:<{width}}  {value}")
+
+
+def _rows(answer: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted name, value) of nested values."""
+    for name, value in answer.items():
+        if isinstance(value, Mapping):
+            yield from _rows(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", "none" if value is None else value

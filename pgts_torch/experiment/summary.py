@@ -1,0 +1,67 @@
+"""What a finished run came to, for programs and for people."""
+
+import textwrap
+from dataclasses import dataclass
+from typing import Any
+
+from pgts_torch.agent.evaluate import Evaluation
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a finished run came to.
+
+    J, J_optimal: exact return of the trained policy and of the best one; None where nothing exact is known.
+    depth: m, the largest if it was adaptive.
+    search: how the lookahead was made, and why where it chose that itself.
+    stationarity_gap: max over visited states of the exact g_m; None likewise.
+    certificate: what the last iteration bounds J* - J^pi by; None: it knows no bound.
+    certificate_is_proved: whether that is a proof, because the critic is exact, or an estimate.
+    """
+
+    run: str
+    seed: int
+    depth: int
+    search: str
+    J: float | None
+    J_optimal: float | None
+    stationarity_gap: float | None
+    certificate: float | None
+    certificate_is_proved: bool
+    iterations: int
+    env_steps: int
+    model_calls: int
+    seconds: float
+    deterministic: Evaluation
+    sampled: Evaluation
+
+
+def describe(summary: Summary) -> str:
+    """The summary as a person reads it, within 80 columns."""
+    rows: dict[str, Any] = {}
+    if summary.J is not None and summary.J_optimal is not None:
+        share = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 <= summary.J else ""
+        rows |= {
+            "return of the policy, J": f"{summary.J:.4g}{share}",
+            "optimal return, J*": f"{summary.J_optimal:.4g}",
+            f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
+        }
+    if summary.certificate is not None:
+        kind = "proved" if summary.certificate_is_proved else "an estimate: the critic is learned"
+        rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({kind})"
+    rows |= {
+        "greedy episodes, return": _score_text(summary.deterministic),
+        "sampled episodes, return": _score_text(summary.sampled),
+        "search": textwrap.fill(summary.search, 50).replace("\n", "\n" + 28 * " "),
+        "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",
+        "model calls": summary.model_calls,
+        "seconds": f"{summary.seconds:.1f}",
+        "run folder": summary.run,
+    }
+    return "\n".join(f"{name:<28}{value}" for name, value in rows.items())
+
+
+def _score_text(evaluation: Evaluation) -> str:
+    score = evaluation.episodic_return
+    spread = "" if score.half_width is None else f" +- {score.half_width:.2g}"
+    return f"{score.mean:.4g}{spread} over {evaluation.episodes} episodes"
