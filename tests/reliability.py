@@ -16,6 +16,7 @@ RESULTS = ROOT / "tests" / "long_results.json"
 
 ONE_LINE = "one line for each mistake, exit code 2, nothing written"
 NAMED = "refused by name, exit code 2"
+DAMAGED = "noticed; the checkpoint before leads to the same bits, with a warning; `--strict-resume` refuses"
 STOPPED = "stops before the policy moves; checkpoints stay, `failure.json`, exit code 1"
 
 FAULTS: dict[str, dict[str, str]] = {
@@ -72,14 +73,39 @@ FAULTS: dict[str, dict[str, str]] = {
         "pickled payload in a saved model": "refused, not run",
         "foreign content in a saved model": "refused",
     },
+    "Checkpoints": {
+        "flipped bit in a checkpoint": DAMAGED,
+        "truncated checkpoint": DAMAGED,
+        "file of a checkpoint missing": DAMAGED,
+        "checkpoints mixed up": DAMAGED,
+        "damaged last checkpoint": DAMAGED,
+        "malicious pickle in a checkpoint": "refused, not run",
+        "checkpoint of another format": NAMED,
+        "another configuration at resume": "refused key by key, exit code 2, nothing lost",
+        "another shape at resume": "refused tensor by tensor, exit code 2, nothing lost",
+        "other versions at resume": "a warning names each; `--strict-resume` refuses",
+        "lost metrics": NAMED,
+        "disk full": "one line, exit code 2; what was saved stays, and the run goes on once there is room",
+        "read-only folder": NAMED,
+        "kill while a checkpoint is written": "the one before is intact",
+    },
     "Processes": {
+        "kill at any moment": "started again, the run ends with the bits of one that was never killed",
+        "SIGTERM": "the iteration is finished and saved, exit code 143",
+        "Ctrl-C": "the iteration is finished and saved, exit code 130",
+        "second Ctrl-C": "the process ends at once, exit code 130; the last checkpoint leads to the same bits",
+        "second process in a run folder": "told the id of the first, exit code 2",
+        "finished run": "says so, exit code 2; `--run.overwrite` starts anew",
         "folder that holds something else": "left as it is, exit code 2",
         "closed output": "the run goes on and is whole",
         "reader that leaves early": "exit code 141, no traceback",
         "no terminal": "plain lines in place of a progress bar",
         "C locale": "as in any other",
         "TensorBoard missing": "one line that says what to do, nothing written; `run.tensorboard: false` trains",
+    },
+    "Diagnostics": {
         "evaluation and logging": "on or off, the trained bits are the same",
+        "rendering": "on or off, the trained bits are the same",
     },
 }
 """By group: each fault, and what happens then."""
@@ -126,12 +152,16 @@ def document() -> str:
         "|---|---|",
     ]
     for name, result in sorted(json.loads(RESULTS.read_text(encoding="utf-8")).items()):
-        lines.append(f"| {name} | {', '.join(f'{key} {value}' for key, value in result.items())} |")
+        lines.append(f"| {name} | {_listing(result)} |")
     return "\n".join(lines) + "\n"
 
 
 def _sentence(test: str) -> str:
     return test.partition("::test_")[2].replace("_", " ")
+
+
+def _listing(result: dict[str, float]) -> str:
+    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in result.items())
 
 
 def record(name: str, **result: float) -> None:

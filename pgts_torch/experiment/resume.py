@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
+from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.config import Config
@@ -30,6 +33,20 @@ class Start:
     path: Path
     notes: checkpoint.Notes
     state: Mapping[str, Any]
+
+    def check(self, algorithm: PGTS) -> None:
+        """PgtsError, naming each tensor, where the algorithm has others: its environment is no longer what it was."""
+        parts = ("policy", "critic", "update")  # what a search remembers grows
+        now, before = (
+            dict(_flat("", {part: state[part] for part in parts})) for state in (algorithm.state_dict(), self.state)
+        )
+        lines = [
+            f"{name} has the shape {tuple(here.shape)}; in {self.path} it is {tuple(there.shape)}"
+            for name, here in now.items()
+            if isinstance(here, Tensor) and isinstance(there := before.get(name), Tensor) and here.shape != there.shape
+        ]
+        if lines:
+            raise PgtsError("\n".join([*lines, f"the environment has changed since; {_ADVICE}"]))
 
 
 def find(config: Config, run: Path, *, strict: bool) -> Start | None:

@@ -102,6 +102,7 @@ def train(config: Config, *, strict_resume: bool = False) -> Summary:
         if start is None:
             clear_folder(path)
         else:
+            start.check(algorithm)
             checkpoint.tidy(path, start.path, keep=config.log.keep)
             algorithm.load_state_dict(dict(start.state))
             print(f"going on from {start.path}", file=sys.stderr)

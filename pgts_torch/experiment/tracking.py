@@ -6,6 +6,9 @@ import math
 import os
 import platform
 import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
@@ -37,6 +40,9 @@ class RunFolder:
         tensorboard: write events beside metrics.jsonl.
         metrics_bytes: what is kept of metrics.jsonl; the rest is cut off.
         after_step: the last step whose events are kept; TensorBoard hides later ones of a process that was killed.
+
+    Raises:
+        PgtsError: from all that writes, if the disk is full.
     """
 
     def __init__(self, path: Path, *, tensorboard: bool, metrics_bytes: int = 0, after_step: int | None = None) -> None:
@@ -46,20 +52,43 @@ class RunFolder:
         self._metrics = (path / METRICS_FILE).open("ab", buffering=0)
         self._metrics.truncate(metrics_bytes)
         purge_step = None if after_step is None else after_step + 1
-        self._events = event_writer()(str(path), purge_step=purge_step) if tensorboard else None
+        self._thread_hook = threading.excepthook
+        with self._writing("events"):
+            self._events = event_writer()(str(path), purge_step=purge_step) if tensorboard else None
 
     def __enter__(self) -> Self:
+        threading.excepthook = self._hear
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._metrics.close()
-        if self._events is not None:
-            self._events.close()
+        try:
+            if self._events is not None:
+                with self._writing("events"):
+                    self._events.close()
+        except PgtsError:
+            if error is None:
+                raise
+        finally:
+            threading.excepthook = self._thread_hook
+
+    def _hear(self, failed: threading.ExceptHookArgs) -> None:
+        """The thread that writes events cannot: it raises that again in ours, where it is said in one line."""
+        if not isinstance(failed.exc_value, OSError):
+            self._thread_hook(failed)
+
+    @contextmanager
+    def _writing(self, what: str) -> Iterator[None]:
+        """PgtsError where something cannot be written."""
+        try:
+            yield
+        except OSError as error:
+            raise PgtsError(f"{self.path / what} cannot be written to: {error.strerror}") from error
 
     def log(self, step: int, tags: dict[str, float]) -> None:
-        """One line of metrics.jsonl, and the same numbers as TensorBoard scalars; PgtsError if the disk is full."""
+        """One line of metrics.jsonl, and the same numbers as TensorBoard scalars."""
         line = {"step": step} | {tag: value if math.isfinite(value) else None for tag, value in tags.items()}
         raw = json.dumps(line).encode() + b"\n"
         try:
@@ -69,14 +98,17 @@ class RunFolder:
         if not whole:
             raise PgtsError(f"{self.path / METRICS_FILE} cannot be written to at step {step}; is the disk full?")
         if self._events is not None:
-            for tag, value in tags.items():
-                self._events.add_scalar(tag, value, step)
+            with self._writing("events"):
+                for tag, value in tags.items():
+                    self._events.add_scalar(tag, value, step)
 
     def flush(self) -> int:
         """Have all that was logged on the disk; how many bytes metrics.jsonl holds."""
-        os.fsync(self._metrics.fileno())
+        with self._writing(METRICS_FILE):
+            os.fsync(self._metrics.fileno())
         if self._events is not None:
-            self._events.flush()
+            with self._writing("events"):
+                self._events.flush()
         return os.fstat(self._metrics.fileno()).st_size
 
     def text(self, name: str, content: str) -> None:
@@ -85,9 +117,11 @@ class RunFolder:
 
     def picture(self, name: str, figure: Figure, step: int) -> None:
         """`name`.png, and the same picture in TensorBoard."""
-        figure.savefig(self.path / f"{name}.png", dpi=120)
+        with self._writing(f"{name}.png"):
+            figure.savefig(self.path / f"{name}.png", dpi=120)
         if self._events is not None:
-            self._events.add_figure(name, figure, step)
+            with self._writing("events"):
+                self._events.add_figure(name, figure, step)
 
 
 def event_writer() -> "type[SummaryWriter]":

@@ -49,6 +49,7 @@ def test_the_marks_of_a_training_that_is_taken_up_again_are_the_same(tmp_path):
     assert second.history == whole.history
 
 
+@pytest.mark.fault("evaluation and logging")
 @pytest.mark.parametrize("env", ["pgts/Ladder-v0", "FrozenLake-v1", "CartPole-v1"])
 def test_evaluations_leave_every_bit_of_the_training_as_it_is(env):
     seen: dict[str, list] = {"quiet": [], "watched": []}
@@ -62,6 +63,21 @@ def test_evaluations_leave_every_bit_of_the_training_as_it_is(env):
     assert all(same_bits(*pair) for pair in zip(seen["quiet"], seen["watched"], strict=True))
     assert same_weights(quiet, watched)
     assert not same_weights(quiet, other)
+
+
+@pytest.mark.fault("rendering")
+@pytest.mark.parametrize("env", ["pgts/Ladder-v0", "FrozenLake-v1", "CartPole-v1"])
+def test_rendering_leaves_every_bit_of_the_training_as_it_is(env):
+    if not env.startswith("pgts/"):
+        pytest.importorskip("pygame")
+    pictures = []
+    short = {"depth": 1, "num_envs": 3, "horizon": {"type": "fixed", "length": 8}}
+    unseen, drawn = make(env, **short), make(env, **short, env_kwargs={"render_mode": "rgb_array"})
+    unseen.learn(60)
+    drawn.learn(60, callback=lambda model, made: pictures.extend(model.world.env.render()))
+    assert len(pictures) == 3 * drawn.num_iterations
+    assert pictures[0].ndim == 3
+    assert same_weights(unseen, drawn)
 
 
 def test_training_ends_when_the_evaluated_return_is_high_enough():

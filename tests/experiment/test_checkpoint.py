@@ -17,6 +17,7 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.checkpoint import MANIFEST_FILE, MODEL_FILE, Damaged, Notes
+from tests import reliability
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -61,6 +62,7 @@ def test_the_newest_are_kept_and_those_ahead_are_removed(tmp_path):
     assert [int(path.name) for path in checkpoint.listed(tmp_path)] == [35]
 
 
+@pytest.mark.fault("flipped bit in a checkpoint")
 @pytest.mark.parametrize("flips", [400, pytest.param(3000, marks=pytest.mark.long)])
 def test_no_flipped_bit_is_accepted(flips, tmp_path):
     [path] = written(tmp_path, 10)
@@ -75,8 +77,11 @@ def test_no_flipped_bit_is_accepted(flips, tmp_path):
             checkpoint.read(path)
         (path / name).write_bytes(whole[name])
     checkpoint.read(path)
+    if flips >= 3000:
+        reliability.record("flipped bits in a checkpoint", flipped=flips, accepted=0)
 
 
+@pytest.mark.fault("truncated checkpoint", "file of a checkpoint missing")
 @pytest.mark.parametrize("cuts", [60, pytest.param(400, marks=pytest.mark.long)])
 def test_no_missing_end_no_longer_end_and_no_missing_file_is_accepted(cuts, tmp_path):
     [path] = written(tmp_path, 10)
@@ -93,8 +98,11 @@ def test_no_missing_end_no_longer_end_and_no_missing_file_is_accepted(cuts, tmp_
             checkpoint.read(path)
         (path / name).write_bytes(whole)
     checkpoint.read(path)
+    if cuts >= 400:
+        reliability.record("truncated checkpoints", truncated=2 * len(lengths), accepted=0)
 
 
+@pytest.mark.fault("checkpoints mixed up")
 def test_the_model_of_another_checkpoint_is_not_accepted(tmp_path):
     first, _ = written(tmp_path, 10)[0], (algorithm := model()).iterate()
     second = checkpoint.write(tmp_path, algorithm, notes(20), keep=9)
@@ -113,6 +121,7 @@ class Bomb:
         return open, (str(self.path), "w")
 
 
+@pytest.mark.fault("malicious pickle in a checkpoint")
 def test_a_pickle_is_not_executed_even_where_all_checksums_are_right(tmp_path):
     trace, [path] = tmp_path / "trace", written(tmp_path, 10)
     torch.save({"arguments": Bomb(trace), "state": {}}, tmp_path / "bomb")
@@ -129,6 +138,7 @@ def test_a_pickle_is_not_executed_even_where_all_checksums_are_right(tmp_path):
     assert trace.exists()
 
 
+@pytest.mark.fault("checkpoint of another format")
 def test_another_format_is_named(tmp_path):
     [path] = written(tmp_path, 10)
     content = json.loads((path / MANIFEST_FILE).read_text())["content"] | {"format": 7}
@@ -138,6 +148,7 @@ def test_another_format_is_named(tmp_path):
     assert not isinstance(raised.value, Damaged)
 
 
+@pytest.mark.fault("damaged last checkpoint")
 def test_the_one_before_a_damaged_checkpoint_is_used_with_a_warning_unless_that_is_refused(tmp_path, capsys):
     first, second = written(tmp_path, 10, 20)
     (second / MODEL_FILE).write_bytes(b"")
@@ -151,6 +162,7 @@ def test_the_one_before_a_damaged_checkpoint_is_used_with_a_warning_unless_that_
         checkpoint.newest(tmp_path)
 
 
+@pytest.mark.fault("disk full")
 def test_a_disk_that_is_full_leaves_the_others_as_they_are(tmp_path, monkeypatch):
     [path] = written(tmp_path, 10)
 
@@ -164,6 +176,7 @@ def test_a_disk_that_is_full_leaves_the_others_as_they_are(tmp_path, monkeypatch
     checkpoint.read(path)
 
 
+@pytest.mark.fault("kill while a checkpoint is written")
 def test_what_was_left_half_written_is_removed(tmp_path):
     [path] = written(tmp_path, 10)
     (tmp_path / "checkpoints" / ".000000000020.partial").mkdir()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.experiment import checkpoint, run
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.tracking import read_metrics
+from tests import reliability
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -110,22 +112,26 @@ def whole(tmp_path_factory) -> tuple[dict[str, Any], int]:
     return left(folder / "run"), int((folder / "calls").read_text())
 
 
+@pytest.mark.fault("kill at any moment")
 @pytest.mark.parametrize("kills", [3, pytest.param(25, marks=pytest.mark.long)])
 def test_after_kills_at_random_moments_every_byte_is_that_of_an_uninterrupted_run(kills, whole, tmp_path):
     expected, calls = whole
     random = np.random.default_rng(kills)
-    killed, folder = 0, tmp_path / "0"
+    killed, compared, folder = 0, 1, tmp_path / "0"
     while killed < kills:
         code = training(folder, kill_at=int(random.integers(1, calls // 2)))
         assert code in (0, -signal.SIGKILL)
         killed += code != 0
         if code == 0:
             assert left(folder) == expected
-            folder = tmp_path / str(killed)
+            compared, folder = compared + 1, tmp_path / str(killed)
     assert training(folder) in (0, 2)  # 2: it was finished already
     assert left(folder) == expected
+    if kills >= 25:
+        reliability.record("kills at random moments of training", kills=killed, runs=compared, runs_with_another_bit=0)
 
 
+@pytest.mark.fault("kill while a checkpoint is written")
 @pytest.mark.parametrize("kills", [2, pytest.param(25, marks=pytest.mark.long)])
 def test_after_kills_while_a_checkpoint_is_written_the_one_before_is_intact(kills, whole, tmp_path, monkeypatch):
     random, write, calls, kill_at = np.random.default_rng(0), checkpoint.write, 0, 0
@@ -151,8 +157,11 @@ def test_after_kills_while_a_checkpoint_is_written_the_one_before_is_intact(kill
             assert checkpoint.newest(folder, strict=True) is not None
     assert training(folder) == 0
     assert left(folder) == whole[0]
+    if kills >= 25:
+        reliability.record("kills while a checkpoint is written", kills=kills, checkpoints_lost=0)
 
 
+@pytest.mark.fault("SIGTERM", "Ctrl-C")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_finishes_the_iteration_saves_and_says_how_to_go_on(number, code, whole, tmp_path, capfd):
     folder = tmp_path / "run"
@@ -165,6 +174,7 @@ def test_a_signal_finishes_the_iteration_saves_and_says_how_to_go_on(number, cod
     assert left(folder) == whole[0]
 
 
+@pytest.mark.fault("second Ctrl-C")
 def test_a_second_signal_ends_the_process_at_once(whole, tmp_path, capfd):
     folder = tmp_path / "run"
     assert signalled(folder, signal.SIGINT, signal.SIGINT) == 130
@@ -174,6 +184,30 @@ def test_a_second_signal_ends_the_process_at_once(whole, tmp_path, capfd):
     assert left(folder) == whole[0]
 
 
+@pytest.mark.fault("disk full")
+@pytest.mark.parametrize(
+    ("most_bytes", "named"), [(3_000, "model.pt cannot be written"), (8_000, "events cannot be written to")]
+)
+def test_a_file_that_cannot_grow_is_one_line_and_with_more_room_the_run_goes_on(most_bytes, named, tmp_path, capfd):
+    folder = tmp_path / "run"
+    steps = ["--total_steps", "600", "--rollout.num_envs", "4", "--rollout.horizon.length", "15"]
+    ladder = ["train", *steps, "--eval.episodes", "2", "--log.checkpoint_every", "1", "--run.dir", str(folder)]
+
+    def short_of_room() -> int:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+        return main(ladder)
+
+    assert in_child(short_of_room) == 2
+    complaint = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("step ")]
+    assert len(complaint) == 2  # one of them says that there was no --config
+    assert complaint[1].startswith(f"error: {folder}/")
+    assert complaint[1].endswith(f"{named}: File too large")
+    assert (checkpoint.newest(folder, strict=True) is None) == ("model.pt" in named)
+    assert main(ladder) == 0
+    assert [line["step"] for line in read_metrics(folder)] == list(range(60, 601, 60))
+
+
+@pytest.mark.fault("SIGTERM")
 def test_the_command_stops_at_a_signal_and_goes_on(tmp_path):
     command = [sys.executable, "train.py", *arguments(tmp_path / "run")[1:], "--total_steps", "100000"]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:

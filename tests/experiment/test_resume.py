@@ -95,6 +95,7 @@ def same_bits(first: Any, second: Any) -> bool:
     return first == second or (first != first and second != second)
 
 
+@pytest.mark.fault("kill at any moment")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_training_cut_off_anywhere_ends_with_the_bits_of_one_that_was_not(kind, tmp_path, monkeypatch):
     if kind == "simulator":
@@ -108,6 +109,7 @@ def test_a_training_cut_off_anywhere_ends_with_the_bits_of_one_that_was_not(kind
     assert same_bits(left(tmp_path / "whole"), left(tmp_path / "cut"))
 
 
+@pytest.mark.fault("kill at any moment")
 def test_tensorboard_shows_every_step_once_and_evaluations_and_the_best_model_are_the_same(tmp_path, monkeypatch):
     run.train(configured(tmp_path / "whole", *WATCHED))
     config = configured(tmp_path / "cut", *WATCHED)
@@ -138,6 +140,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in files}
 
 
+@pytest.mark.fault("another configuration at resume")
 def test_another_configuration_is_refused_key_by_key_and_nothing_is_lost(cut, capsys):
     before = content(cut)
     other = [
@@ -165,6 +168,27 @@ def test_another_configuration_is_refused_key_by_key_and_nothing_is_lost(cut, ca
     assert content(cut) == before
 
 
+@pytest.mark.fault("another shape at resume")
+def test_an_environment_of_another_size_is_refused_tensor_by_tensor_and_nothing_is_lost(cut, monkeypatch, capsys):
+    before, build = content(cut), run.build
+
+    def build_larger(config: Config) -> PGTS:
+        return build(config.model_copy(update={"env": config.env.model_copy(update={"kwargs": {"n": 7}})}))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "build", build_larger)
+        assert main(arguments()) == 2
+    where = "in cut/checkpoints/000000000120 it is"
+    assert capsys.readouterr().err.splitlines()[1:] == [
+        f"error: policy.logits_SA has the shape (7, 2); {where} (5, 2)",
+        f"error: critic.value_C has the shape (7,); {where} (5,)",
+        f"error: critic.count_C has the shape (7,); {where} (5,)",
+        "error: the environment has changed since; choose another folder, or set run.overwrite",
+    ]
+    assert content(cut) == before
+    assert main(arguments()) == 0
+
+
 def test_what_no_bit_of_training_depends_on_may_differ(cut, tmp_path, capsys):
     assert main(arguments("--name", "x", "--log.keep", "1", "--log.every", "2", "--eval.every", "60")) == 0
     assert "going on from cut/checkpoints/000000000120" in capsys.readouterr().err
@@ -174,6 +198,7 @@ def test_what_no_bit_of_training_depends_on_may_differ(cut, tmp_path, capsys):
     assert load(cut / "config.yaml").name == "x"
 
 
+@pytest.mark.fault("finished run")
 def test_a_run_goes_on_by_its_folder_alone_and_then_is_finished(cut, capsys):
     moved = cut.rename("moved")
     assert main(["train", "--resume", "moved", "--json"]) == 0
@@ -196,12 +221,14 @@ def test_what_the_run_says_itself_is_not_said_again(given, cut, capsys):
     assert capsys.readouterr().err == mistake
 
 
+@pytest.mark.fault("finished run")
 def test_overwriting_starts_anew(cut):
     assert main(arguments("--run.overwrite", "--seed", "1")) == 0
     assert [line["step"] for line in read_metrics(cut)] == [60, 120, 180, 240, 300]
     assert load(cut / "config.yaml").seed == 1
 
 
+@pytest.mark.fault("damaged last checkpoint")
 def test_after_a_damaged_checkpoint_the_one_before_leads_to_the_same_bits(cut, tmp_path, capsys):
     newest = checkpoint.listed(cut)[-1]
     (newest / checkpoint.MODEL_FILE).write_bytes(b"")
@@ -217,12 +244,14 @@ def test_after_a_damaged_checkpoint_the_one_before_leads_to_the_same_bits(cut, t
     assert same_bits(left(cut), left(tmp_path / "whole"))
 
 
+@pytest.mark.fault("lost metrics")
 def test_lost_metrics_are_noticed(cut, capsys):
     (cut / "metrics.jsonl").write_bytes((cut / "metrics.jsonl").read_bytes()[:100])
     assert main(arguments()) == 2
     assert "cut/metrics.jsonl has 100 bytes; it had " in capsys.readouterr().err
 
 
+@pytest.mark.fault("other versions at resume")
 def test_other_versions_are_a_warning_or_refused(cut, monkeypatch, capsys):
     now = tracking.versions()
     monkeypatch.setattr(resume, "versions", lambda: now | {"torch": "0.1"})
@@ -233,6 +262,7 @@ def test_other_versions_are_a_warning_or_refused(cut, monkeypatch, capsys):
     assert f"warning: {line}: the last bits may differ\n" in capsys.readouterr().err
 
 
+@pytest.mark.fault("read-only folder")
 def test_a_folder_that_cannot_be_written_to_is_named(tmp_path, monkeypatch, capsys):
     def read_only(path: Path, *args: Any, **kwargs: Any) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
@@ -243,6 +273,7 @@ def test_a_folder_that_cannot_be_written_to_is_named(tmp_path, monkeypatch, caps
     assert capsys.readouterr().err.splitlines()[1:] == [mistake]
 
 
+@pytest.mark.fault("disk full")
 def test_a_disk_that_is_full_ends_the_training_and_the_checkpoint_stays(cut, monkeypatch, capsys):
     log = RunFolder.log
     with Path("/dev/full").open("ab", buffering=0) as full, monkeypatch.context() as patch:
@@ -268,6 +299,7 @@ def test_slow_iterations_are_saved_more_often(tmp_path, monkeypatch):
     assert [len(checkpoint.listed(tmp_path / name)) for name in ("slow", "last")] == [5, 1]
 
 
+@pytest.mark.fault("second process in a run folder")
 def test_a_second_process_is_told_who_has_the_folder(cut, capsys):
     before = content(cut)
     with tracking.RunLock(cut):
