@@ -326,6 +326,10 @@ class SearchConfig(Section):
     max_nodes: Count = 10_000_000
     """The most nodes of one search. One that needs more is narrowed by auto and refused by the others."""
 
+    max_bytes: Count = 4 * 2**30
+    """The most memory that the outcomes and nodes of one search may take; at its peak it needs about three times as
+    much. One that needs more is treated likewise, before it takes it."""
+
     max_width: Count | None = None
     """The most states of a level that are unfolded; null: all. Only with search.kind expectimax."""
 
@@ -344,7 +348,7 @@ class SearchConfig(Section):
 
     def description(self) -> dict[str, Any]:
         """The search as `agent.build` reads it."""
-        given = {name: getattr(self, name) for name in ("max_nodes", *SEARCH_OPTIONS)}
+        given = {name: getattr(self, name) for name in ("max_nodes", "max_bytes", *SEARCH_OPTIONS)}
         return {"type": self.kind} | {name: value for name, value in given.items() if value is not None}
 
     @field_validator(*SEARCH_OPTIONS)

@@ -10,7 +10,7 @@ from pgts_torch.errors import NodeBudgetExceeded, RandomOutcomes
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.engine import SampledSearch, Search
 from pgts_torch.search.expectimax import expectimax
-from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead
+from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaf, Leaves, Lookahead
 from pgts_torch.search.topology import Topology, tree_nodes
 
 MOST_SAMPLES = 32
@@ -31,6 +31,7 @@ class AutoSearch(Search):
     Args:
         model: what is asked.
         max_nodes: the most nodes of one search.
+        max_bytes: the most memory that its outcomes may take.
 
     Raises:
         NodeBudgetExceeded: from a search, where even one state a level, or one sample of each action, is too much.
@@ -38,10 +39,10 @@ class AutoSearch(Search):
 
     choices = ("_width", "_too_much", "_samples", "_most_asked", "_picked")
 
-    def __init__(self, model: Model, *, max_nodes: int = MAX_NODES) -> None:
+    def __init__(self, model: Model, *, max_nodes: int = MAX_NODES, max_bytes: int = MAX_BYTES) -> None:
         super().__init__(model)
-        self.max_nodes = max_nodes
-        self.topology = Topology(model) if isinstance(model, EnumeratingModel) else None
+        self.max_nodes, self.max_bytes = max_nodes, max_bytes
+        self.topology = Topology(model, max_bytes=max_bytes) if isinstance(model, EnumeratingModel) else None
         self._width = max(1, max_nodes)
         self._too_much: tuple[int, int] | None = None
         self._samples = 0
@@ -128,9 +129,10 @@ class AutoSearch(Search):
         self._samples = max(self._samples, 1)
         while True:
             try:
-                look = SampledSearch(self.model, samples=self._samples, max_nodes=self.max_nodes)(
-                    root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, generator=generator
+                search = SampledSearch(
+                    self.model, samples=self._samples, max_nodes=self.max_nodes, max_bytes=self.max_bytes
                 )
+                look = search(root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, generator=generator)
                 break
             except NodeBudgetExceeded:
                 if self._samples == 1:
@@ -147,7 +149,7 @@ class AutoSearch(Search):
 
     def forget(self) -> None:
         if self.topology is not None:
-            self.topology = Topology(self.topology.model)
+            self.topology = self.topology.anew()
 
     def __str__(self) -> str:
         return self._picked

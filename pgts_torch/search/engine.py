@@ -13,7 +13,7 @@ from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.empirical import Drawn, Share
 from pgts_torch.search.expectimax import expectimax
-from pgts_torch.search.lookahead import MAX_NODES, Leaf, Lookahead, check_finite
+from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaf, Lookahead, check_finite
 from pgts_torch.search.mcts import mcts
 from pgts_torch.search.sampled import sampled
 from pgts_torch.search.topology import Topology
@@ -105,14 +105,21 @@ class ExpectimaxSearch(Search):
         model: lists outcomes.
         max_nodes: the most nodes of one search.
         max_width: the most states of a level that are unfolded. Default: all.
+        max_bytes: the most memory that the outcomes of one search may take.
     """
 
     keeps_bounds = True
 
-    def __init__(self, model: Model, *, max_nodes: int = MAX_NODES, max_width: int | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        *,
+        max_nodes: int = MAX_NODES,
+        max_width: int | None = None,
+        max_bytes: int = MAX_BYTES,
+    ) -> None:
         super().__init__(model)
-        self._model = listing(model, "expectimax")
-        self.topology: Topology = Topology(self._model)
+        self.topology: Topology = Topology(listing(model, "expectimax"), max_bytes=max_bytes)
         self.max_nodes, self.max_width = max_nodes, max_width
 
     def _look(
@@ -130,7 +137,7 @@ class ExpectimaxSearch(Search):
         )
 
     def forget(self) -> None:
-        self.topology = Topology(self._model)
+        self.topology = self.topology.anew()
 
     def __str__(self) -> str:
         return "expectimax" if self.max_width is None else f"expectimax, {self.max_width} states a level"
@@ -145,6 +152,7 @@ class SampledSearch(Search):
         samples: outcomes of each (state, action), one number or one for each level.
         share: what shares them, "none", "level" or "search".
         max_nodes: the most nodes of one search.
+        max_bytes: the most memory that its outcomes may take.
     """
 
     keeps_bounds = False
@@ -156,10 +164,11 @@ class SampledSearch(Search):
         samples: int | Sequence[int | None] = DEFAULT_SAMPLES,
         share: Share = "level",
         max_nodes: int = MAX_NODES,
+        max_bytes: int = MAX_BYTES,
     ) -> None:
         super().__init__(model)
         self._model = drawing(model, "sampled")
-        self.samples, self.share, self.max_nodes = samples, share, max_nodes
+        self.samples, self.share, self.max_nodes, self.max_bytes = samples, share, max_nodes, max_bytes
 
     def _look(
         self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator
@@ -175,6 +184,7 @@ class SampledSearch(Search):
             generator=generator,
             replicates=0,
             max_nodes=self.max_nodes,
+            max_bytes=self.max_bytes,
         )
 
     def forget(self) -> None:
@@ -195,6 +205,7 @@ class MCTSSearch(Search):
         samples: how many drawn outcomes of each action stand for all, anew in each search. Default: all are listed, or
             4 where the model only draws.
         max_nodes: the most nodes of one search.
+        max_bytes: the most memory that its nodes and the outcomes of their states may take.
     """
 
     def __init__(
@@ -205,14 +216,15 @@ class MCTSSearch(Search):
         merge: bool = True,
         samples: int | None = None,
         max_nodes: int = MAX_NODES,
+        max_bytes: int = MAX_BYTES,
     ) -> None:
         super().__init__(model)
-        self.simulations, self.merge, self.max_nodes = simulations, merge, max_nodes
+        self.simulations, self.merge, self.max_nodes, self.max_bytes = simulations, merge, max_nodes, max_bytes
         if samples is not None and samples < 1:
             raise PgtsError(f"samples is {samples}; it must be at least 1")
         lists = samples is None and isinstance(model, EnumeratingModel)
         self.keeps_bounds = lists
-        self.topology = Topology(listing(model, "mcts")) if lists else None
+        self.topology = Topology(listing(model, "mcts"), max_bytes=max_bytes) if lists else None
         self.samples = samples or DEFAULT_SAMPLES
         if not lists:
             drawing(model, "mcts")
@@ -223,7 +235,8 @@ class MCTSSearch(Search):
         topology, calls_each = self.topology, 1
         if topology is None:
             key = draw_keys(1, generator=generator).to(self.model.device)
-            topology = Topology(Drawn(drawing(self.model, "mcts"), samples=self.samples, key=key))
+            drawn = Drawn(drawing(self.model, "mcts"), samples=self.samples, key=key)
+            topology = Topology(drawn, max_bytes=self.max_bytes, num_outcomes=self.samples)
             calls_each = self.samples
         look = mcts(
             topology.model,
@@ -241,7 +254,7 @@ class MCTSSearch(Search):
 
     def forget(self) -> None:
         if self.topology is not None:
-            self.topology = Topology(self.topology.model)
+            self.topology = self.topology.anew()
 
     def __str__(self) -> str:
         drawn = "" if self.topology is not None else f", {self.samples} drawn outcomes of each action"

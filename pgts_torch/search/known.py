@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NodeBudgetExceeded, PgtsError
 from pgts_torch.search.lookahead import Leaf, Leaves
-from pgts_torch.search.topology import Topology, counting
+from pgts_torch.search.topology import Topology, counting, gib, table_bytes
 
 _FAIR = 1e-3
 """By how much the probabilities of a prior may miss 1."""
@@ -28,10 +28,11 @@ class KnownStates:
     shut_outcome_TE, shut_action_TA, shut_T: 0, or -inf where an outcome, all outcomes of an action or all outcomes of
         the state have no weight.
     outcomes_T, width_TA: how many outcomes of the state, and of each action, have weight.
+    max_bytes: the topology's: the most memory that the tables and the nodes of the search may take.
     """
 
     def __init__(self, topology: Topology, leaves: Leaves, prior: Leaf | None) -> None:
-        self._topology, self._leaves, self._prior = topology, leaves, prior
+        self._topology, self._leaves, self._prior, self.max_bytes = topology, leaves, prior, topology.max_bytes
         model = topology.model
         self.num_actions, self.num_outcomes = model.num_actions, 1
         self.device, self.dtype = model.device, model.dtype
@@ -48,17 +49,36 @@ class KnownStates:
         self.prob_TE, self.child_TE = none(A, dtype=torch.float64), none(A, dtype=torch.int64)
         self.v_T, self.shut_T, self.outcomes_T = none(), none(), none(dtype=torch.int64)
 
-    def rows(self, state_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+    def rows(self, state_N: Int[Tensor, "N"], *, beside: int = 0) -> Int[Tensor, "N"]:
         """Where these states stand in the tables; those that are new are asked about first, together.
+
+        Args:
+            beside: how many bytes the nodes of the search take.
 
         Raises:
             PgtsError: the model, the critic or the prior answers with something that cannot be used.
+            NodeBudgetExceeded: see `check_memory`; the model has not been asked.
         """
         row_N = self.row_S.index_select(0, state_N)
         if int(row_N.amin()) < 0:
-            self._learn(state_N[row_N < 0].unique())
+            new_N = state_N[row_N < 0].unique()
+            self.check_memory(len(new_N), beside)
+            self._learn(new_N)
             row_N = self.row_S.index_select(0, state_N)
+        else:
+            self.check_memory(0, beside)
         return row_N
+
+    def check_memory(self, new: int, beside: int) -> None:
+        """NodeBudgetExceeded if so many more states, and so many bytes beside the states, are too much."""
+        A, K, limit = self.num_actions, self._topology.num_outcomes, self.max_bytes
+        states = state_bytes(self.count + new, A, K, self.dtype)
+        if states + beside > limit:
+            raise NodeBudgetExceeded(
+                f"the search would take {gib(states + beside)}: {gib(beside)} for its nodes and {gib(states)} for "
+                f"{self.count + new} states of {A} actions and {K} outcomes of each; the limit is {gib(limit)}: lower "
+                "the simulations, ask for fewer roots or raise max_bytes"
+            )
 
     def _learn(self, state_N: Int[Tensor, "N"]) -> None:
         with torch.inference_mode(False), torch.no_grad():
@@ -126,6 +146,14 @@ class KnownStates:
             n = int(off_N.nonzero()[0, 0])
             raise PgtsError(f"the prior of state {int(state_N[n])} is {prior_NA[n].tolist()}; it is no distribution")
         return prior_NA
+
+
+def state_bytes(num_states: int, num_actions: int, num_outcomes: int, dtype: torch.dtype) -> int:
+    """How much memory the tables of `KnownStates` and the outcomes of their states take."""
+    s, A, E = dtype.itemsize, num_actions, num_actions * num_outcomes
+    return num_states * (2 * s + 8 + A * (4 * s + 8) + E * (4 * s + 16)) + table_bytes(
+        num_states, num_actions, num_outcomes, dtype
+    )
 
 
 def longer(x_N: Tensor, rows: int) -> Tensor:

@@ -81,14 +81,16 @@ def mcts(
             estimate q_0 and the returns G_i seen, which does not converge to T^m Q; its `pruned_BA` is inf.
         merge: a node is a (level, state), shared by all paths and roots. What a simulation could not update is
             backed up at the end.
-        topology: what earlier searches of the same model found; this search adds to it. Default: a fresh one.
+        topology: what earlier searches of the same model found; this search adds to it. Its `max_bytes` is the most
+            memory that the search may take. Default: a fresh one.
         generator: of the Gumbel noise, one number a search. Default: no noise.
         max_nodes: the most nodes, summed over levels: those that the critic valued count too.
 
     Raises:
         PgtsError: an option that makes no sense or is ignored by the others, roots that are no states, leaf values of a
             wrong shape or not finite (naming the state), a prior that is no distribution.
-        NodeBudgetExceeded: more than `max_nodes` would be needed.
+        NodeBudgetExceeded: more than `max_nodes` would be needed; or what is to be expanded next would not fit into
+            `max_bytes`, and the model has not been asked about it.
     """
     _check(simulations, root, rule, exploration, wave, prior, backup, merge, generator)
     leaves = Leaves(model, depth, q_leaf, v_leaf)

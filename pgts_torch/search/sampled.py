@@ -12,7 +12,7 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.empirical import Empirical, Share
 from pgts_torch.search.expectimax import expectimax
-from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead, check_states, check_vector
+from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaf, Leaves, Lookahead, check_states, check_vector
 from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import draw_keys, mix, uniform
 
@@ -36,6 +36,7 @@ def sampled(
     generator: torch.Generator,
     replicates: int = 32,
     max_nodes: int = MAX_NODES,
+    max_bytes: int = MAX_BYTES,
 ) -> Lookahead:
     """An estimate of (T^m Q)(s, .) at the roots for m = depth: T^m Q in the MDP of the sampled outcomes.
 
@@ -67,13 +68,14 @@ def sampled(
         generator: gives one key, from which all samples of this search follow.
         replicates: R of the bootstrap: 0, or at least 2.
         max_nodes: the most nodes, summed over levels; the samples of a level are drawn before its children are counted.
+        max_bytes: the most memory that the outcomes may take; those of a level are estimated before they are drawn.
 
     Returns:
         `model_calls` counts each (state, action, sample), and one for a (state, action) whose outcomes are listed.
 
     Raises:
         PgtsError: as `expectimax`; C below 1; several C with share="search"; a model that cannot do what is asked.
-        NodeBudgetExceeded: more than `max_nodes` would be needed.
+        NodeBudgetExceeded: more than `max_nodes` or `max_bytes` would be needed.
     """
     leaves = Leaves(model, depth, q_leaf, v_leaf)
     check_vector(root_B)
@@ -89,9 +91,14 @@ def sampled(
         return Lookahead(q_BA, zero_BA, zero_BA, 0, critic_calls=leaves.calls, nodes_per_level=(len(roots),))
     if all(C is None for C in plan):
         assert isinstance(model, EnumeratingModel)
-        return expectimax(model, root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, max_nodes=max_nodes)
+        topology = Topology(model, max_bytes=max_bytes)
+        return expectimax(
+            model, root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, topology=topology, max_nodes=max_nodes
+        )
     empirical = Empirical(model, root_B, samples=plan, share=share, key=key)
-    steps, bottom_N, nodes_per_level = _unfolded(empirical, leaves.expansions, share, max_nodes)
+    widest = max(C or 1 for C in plan)
+    topology = Topology(empirical, max_bytes=max_bytes, num_outcomes=widest)
+    steps, bottom_N, nodes_per_level = _unfolded(empirical, topology, leaves.expansions, share, max_nodes)
     if bottom_N is None:
         v_N = torch.zeros(steps[-1][1].num_children, dtype=model.dtype, device=model.device)
     else:
@@ -138,10 +145,9 @@ Step = tuple[Tensor, Outcomes]
 
 
 def _unfolded(
-    empirical: Empirical, expansions: int, share: Share, max_nodes: int
+    empirical: Empirical, topology: Topology, expansions: int, share: Share, max_nodes: int
 ) -> tuple[list[Step], Tensor | None, tuple[int, ...]]:
     """The levels from the roots down, the nodes at the bottom (None: every path ends above), and how many there are."""
-    topology = Topology(empirical)
     for unfolded in range(1, expansions + 1):
         levels = topology.levels(empirical.root_B, unfolded, max_nodes=max_nodes)
         if levels.closed is not None:

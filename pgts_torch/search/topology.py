@@ -118,10 +118,11 @@ class Topology:
     Args:
         model: the model that answers.
         max_bytes: the most memory that the outcomes of one lookahead may take, see `table_bytes`.
+        num_outcomes: K as far as it is known before the model is asked.
     """
 
-    def __init__(self, model: EnumeratingModel, *, max_bytes: int = MAX_BYTES) -> None:
-        self.model, self.max_bytes = model, max_bytes
+    def __init__(self, model: EnumeratingModel, *, max_bytes: int = MAX_BYTES, num_outcomes: int = 1) -> None:
+        self.model, self.max_bytes, self._least_outcomes = model, max_bytes, num_outcomes
         self.model_calls = 0
         self._generation = model.generation
         self._known = _Rows()
@@ -177,6 +178,15 @@ class Topology:
         counts_NAK = counting(outcomes)
         children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
         return self._renumbered(outcomes, counts_NAK, children), children
+
+    def anew(self) -> "Topology":
+        """One of the same model and limits that has asked nothing yet."""
+        return Topology(self.model, max_bytes=self.max_bytes, num_outcomes=self._least_outcomes)
+
+    @property
+    def num_outcomes(self) -> int:
+        """K, as far as it is known by now."""
+        return max(self._least_outcomes, self._known.num_outcomes)
 
     @property
     def asked(self) -> Int[Tensor, "N"]:
@@ -272,19 +282,19 @@ class Topology:
             return nodes
         size = f"the lookahead has {nodes} nodes on levels 0 to {level}; max_nodes is {max_nodes}"
         if level < expansions:
-            last, children = len(levels.frontiers[level]), self.model.num_actions * self._known.num_outcomes
+            last, children = len(levels.frontiers[level]), self.model.num_actions * self.num_outcomes
             most = nodes - last + tree_nodes(last, children, expansions - level)
             size += f", and levels 0 to {expansions} hold up to {most:.3g}"
         raise NodeBudgetExceeded(f"{size}: {_SMALLER}")
 
     def _check_memory(self, states: int, which: str) -> None:
         """NodeBudgetExceeded if the outcomes of so many states would not fit."""
-        A, K = self.model.num_actions, self._known.num_outcomes
+        A, K = self.model.num_actions, self.num_outcomes
         needed = table_bytes(states, A, K, self.model.dtype)
         if needed > self.max_bytes:
             raise NodeBudgetExceeded(
                 f"the outcomes of {which} of the lookahead ({states} nodes, {A} actions, {K} outcomes of each: up to "
-                f"{states * A * K} children) would take {_gib(needed)}; the limit is {_gib(self.max_bytes)}: {_SMALLER}"
+                f"{states * A * K} children) would take {gib(needed)}; the limit is {gib(self.max_bytes)}: {_SMALLER}"
             )
 
     def _check_generation(self) -> None:
@@ -350,7 +360,7 @@ def check_answer(model: Model, state_N: Int[Tensor, "N"], answer: Outcomes) -> N
         )
 
 
-_SMALLER = "set a smaller depth or max_width, fewer environments, or the search sampled"
+_SMALLER = "set a smaller depth or max_width, fewer environments, or the search sampled with fewer samples"
 
 
 def table_bytes(num_states: int, num_actions: int, num_outcomes: int, dtype: torch.dtype) -> int:
@@ -368,5 +378,6 @@ def tree_nodes(roots: int, children: int, expansions: int) -> float:
         return math.inf
 
 
-def _gib(num_bytes: int) -> str:
+def gib(num_bytes: int) -> str:
+    """As a person reads it."""
     return f"{num_bytes / 2**30:.3g} GiB"

@@ -28,6 +28,12 @@ _DUST = 1e-6
 """Shares of simulations below this are rounding and go nowhere."""
 
 
+def node_bytes(num_nodes: int, num_actions: int, num_outcomes: int, dtype: torch.dtype) -> int:
+    """How much memory so many nodes of a `Tree` take."""
+    s, A, E = dtype.itemsize, num_actions, num_actions * num_outcomes
+    return num_nodes * (2 * s + 16 + A * (2 * s + 8) + E * (2 * s + 16))
+
+
 @dataclass(eq=False)
 class _Step:
     """What a wave does on one level: it passes F nodes by M of their actions ("arms") and those by L outcomes.
@@ -79,10 +85,12 @@ class Tree:
     ) -> None:
         self.known, self.bottom, self.selection = known, bottom, selection
         self.merge, self.mean, self.max_nodes = merge, backup == "mean", max_nodes
-        self.A, self.K = known.num_actions, known.num_outcomes
-        self.count, self.valued = 1, [0] * (bottom + 1)
+        self.A, self.K, self.count = known.num_actions, known.num_outcomes, 1
+        known.check_memory(0, self._bytes(0))
+        self.valued = [0] * (bottom + 1)
         self._full_T = dict[tuple[int, int], Tensor]()
-        room = min(room, _ROOM // (self.A * self.K)) + 1
+        most = known.max_bytes // node_bytes(1, self.A, self.K, known.dtype)
+        room = min(room, most, _ROOM // (self.A * self.K)) + 1
 
         def table(*shape: int, dtype: torch.dtype = known.dtype) -> Tensor:
             return torch.zeros(shape, dtype=dtype, device=known.device)
@@ -100,7 +108,7 @@ class Tree:
     def plant(self, root_B: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
         """A node for each of these distinct states; it is expanded."""
         self.valued[0] = len(root_B)
-        node_B = self._add(self.known.rows(root_B), 0)
+        node_B = self._add(root_B, 0)
         if self.merge:
             self.node_at[self._place(root_B, 0)] = node_B
         return node_B
@@ -235,7 +243,7 @@ class Tree:
         new = (child_L == 0).nonzero().squeeze(1)
         step.budget_C, step.used_C, step.child_C = step.budget_L, torch.zeros_like(step.budget_L), child_L
         if len(new):
-            node = self._add(self.known.rows(state_L.index_select(0, new)), step.level + 1)
+            node = self._add(state_L.index_select(0, new), step.level + 1)
             child_L.scatter_(0, new, node)
             step.used_C.index_fill_(0, new, 1)
             self.below_NE.view(-1).scatter_(0, step.edge(step.arm_M, self.K).index_select(0, new), node)
@@ -245,7 +253,7 @@ class Tree:
         new_C = state_L[self.node_at.index_select(0, self._place(state_L, step.level + 1)) == 0].unique()
         first = self.count
         if len(new_C):
-            node_C = self._add(self.known.rows(new_C), step.level + 1)
+            node_C = self._add(new_C, step.level + 1)
             self.node_at[self._place(new_C, step.level + 1)] = node_C
         child_L = self.node_at[self._place(state_L, step.level + 1)]
         step.child_C, step.at_L = child_L.unique(return_inverse=True)
@@ -254,8 +262,14 @@ class Tree:
         self._meet(step.child_C[step.child_C < first], step.level + 1)
 
     def _add(self, state_N: Tensor, level: int) -> Tensor:
-        """Nodes for these rows of `known`; nothing leads to them yet."""
+        """Nodes for these states; nothing leads to them yet.
+
+        Raises:
+            NodeBudgetExceeded: they would not fit into memory, and the model has not been asked about them; or they are
+                too many.
+        """
         known, N = self.known, len(state_N)
+        state_N = known.rows(state_N, beside=self._bytes(N))
         self._reserve(N)
         new = slice(self.count, self.count + N)
         self.count += N
@@ -290,6 +304,12 @@ class Tree:
             for name, table in vars(self).items():
                 if name.endswith(("_N", "_NA", "_NE")):
                     setattr(self, name, longer(table, 2 * (self.count + rows)))
+
+    def _bytes(self, rows: int) -> int:
+        """How much memory the nodes take once there are so many more."""
+        return 8 * (self.bottom + 1 + self.merge * self._places()) + node_bytes(
+            self.count + rows, self.A, self.known.num_outcomes, self.known.dtype
+        )
 
     def _places(self) -> int:
         return len(self.known.row_S) * (self.bottom + 1)

@@ -56,6 +56,14 @@ def test_a_model_is_saved_with_its_search_and_trains_on_alike(search, tmp_path):
     torch.testing.assert_close(loaded.iterate().look.q_BA, made.iterate().look.q_BA, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("search", SEARCHES, ids=str)
+def test_every_search_has_a_limit_of_memory(search):
+    description = {"type": search} if isinstance(search, str) else search
+    with pytest.raises(PgtsError, match=r"the limit is 9\.31e-08 GiB"):
+        PGTS("pgts/Ladder-v0", depth=2, search={**description, "max_bytes": 100}, num_envs=2).iterate()
+    PGTS("pgts/Ladder-v0", depth=2, search={**description, "max_bytes": 100_000}, num_envs=2).iterate()
+
+
 def test_samples_prove_nothing_but_a_narrow_search_does():
     def certificate(search) -> float:
         return PGTS("pgts/Ladder-v0", depth=6, search=search, policy=LEFT, critic="exact").iterate().certificate

@@ -218,6 +218,10 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
             "search.kind is mcts; with estimator.type sampled there is no lookahead, it must be auto",
         ),
         (
+            "{policy: {type: mlp}, search: {depth: 0, max_bytes: 9}, estimator: {type: sampled}}",
+            "search.max_bytes is 9; with estimator.type sampled there is no lookahead, it must be 4294967296",
+        ),
+        (
             "{policy: {type: mlp}, search: {depth: 0, stop_at: 1}, estimator: {type: sampled}}",
             "search.stop_at is 1.0; with estimator.type sampled there is no lookahead, it must be null",
         ),

@@ -119,7 +119,7 @@ def test_after_kills_at_random_moments_every_byte_is_that_of_an_uninterrupted_ru
     random = np.random.default_rng(kills)
     killed, compared, folder = 0, 1, tmp_path / "0"
     while killed < kills:
-        code = training(folder, kill_at=int(random.integers(1, calls // 2)))
+        code = training(folder, kill_at=int(random.integers(1, calls)))
         assert code in (0, -signal.SIGKILL)
         killed += code != 0
         if code == 0:

@@ -12,6 +12,7 @@ from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import diagnostics, run
+from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import last_checkpoint
 from pgts_torch.experiment.loading import load
@@ -158,6 +159,16 @@ def test_training_ends_at_the_stated_return_of_greedy_episodes_and_the_best_mode
     summary = run.train(few_iterations(tmp_path, *fast, "--run.overwrite", "--total_steps", "600"))
     assert summary.env_steps >= 600
     assert not (tmp_path / "run" / "best.pt").exists()
+
+
+@pytest.mark.parametrize("kind", ["auto", "expectimax", "sampled", "mcts"])
+def test_a_search_of_any_kind_that_needs_more_than_the_configured_memory_is_refused(kind, tmp_path, capsys):
+    arguments = ["train", "--search.kind", kind, "--total_steps", "60", "--run.dir", str(tmp_path / "run")]
+    assert main([*arguments, "--search.max_bytes", "200"]) == 2
+    complaint = capsys.readouterr().err.splitlines()[-1]
+    assert complaint.startswith("error: ")
+    assert "the limit is 1.86e-07 GiB" in complaint
+    assert main([*arguments, "--search.max_bytes", "200000", "--run.overwrite"]) == 0
 
 
 def test_nothing_shipped_learns_from_exact_values(tmp_path):
