@@ -27,7 +27,7 @@ from pgts_torch.experiment.progress import Reporter
 from pgts_torch.experiment.resume import Start, find, flat
 from pgts_torch.experiment.sections import EvalConfig
 from pgts_torch.experiment.signals import StopFlag
-from pgts_torch.experiment.summary import Summary
+from pgts_torch.experiment.summary import EndedBy, Summary
 from pgts_torch.experiment.tracking import (
     BEST_FILE,
     CONFIG_FILE,
@@ -151,7 +151,7 @@ class _Recorder:
 
     def __init__(self, config: Config, algorithm: PGTS, folder: RunFolder, stop: StopFlag) -> None:
         self.config, self.algorithm, self.folder, self.stop = config, algorithm, folder, stop
-        self.finished = False
+        self.ended_by: EndedBy | None = None
         self.truth = diagnostics.Truth(algorithm) if algorithm.world.mdp is not None else None
         self.report = Reporter(config.total_steps)
         self._clock = time.perf_counter()
@@ -160,6 +160,11 @@ class _Recorder:
         self._pi_SA = self._table()
         self._deepest, self._certificate = 0, math.inf
         self._evaluations = _evaluations(config.eval, config.seed, folder)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the training has come to its end."""
+        return self.ended_by is not None
 
     def __call__(self, algorithm: PGTS, iteration: Iteration) -> bool:
         """Whether training may go on."""
@@ -177,11 +182,12 @@ class _Recorder:
         if tags := {tag: value for kind in self._evaluations for tag, value in self._scores(kind, step)}:
             self.folder.log(step, tags)
         target = self.config.search.stop_at
-        self.finished = (
-            not all(go_on)
-            or step >= self.config.total_steps
-            or (target is not None and iteration.certificate <= target)
-        )
+        if target is not None and iteration.certificate <= target:
+            self.ended_by = "certificate"
+        elif not all(go_on):
+            self.ended_by = "return"
+        elif step >= self.config.total_steps:
+            self.ended_by = "total_steps"
         every = self.config.log.checkpoint_every
         is_due = every and (k % every == 0 or time.perf_counter() - self._saved_clock > MOST_SECONDS)
         if is_due and not self.finished:  # the last one waits until the training has ended
@@ -195,6 +201,7 @@ class _Recorder:
         if self._saved_at == self.algorithm.num_env_steps:
             return
         progress = {
+            "ended_by": self.ended_by,
             "depth": self._deepest,
             "certificate": None if math.isinf(self._certificate) else self._certificate,
             "seconds": time.perf_counter() - self._started,
@@ -216,7 +223,7 @@ class _Recorder:
     def load(self, notes: Notes) -> None:
         """Go on from what `save` wrote; the algorithm has been loaded."""
         progress = notes.progress
-        self.finished, self._saved_at = notes.finished, notes.env_steps
+        self.ended_by, self._saved_at = progress["ended_by"], notes.env_steps
         self._deepest = progress["depth"]
         self._certificate = math.inf if progress["certificate"] is None else progress["certificate"]
         self._started -= progress["seconds"]
@@ -244,6 +251,7 @@ class _Recorder:
         """The picture and the summary of the trained policy."""
         seconds = time.perf_counter() - self._started
         config, algorithm, exactly = self.config, self.algorithm, dict[str, float | None]()
+        assert self.ended_by is not None
         if self.truth is not None:
             pi_SA = algorithm.policy_table()
             title = f"{config.env.id}, depth {config.search.depth}, seed {config.seed}"
@@ -267,6 +275,7 @@ class _Recorder:
             stationarity_gap=exactly.get("stationarity_gap"),
             certificate=self._certificate if math.isfinite(self._certificate) else None,
             certificate_is_proved=config.critic.type == "exact",
+            ended_by=self.ended_by,
             iterations=algorithm.num_iterations,
             env_steps=algorithm.num_env_steps,
             model_calls=algorithm.num_model_calls,

@@ -2,9 +2,17 @@
 
 import textwrap
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from pgts_torch.agent.evaluate import Evaluation
+
+EndedBy = Literal["total_steps", "certificate", "return"]
+
+_ENDINGS: dict[EndedBy, str] = {
+    "total_steps": "total_steps",
+    "certificate": "the certificate, which has reached search.stop_at",
+    "return": "the return of greedy episodes: eval.stop_at_return",
+}
 
 
 @dataclass(frozen=True)
@@ -17,6 +25,8 @@ class Summary:
     stationarity_gap: max over visited states of the exact g_m; None likewise.
     certificate: what the last iteration bounds J* - J^pi by; None: it knows no bound.
     certificate_is_proved: whether that is a proof, because the critic is exact, or an estimate.
+    ended_by: what ended the training: the certificate came down to `search.stop_at`, greedy episodes reached
+        `eval.stop_at_return`, or neither before `total_steps`.
     """
 
     run: str
@@ -28,6 +38,7 @@ class Summary:
     stationarity_gap: float | None
     certificate: float | None
     certificate_is_proved: bool
+    ended_by: EndedBy
     iterations: int
     env_steps: int
     model_calls: int
@@ -53,6 +64,7 @@ def describe(summary: Summary) -> str:
         "greedy episodes, return": _score_text(summary.deterministic),
         "sampled episodes, return": _score_text(summary.sampled),
         "search": textwrap.fill(summary.search, 50).replace("\n", "\n" + 28 * " "),
+        "training ended by": _ENDINGS[summary.ended_by],
         "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",
         "model calls": summary.model_calls,
         "seconds": f"{summary.seconds:.1f}",

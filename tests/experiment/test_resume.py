@@ -16,6 +16,7 @@ from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import last_checkpoint
 from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -187,6 +188,37 @@ def test_an_environment_of_another_size_is_refused_tensor_by_tensor_and_nothing_
     ]
     assert content(cut) == before
     assert main(arguments()) == 0
+
+
+ENDINGS = {
+    "total_steps": [],
+    "certificate": [*KINDS["certified"], "--search.stop_at", "1000"],
+    "return": ["--eval.every", "60", "--eval.stop_at_return", "0"],
+}
+
+
+@pytest.mark.parametrize("ended_by", ENDINGS)
+def test_what_ended_a_training_is_said_also_where_its_process_was_killed_before_the_summary(
+    ended_by, tmp_path, monkeypatch
+):
+    config = configured(tmp_path / "run", *QUIET, *ENDINGS[ended_by])
+
+    def killed(recorder: run._Recorder) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run._Recorder, "finish", killed)
+        with pytest.raises(Killed):
+            run.train(config)
+    assert checkpoint.newest(tmp_path / "run")[1].finished
+    summary = run.train(config)
+    assert summary.ended_by == json.loads((tmp_path / "run" / "summary.json").read_text())["ended_by"] == ended_by
+    assert summary.env_steps == (300 if ended_by == "total_steps" else 60)
+    [line] = [line for line in describe(summary).splitlines() if line.startswith("training ended by")]
+    assert line.split()[3:][-1] == {"return": "eval.stop_at_return", "certificate": "search.stop_at"}.get(
+        ended_by, ended_by
+    )
+    assert len(line) < 80
 
 
 def test_what_no_bit_of_training_depends_on_may_differ(cut, tmp_path, capsys):

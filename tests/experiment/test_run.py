@@ -152,12 +152,14 @@ def test_training_ends_at_the_stated_return_of_greedy_episodes_and_the_best_mode
     summary = run.train(few_iterations(tmp_path, *fast, *best, "--total_steps", "600", "--eval.stop_at_return", "96"))
     lines = read_metrics(tmp_path / "run")
     assert summary.env_steps == lines[-1]["step"] < 600
+    assert summary.ended_by == "return"
     greedy = [line["eval/deterministic_return"] for line in lines if "eval/deterministic_return" in line]
     assert greedy[-1] == 96.0 == PGTS.load(tmp_path / "run" / "best.pt").predict(0) * 96
     assert all(score < 96 for score in greedy[:-1])
     assert last_checkpoint(tmp_path / "run").parent.name == f"{summary.env_steps:012d}"
     summary = run.train(few_iterations(tmp_path, *fast, "--run.overwrite", "--total_steps", "600"))
     assert summary.env_steps >= 600
+    assert summary.ended_by == "total_steps"
     assert not (tmp_path / "run" / "best.pt").exists()
 
 
