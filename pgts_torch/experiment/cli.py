@@ -136,9 +136,10 @@ def sweep(arguments: Arguments) -> None:
 
 SWEEP_HELP = """\
 Keys of the configuration are those of pgts train. Runs that are finished are
-kept, so a sweep that was cut off goes on when it is started again, and more
-seeds or depths can be added. Each run has one thread. A run that fails is
-named, the others go on, and the exit code is 1."""
+kept and others go on from their last checkpoint, so a sweep that was cut off
+goes on when it is started again, and more seeds or depths can be added. Each
+run has one thread. A run that fails is named, the others go on, and the exit
+code is 1. SIGTERM or Ctrl-C lets the runs finish their iterations and save."""
 
 
 @command

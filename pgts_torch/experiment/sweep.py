@@ -1,12 +1,7 @@
 """One configuration at several depths and with several seeds: `pgts sweep`."""
 
 import json
-import os
-import subprocess
-import sys
-import time
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +12,7 @@ from jaxtyping import Float
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.processes import train_all
 
 CONFIDENCE = 0.95
 RESAMPLES = 1000
@@ -27,7 +23,7 @@ SET_BY_SWEEP = {
     "search.depth": "--depths says which",
     "seed": "--seeds says how many",
     "run.dir": "--out is the folder of all runs",
-    "run.overwrite": "finished runs are kept, others begin anew",
+    "run.overwrite": "finished runs are kept, others go on",
     "threads": "every run has one, --jobs says how many run at once",
 }
 """Keys that a sweep sets itself, and what is to be said instead."""
@@ -35,7 +31,7 @@ SET_BY_SWEEP = {
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a sweep: its depth, its seed, its whole configuration, and the command line that begins it."""
+    """One run of a sweep: its depth, its seed, its whole configuration, and the arguments of `pgts train`."""
 
     depth: int | str
     seed: int
@@ -99,7 +95,8 @@ def plan(
 
     Raises:
         ConfigError: a configuration is wrong.
-        PgtsError: an override that the sweep sets itself, or a folder that holds another run.
+        PgtsError: an override that the sweep sets itself, or a folder that holds a run, finished or not, of another
+            configuration.
     """
     for key in (override.removeprefix("--").partition("=")[0] for override in overrides if override.startswith("--")):
         if key in SET_BY_SWEEP:
@@ -109,18 +106,24 @@ def plan(
     for depth in depths or [load(path, overrides).search.depth]:
         for seed in range(num_seeds):
             folder = out / f"depth-{depth}" / f"seed-{seed}"
-            own = {"search.depth": depth, "seed": seed, "threads": 1, "run.dir": folder, "run.overwrite": "true"}
+            own = {"search.depth": depth, "seed": seed, "threads": 1, "run.dir": folder, "run.overwrite": "false"}
             arguments = [*overrides, *(f"--{key}={value}" for key, value in own.items())]
             runs.append(Run(depth, seed, load(path, arguments), (*shared, *arguments)))
     for run in runs:
-        if _summary(run) is not None and load(run.folder / "config.yaml") != run.config:
+        if (run.folder / "config.yaml").is_file() and not _same(load(run.folder / "config.yaml"), run.config):
             raise PgtsError(f"{run.folder} holds a run of another configuration; choose another --out")
     return runs
 
 
 def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
-    """Run those that are not finished, each in a process of its own, and write table.json and curves.png."""
-    failures = _run_all([run for run in runs if _summary(run) is None], jobs)
+    """Run those that are not finished, each in a process of its own, and write table.json and curves.png.
+
+    A run that was cut off goes on from its last checkpoint.
+
+    Raises:
+        Stopped: a signal came; see `train_all`.
+    """
+    failures = train_all({run.name: run.arguments for run in runs if _summary(run) is None}, jobs=jobs)
     finished = [run for run in runs if _summary(run) is not None]
     answer = Sweep(tuple(_rows(finished)), _score_is(finished), failures, str(out))
     out.mkdir(parents=True, exist_ok=True)
@@ -161,45 +164,9 @@ def describe(answer: Sweep) -> str:
     return "\n".join([*lines, "", f"Interquartile means over seeds; {answer.score_is}: {what}.", f"in {answer.out}"])
 
 
-def _run_all(runs: Sequence[Run], jobs: int) -> dict[str, str]:
-    """What failed, by name, with the last line that it wrote."""
-    failures: dict[str, str] = {}
-    processes: list[subprocess.Popen[str]] = []
-    pool = ThreadPoolExecutor(jobs)
-    try:
-        waiting = {pool.submit(_run_one, run, processes): run for run in runs}
-        for number, future in enumerate(as_completed(waiting), 1):
-            seconds, mistake = future.result()
-            name = waiting[future].name
-            ending = f"done in {seconds:.0f} s" if mistake is None else f"FAILED: {mistake}"
-            print(f"[{number}/{len(runs)}] {name}: {ending}", file=sys.stderr, flush=True)
-            if mistake is not None:
-                failures[name] = mistake
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.terminate()
-    return failures
-
-
-def _run_one(run: Run, processes: list[subprocess.Popen[str]]) -> tuple[float, str | None]:
-    """Seconds, and the last line of what it complained about if it failed."""
-    started = time.perf_counter()
-    command = [sys.executable, "-m", "pgts_torch.experiment.cli", "train", *run.arguments]
-    with subprocess.Popen(
-        command,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
-    ) as process:
-        processes.append(process)
-        _, complaint = process.communicate()
-    seconds = time.perf_counter() - started
-    if process.returncode == 0:
-        return seconds, None
-    last = (complaint.strip().splitlines() or [f"exit code {process.returncode}"])[-1]
-    return seconds, last.removeprefix("error: ")
+def _same(first: Config, second: Config) -> bool:
+    """Whether they are, but for where the run is."""
+    return first.model_copy(update={"run": second.run}) == second
 
 
 def _summary(run: Run) -> dict[str, Any] | None:

@@ -1,8 +1,13 @@
 """The command `pgts sweep`: many runs, what they come to, and what happens if one fails."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,10 +15,13 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import sweep
+from pgts_torch.errors import PgtsError, Stopped
+from pgts_torch.experiment import checkpoint, run, sweep
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import dump
+from pgts_torch.experiment.processes import train_all
+from pgts_torch.experiment.tracking import RunLock
+from tests.experiment.test_processes import in_child
 
 HELP = "(see pgts sweep --help)"
 SMALL = ["--total_steps", "60", "--rollout.num_envs", "3", "--rollout.horizon.length", "10", "--eval.episodes", "2"]
@@ -79,13 +87,120 @@ def test_where_nothing_exact_is_known_sampled_episodes_score_and_one_seed_has_no
     assert "return of sampled episodes" in sweep.describe(answer)
 
 
-def test_a_folder_with_a_run_of_another_configuration_is_refused_and_an_unfinished_one_is_not(here):
+def test_a_folder_with_a_run_of_another_configuration_is_refused_also_where_it_is_unfinished(here):
     finish(planned()[0], J=1.0)
-    assert len(planned()) == 6
-    with pytest.raises(PgtsError, match="depth-0/seed-0 holds a run of another configuration; choose another --out"):
-        planned("--update.step_size", "0.7")
-    Path("out/depth-0/seed-0/summary.json").unlink()
-    assert len(planned("--update.step_size", "0.7")) == 6
+    for _ in range(2):
+        assert len(planned()) == 6
+        with pytest.raises(PgtsError, match="depth-0/seed-0 holds a run of another configuration; choose another --o"):
+            planned("--update.step_size", "0.7")
+        Path("out/depth-0/seed-0/summary.json").unlink(missing_ok=True)
+
+
+def until(done: Callable[[], bool]) -> None:
+    started = time.monotonic()
+    while not done():
+        assert time.monotonic() - started < 120
+        time.sleep(0.02)
+
+
+@pytest.mark.fault("SIGTERM")
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_sweep_that_is_stopped_saves_and_the_same_command_ends_with_the_table_of_one_that_was_not(here):
+    long = ["--total_steps", "600", "--log.checkpoint_every", "1", "--log.keep", "999", "--run.tensorboard", "false"]
+    whole = sweep.plan(None, [*SMALL, *long], depths=(1,), num_seeds=2, out=Path("whole"))
+    for each in whole:
+        run.train(each.config)
+    expected = asdict(sweep.sweep(whole, jobs=1, out=Path("whole")))
+    arguments = ["sweep", "--out", "out", "--depths", "1", "--seeds", "2", "--jobs", "2", *SMALL, *long]
+    folders = [Path("out/depth-1/seed-0"), Path("out/depth-1/seed-1")]
+    command = [sys.executable, "-m", "pgts_torch.experiment.cli", *arguments]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        until(lambda: any(map(checkpoint.listed, folders)))
+        process.terminate()
+        assert "stopped: 0 of 2 runs are done; the same command goes on\n" in process.communicate()[1]
+    assert process.returncode == 143
+    assert not any((folder / "summary.json").exists() for folder in folders)
+    for folder in folders:
+        RunLock(folder).__exit__(None, None, None)  # nobody has it any more
+    first = {path: path.stat().st_mtime_ns for folder in folders for path in checkpoint.listed(folder)[:1]}
+    assert main(arguments) == 0
+    assert {path: path.stat().st_mtime_ns for path in first} == first  # it did not begin anew
+    answer = json.loads(Path("out/table.json").read_text())
+    for row in (*answer["rows"], *expected["rows"]):
+        del row["seconds"]
+    assert answer["rows"] == json.loads(json.dumps(expected["rows"]))
+
+
+@pytest.fixture
+def trainer(here, monkeypatch) -> Callable[[str], Path]:
+    """Puts a shell script in the place of `pgts train`; it writes its process id into `pids` when it has begun."""
+
+    def replace(on_signal: str) -> Path:
+        script = here / "trainer"
+        script.write_text(f"#!/bin/sh\ntrap '{on_signal}' TERM\necho $$ >> pids\nwhile :; do sleep 0.05; done\n")
+        script.chmod(0o755)
+        monkeypatch.setattr(sys, "executable", str(script))
+        return here / "pids"
+
+    return replace
+
+
+def signal_when(done: Callable[[], bool], *numbers: int) -> None:
+    """Send this process signals, a little apart, once something is the case."""
+
+    def send() -> None:
+        until(done)
+        for number in numbers:
+            os.kill(os.getpid(), number)
+            time.sleep(0.3)
+
+    threading.Thread(target=send, daemon=True).start()
+
+
+def lines(path: Path) -> list[str]:
+    return path.read_text().split() if path.exists() else []
+
+
+@pytest.mark.fault("SIGTERM", "Ctrl-C")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_to_a_sweep_asks_each_run_once_to_end_and_begins_no_other(number, trainer, capsys):
+    pids = trainer("echo asked >> pids; sleep 0.3; exit 143")
+    signal_when(lambda: len(lines(pids)) == 2, number)
+    before = signal.getsignal(number)
+    with pytest.raises(Stopped, match="stopped: 0 of 3 runs are done; the same command goes on") as caught:
+        train_all({name: [] for name in "abc"}, jobs=2)
+    assert caught.value.signal == number
+    assert signal.getsignal(number) is before
+    assert lines(pids)[2:] == ["asked", "asked"]
+    said = [line.partition(" after")[0].split(maxsplit=1) for line in capsys.readouterr().err.splitlines()]
+    assert [number for number, _ in said] == ["[1/3]", "[2/3]"]
+    assert sorted(ending for _, ending in said) == ["a: stopped", "b: stopped"]
+
+
+@pytest.mark.fault("second Ctrl-C")
+def test_a_second_signal_to_a_sweep_ends_all_runs_at_once(trainer):
+    pids = trainer("")
+
+    def interrupted() -> int:
+        signal_when(lambda: len(lines(pids)) == 2, signal.SIGINT, signal.SIGINT)
+        train_all({name: [] for name in "abc"}, jobs=2)
+        return 0
+
+    assert in_child(interrupted) == 130
+    for pid in map(int, lines(pids)):
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+def test_a_run_that_was_killed_has_failed(trainer):
+    pids = trainer("")
+
+    def kill() -> None:
+        until(lambda: bool(lines(pids)))
+        os.kill(int(lines(pids)[0]), signal.SIGKILL)
+
+    threading.Thread(target=kill, daemon=True).start()
+    assert train_all({"a": []}, jobs=1) == {"a": "killed by the signal 9"}
 
 
 def test_a_run_that_fails_is_named_and_the_others_go_on(here, capsys):

@@ -1,0 +1,104 @@
+"""Several trainings at once, each in a process of its own; a signal ends them together, and nothing is lost."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import final
+
+from pgts_torch.errors import Stopped
+from pgts_torch.experiment.signals import SIGNALS, StopFlag
+
+_POLL = 0.05
+"""Seconds from one look at the processes to the next."""
+
+_STOPPED = (128 + signal.SIGTERM, -signal.SIGTERM)
+"""Exit codes of a training that was told to end: it has saved, or had not begun."""
+
+
+def train_all(trainings: Mapping[str, Sequence[str]], *, jobs: int) -> dict[str, str]:
+    """Run `pgts train` with each of these arguments, `jobs` at once.
+
+    Args:
+        trainings: the arguments, by the name of the training.
+
+    Returns:
+        What failed, by name, with the last line that it wrote.
+
+    Raises:
+        Stopped: SIGTERM, SIGINT or SIGHUP came. The trainings have finished their iterations and saved; a second
+            signal ends them, and this process, at once.
+    """
+    failures: dict[str, str] = {}
+    waiting, running, finished = deque(trainings.items()), list[_Training](), 0
+    # A shell lets commands that are to outlive it ignore SIGHUP.
+    signals = SIGNALS if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (*SIGNALS, signal.SIGHUP)
+    with StopFlag(signals, at_once=lambda: _kill(running)) as stop:
+        try:
+            while running or (waiting and stop.signal is None):
+                while waiting and len(running) < jobs and stop.signal is None:
+                    running.append(_Training(*waiting.popleft()))
+                for training in [each for each in running if each.ended(ask=stop.signal is not None)]:
+                    running.remove(training)
+                    code, seconds, last = training.outcome()
+                    if code == 0:
+                        ending = f"done in {seconds:.0f} s"
+                        finished += 1
+                    elif stop.signal is not None and code in _STOPPED:
+                        ending = f"stopped after {seconds:.0f} s"
+                    else:
+                        ending, failures[training.name] = f"FAILED: {last}", last
+                    number = len(trainings) - len(waiting) - len(running)
+                    print(f"[{number}/{len(trainings)}] {training.name}: {ending}", file=sys.stderr, flush=True)
+                time.sleep(_POLL)
+        finally:
+            _kill(running)
+    if stop.signal is not None:
+        raise Stopped(f"stopped: {finished} of {len(trainings)} runs are done; the same command goes on", stop.signal)
+    return failures
+
+
+@final
+class _Training:
+    """A process that trains. Signals of the terminal do not reach it: it is told to end once, by us."""
+
+    def __init__(self, name: str, arguments: Sequence[str]) -> None:
+        self.name = name
+        self._started, self._asked = time.perf_counter(), False
+        self._complaints = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 (outlives this)
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "pgts_torch.experiment.cli", "train", *arguments],
+            stdout=subprocess.DEVNULL,
+            stderr=self._complaints,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
+            process_group=0,
+        )
+
+    def ended(self, *, ask: bool) -> bool:
+        """Whether it has; if not, it may be asked to."""
+        if self.process.poll() is not None:
+            return True
+        if ask and not self._asked:
+            self.process.terminate()
+            self._asked = True
+        return False
+
+    def outcome(self) -> tuple[int, float, str]:
+        """The exit code, seconds, and the last line that it wrote to stderr."""
+        self._complaints.seek(0)
+        code, lines = self.process.returncode, self._complaints.read().strip().splitlines()
+        self._complaints.close()
+        last = f"killed by the signal {-code}" if code < 0 else (lines or [f"exit code {code}"])[-1]
+        return code, time.perf_counter() - self._started, last.removeprefix("error: ")
+
+
+def _kill(trainings: Sequence[_Training]) -> None:
+    """End these at once; what they have saved stays."""
+    for each in trainings:
+        each.process.kill()
+    for each in trainings:
+        each.process.wait()
