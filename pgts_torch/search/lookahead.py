@@ -118,6 +118,14 @@ class Leaves:
         return values
 
 
+def unexpanded(leaves: Leaves, root_B: Int[Tensor, "B"]) -> Lookahead:
+    """The lookahead of no levels: what the critic of Q^pi says of the roots, asked once about each."""
+    state_N, row_B = torch.unique(root_B, return_inverse=True)
+    q_BA = leaves.q(state_N)[row_B]
+    zero_BA = torch.zeros_like(q_BA)
+    return Lookahead(q_BA, zero_BA, zero_BA, 0, leaves.calls, (len(state_N),))
+
+
 def check_finite(what: str, name: str, value_N: Float[Tensor, "N ..."], state_N: Int[Tensor, "N"] | None) -> None:
     """NotFinite if a value is, naming its state, or else its row. Of several values of a state the best must be finite,
     the others may be -inf: an action that is not allowed."""

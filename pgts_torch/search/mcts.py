@@ -11,7 +11,7 @@ from torch import Tensor
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.search.known import KnownStates
-from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead, check_states, check_vector
+from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead, check_states, check_vector, unexpanded
 from pgts_torch.search.split import Rule, Selection, sigma
 from pgts_torch.search.topology import Topology
 from pgts_torch.search.tree import Backup, Tree
@@ -99,11 +99,9 @@ def mcts(
         raise PgtsError("the topology belongs to another model")
     check_vector(root_B)
     check_states(root_B, model.num_states)
-    state_B, row_B = root_B.unique(return_inverse=True)
     if leaves.expansions == 0:
-        q_BA = leaves.q(state_B)[row_B]
-        zero_BA = torch.zeros_like(q_BA)
-        return Lookahead(q_BA, zero_BA, zero_BA, 0, leaves.calls, (len(state_B),))
+        return unexpanded(leaves, root_B)
+    state_B, row_B = root_B.unique(return_inverse=True)
     calls_before = topology.model_calls
     # Tens of small operations a level: without the bookkeeping of autograd each is a fifth cheaper.
     with torch.inference_mode():
@@ -116,20 +114,14 @@ def mcts(
         if root == "rule":
             _by_rule(tree, node_B, simulations - 1, wave)
         else:
-            log_prior_BA = known.prior_TA[tree.state_N[node_B]].log()
-            if generator is not None:
-                log_prior_BA += _gumbel(state_B, model, generator)
-            _halve(tree, node_B, simulations - 1, wave, log_prior_BA)
-        if backup == "mean":
-            pruned_BA = torch.full((len(node_B), tree.A), math.inf, dtype=model.dtype, device=model.device)
-        else:
-            pruned_BA = tree.settle(node_B)
+            _halve(tree, node_B, simulations - 1, wave, _preference(known, state_B, generator))
+        pruned_NA = tree.settle(node_B)
         q_NA = tree.q_NA[node_B]
     q_BA = q_NA[row_B]
     return Lookahead(
         q_BA,
         stderr_BA=torch.zeros_like(q_BA),
-        pruned_BA=pruned_BA[row_B],
+        pruned_BA=pruned_NA[row_B],
         model_calls=topology.model_calls - calls_before,
         critic_calls=leaves.calls,
         nodes_per_level=tree.nodes_per_level(),
@@ -152,18 +144,18 @@ def _by_rule(tree: Tree, node_B: Tensor, simulations: int, wave: int | None) -> 
         used_B[at_B] += tree.wave(node_B[at_B], tree.split(node_B[at_B], budget_B))
 
 
-def _halve(tree: Tree, node_B: Tensor, simulations: int, wave: int | None, log_prior_BA: Tensor) -> None:
+def _halve(tree: Tree, node_B: Tensor, simulations: int, wave: int | None, preference_BA: Tensor) -> None:
     """Sequential halving of the root's actions (Karnin, Koren and Somekh 2013; Danihelka et al. 2022, Sec. 3.2).
 
     What an action that is complete would have got goes to the next best one, also after the last round.
     """
     used_B = torch.zeros(len(node_B), dtype=torch.float64, device=node_B.device)
-    alive_BA = torch.ones_like(log_prior_BA, dtype=torch.bool)
+    alive_BA = torch.ones_like(preference_BA, dtype=torch.bool)
     place_A = torch.arange(tree.A, device=node_B.device)
     before = 0
     for width, most in _rounds(tree.A, simulations, wave):
         if width != before:
-            order_BA, before = _order(tree, node_B, log_prior_BA, alive_BA), width
+            order_BA, before = _order(tree, node_B, preference_BA, alive_BA), width
             alive_BA = torch.zeros_like(alive_BA).scatter_(1, order_BA[:, :width], True)
         lanes_B1 = tree.open(node_B).sum(1, keepdim=True).clamp_max_(width)
         left_B1 = (simulations - used_B + _WHOLE).floor_().unsqueeze(1)
@@ -175,7 +167,7 @@ def _halve(tree: Tree, node_B: Tensor, simulations: int, wave: int | None, log_p
         share_B1 = (total_B1 / lanes_B1).floor_()
         share_BA = share_B1 + (place_A < total_B1 - share_B1 * lanes_B1)
         share_BA.masked_fill_(place_A >= lanes_B1, 0)
-        order_BA = _order(tree, node_B[at_B], log_prior_BA[at_B], alive_BA[at_B])
+        order_BA = _order(tree, node_B[at_B], preference_BA[at_B], alive_BA[at_B])
         used_B[at_B] += tree.wave(node_B[at_B], torch.zeros_like(share_BA).scatter_(1, order_BA, share_BA))
 
 
@@ -195,20 +187,24 @@ def _rounds(actions: int, simulations: int, wave: int | None) -> Iterator[tuple[
         yield width, wave or simulations
 
 
-def _order(tree: Tree, node_B: Tensor, log_prior_BA: Tensor, alive_BA: Tensor) -> Int[Tensor, "B A"]:
+def _order(tree: Tree, node_B: Tensor, preference_BA: Tensor, alive_BA: Tensor) -> Int[Tensor, "B A"]:
     """The actions of each root, best first: survivors before the others, complete ones last."""
-    score_BA = log_prior_BA + sigma(tree.q_NA[node_B], tree.visits_NA[node_B])
+    score_BA = preference_BA + sigma(tree.q_NA[node_B], tree.visits_NA[node_B])
     by_score_BA = score_BA.argsort(dim=1, descending=True, stable=True)
     rank_BA = torch.where(tree.open(node_B), torch.where(alive_BA, 0, 1), 2).gather(1, by_score_BA)
     return by_score_BA.gather(1, rank_BA.argsort(dim=1, stable=True))
 
 
-def _gumbel(state_B: Tensor, model: EnumeratingModel, generator: torch.Generator) -> Float[Tensor, "B A"]:
-    """Standard Gumbel noise: a function of the search, the state and the action."""
-    key = draw_keys(1, generator=generator).to(model.device)
-    action_A = torch.arange(model.num_actions, device=model.device)
+def _preference(known: KnownStates, state_B: Tensor, generator: torch.Generator | None) -> Float[Tensor, "B A"]:
+    """log prior(a), plus standard Gumbel noise if there is a generator: a function of the search, the state and the
+    action."""
+    log_prior_BA = known.prior_TA[known.rows(state_B)].log()
+    if generator is None:
+        return log_prior_BA
+    key = draw_keys(1, generator=generator).to(known.device)
+    action_A = torch.arange(known.num_actions, device=known.device)
     u_BA = uniform(mix(key, state_B.unsqueeze(1), action_A)).clamp_min(torch.finfo(torch.float64).tiny)
-    return -(-u_BA.log()).log().to(model.dtype)
+    return log_prior_BA - (-u_BA.log()).log().to(known.dtype)
 
 
 def _check(

@@ -12,7 +12,16 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.empirical import Empirical, Share
 from pgts_torch.search.expectimax import expectimax
-from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaf, Leaves, Lookahead, check_states, check_vector
+from pgts_torch.search.lookahead import (
+    MAX_BYTES,
+    MAX_NODES,
+    Leaf,
+    Leaves,
+    Lookahead,
+    check_states,
+    check_vector,
+    unexpanded,
+)
 from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import draw_keys, mix, uniform
 
@@ -85,10 +94,7 @@ def sampled(
         raise PgtsError(f"replicates is {replicates}; it must be 0 or at least 2")
     key = draw_keys(1, generator=generator).to(model.device)
     if not plan:
-        roots, row_B = torch.unique(root_B, return_inverse=True)
-        q_BA = leaves.q(roots)[row_B]
-        zero_BA = torch.zeros_like(q_BA)
-        return Lookahead(q_BA, zero_BA, zero_BA, 0, critic_calls=leaves.calls, nodes_per_level=(len(roots),))
+        return unexpanded(leaves, root_B)
     if all(C is None for C in plan):
         assert isinstance(model, EnumeratingModel)
         topology = Topology(model, max_bytes=max_bytes)
@@ -99,11 +105,7 @@ def sampled(
     widest = max(C or 1 for C in plan)
     topology = Topology(empirical, max_bytes=max_bytes, num_outcomes=widest)
     steps, bottom_N, nodes_per_level = _unfolded(empirical, topology, leaves.expansions, share, max_nodes)
-    if bottom_N is None:
-        v_N = torch.zeros(steps[-1][1].num_children, dtype=model.dtype, device=model.device)
-    else:
-        bottom, row_N = torch.unique(empirical.state_N[bottom_N], return_inverse=True)
-        v_N = leaves.v(bottom)[row_N]
+    v_N = _leaf_values(leaves, empirical, steps, bottom_N)
     q_BA = _backups([outcomes for _, outcomes in reversed(steps)], v_N)[empirical.root_B]
     stderr_BA = bias_BA = torch.full_like(q_BA, torch.nan)
     if replicates and 1 not in plan:
@@ -162,6 +164,16 @@ def _unfolded(
     # Other nodes than states never recur: a set of them that is closed has no children that count.
     widths = [len(frontier) for frontier in levels.frontiers]
     return steps, None, (*widths, *[0] * (expansions + 1 - len(widths)))
+
+
+def _leaf_values(
+    leaves: Leaves, empirical: Empirical, steps: list[Step], bottom_N: Tensor | None
+) -> Float[Tensor, "leaves"]:
+    """What the critic says of the nodes at the bottom; where every path ends above, zeros that nothing leads to."""
+    if bottom_N is None:
+        return torch.zeros(steps[-1][1].num_children, dtype=empirical.dtype, device=empirical.device)
+    state_N, row_N = torch.unique(empirical.state_N[bottom_N], return_inverse=True)
+    return leaves.v(state_N)[row_N]
 
 
 def _backups(outcomes: Iterable[Outcomes], v_N: Float[Tensor, "leaves"]) -> Float[Tensor, "N A"]:

@@ -153,8 +153,10 @@ class Tree:
 
         Returns:
             `Lookahead.pruned_BA`: the most discounted probability that a plan after each action of the roots puts on
-            nodes that could be expanded.
+            nodes that could be expanded; inf for averages, which have no bound and are as the waves left them.
         """
+        if self.mean:
+            return torch.full_like(self.q_NA[node_B], torch.inf)
         known, A, K = self.known, self.A, self.K
         leaf_T = known.weight_TE.view(-1, A, K).sum(2).amax(1)
         mass_N = leaf_T.index_select(0, self.state_N[: self.count])
