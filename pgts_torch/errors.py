@@ -2,7 +2,12 @@
 
 
 class PgtsError(ValueError):
-    """Something that the caller gave cannot be used."""
+    """Something that the caller gave cannot be used.
+
+    rank: the process in which it happened, where several train together; None: in this one.
+    """
+
+    rank: int | None = None
 
 
 class NodeBudgetExceeded(PgtsError):
@@ -15,6 +20,10 @@ class MissingModel(PgtsError):
 
 class RandomOutcomes(PgtsError):
     """A model that lists outcomes where it is certain of them was asked where chance decides."""
+
+
+class RankLost(PgtsError):
+    """One of several processes that train together is gone, and so the others cannot go on."""
 
 
 class NotFinite(PgtsError):
@@ -31,8 +40,12 @@ class NotFinite(PgtsError):
 
 def failure(where: str, error: Exception) -> PgtsError:
     """The error that says where another one happened; NotFinite stays NotFinite."""
-    story = f"{where}: {error}" if isinstance(error, PgtsError) else f"{where}: {type(error).__name__}: {error}"
-    return NotFinite(story, what=error.what) if isinstance(error, NotFinite) else PgtsError(story)
+    if not isinstance(error, PgtsError):
+        return PgtsError(f"{where}: {type(error).__name__}: {error}")
+    story = f"{where}: {error}"
+    told = NotFinite(story, what=error.what) if isinstance(error, NotFinite) else PgtsError(story)
+    told.rank = error.rank
+    return told
 
 
 class Stopped(Exception):

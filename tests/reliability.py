@@ -107,6 +107,10 @@ FAULTS: dict[str, dict[str, str]] = {
         "evaluation and logging": "on or off, the trained bits are the same",
         "rendering": "on or off, the trained bits are the same",
     },
+    "Several processes": {
+        "lost rank": "the others end with exit code 1; the same command goes on and ends with the same bits",
+        "other world size at resume": "refused with both numbers, exit code 2; `--any-world-size` goes on",
+    },
 }
 """By group: each fault, and what happens then."""
 

@@ -111,6 +111,14 @@ class _Watched(World):
         """Nothing can be said."""
         raise AssertionError("what was watched is over")
 
+    def export(self, state_N: Int[Tensor, "N"]) -> Any:
+        """Nothing can be said."""
+        raise AssertionError("what was watched is over")
+
+    def adopt(self, exported: Any) -> Int[Tensor, "N"]:
+        """Nothing can be said."""
+        raise AssertionError("what was watched is over")
+
     def forget(self) -> bool:
         """Nothing."""
         return False

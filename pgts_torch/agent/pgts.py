@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self, final
+from typing import Any, Literal, NamedTuple, Self, final
 
 import numpy as np
 import torch
@@ -33,7 +33,9 @@ from pgts_torch.agent.copies import divided_actions, make_vector_env, more_copie
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.iteration import Iteration, Seen
 from pgts_torch.agent.policies import Policy, listed
+from pgts_torch.agent.ranks import checksum, present_ranks
 from pgts_torch.agent.rollout import Horizon, Rollout, rollout
+from pgts_torch.agent.sharing import whole_lookahead, whole_rollout
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import make_world
 from pgts_torch.errors import PgtsError
@@ -47,6 +49,14 @@ Callback = Callable[["PGTS", Iteration], bool | None]
 """Called after each iteration; returning False ends the training. `agent.callbacks` has some."""
 
 
+class _Draws(NamedTuple):
+    """The streams that an iteration draws from."""
+
+    episodes: torch.Generator
+    critic: torch.Generator
+    update: torch.Generator
+
+
 @final
 class PGTS:
     """A policy that is pushed toward what a depth-m lookahead sees at the states it visits.
@@ -55,6 +65,10 @@ class PGTS:
 
     The tree is used in training only; acting is one look into the policy. Everything random in iteration k is drawn
     from streams named by (seed, k), so a loaded model goes on exactly as the saved one would have.
+
+    Where torch.distributed has a default process group, its processes train one policy together: each makes its part of
+    the episodes and of the lookahead, and all make the same update from the whole batch (`agent.ranks`). They must do
+    the same calls, with the same arguments.
 
     Args:
         env: a Gymnasium id; or an environment or a spec, of which copies are made by its spec; or a function that makes
@@ -72,7 +86,7 @@ class PGTS:
             A2C, which need depth 0, a network and no model.
         policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax", "mlp",
             {"type": "tabular", "target": "q"}, ... Default: tables where the environment is tabular, else networks.
-        num_envs: episodes in each iteration.
+        num_envs: episodes in each iteration, of all processes together.
         actions_per_dimension: into how many evenly spaced values, from the lowest to the highest, each dimension of
             continuous actions is divided; None: actions are discrete.
         action_repeat: how often the lookahead takes an action before it takes the next, so that it sees as many times
@@ -121,9 +135,12 @@ class PGTS:
         self.seed = seed
         self.device = torch.device(device)
         self.estimator = make_estimator(estimator)
+        self.ranks = present_ranks()
+        if num_envs < self.ranks.size:
+            raise PgtsError(f"num_envs is {num_envs}; {self.ranks.size} ranks need at least as many")
         self.world = make_world(
             env,
-            num_envs=num_envs,
+            num_envs=self.ranks.count(num_envs),
             gamma=gamma,
             observation_key=observation_key,
             plain=isinstance(self.estimator, SampledAdvantages),
@@ -152,18 +169,16 @@ class PGTS:
 
     def iterate(self) -> Iteration:
         """One pass through the loop: visit states, estimate Q^pi, look m steps ahead, move pi.        [PGTS Alg. 1]"""
-        names = ("iteration", self.num_iterations)
-        generator = stream(self.seed, *names, device=self.device)
-        if self.world.forget() and self.search is not None:
-            self.search.forget()
+        draws = self._draws()
         calls_before = self._model_calls()
 
         # Visit states with pi_k and estimate Q^{pi_k} (line 2).
-        experience = rollout(
-            self.world, self.world.env, self.policy, self.horizon, seed=self.seed, names=names, generator=generator
-        )
+        numbers_anew = self.world.forget()
+        experience = whole_rollout(self.ranks, self.world, lambda: self._visit(draws.episodes))
+        if numbers_anew and self.search is not None:
+            self.search.forget()
         taken = self._taken(experience)
-        losses = self.critic.fit(self.policy, experience, generator=generator)
+        losses = self.critic.fit(self.policy, experience, generator=draws.critic)
 
         # Look m steps ahead from the states with d(s) > 0.
         seen = taken or self._look(experience)
@@ -171,13 +186,26 @@ class PGTS:
         # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is proved good enough.
         if not self._proved(seen.certificate):
             observation_N = self.world.observe(seen.state_N)
-            losses |= self.update(self.policy, observation_N, seen.advantage_NA, seen.weight_N, generator=generator)
+            losses |= self.update(self.policy, observation_N, seen.advantage_NA, seen.weight_N, generator=draws.update)
 
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
-        model_calls = self._model_calls() - calls_before
+        model_calls = sum(self.ranks.gather(lambda: self._model_calls() - calls_before))
         self.num_model_calls += model_calls
         return Iteration(**vars(seen), experience=experience, losses=losses, model_calls=model_calls)
+
+    def _visit(self, generator: torch.Generator) -> Rollout:
+        """The episodes of this process."""
+        names = ("iteration", self.num_iterations, *self.ranks.names)
+        world, horizon = self.world, self.horizon
+        return rollout(world, world.env, self.policy, horizon, seed=self.seed, names=names, generator=generator)
+
+    def _draws(self) -> _Draws:
+        """One stream where this process is alone. Else one of its own for the episodes, and two that all have: what the
+        critic draws in a lookahead in parts must not move the update."""
+        if self.ranks.size == 1:
+            return _Draws(*[self._stream()] * 3)
+        return _Draws(self._stream(*self.ranks.names), self._stream("critic"), self._stream("update"))
 
     def _model_calls(self) -> int:
         return (0 if self.search is None else self.search.model_calls) + self.critic.model_calls
@@ -186,12 +214,12 @@ class PGTS:
         """The lookahead from the visited states, at the given depth or at the first that sees enough."""
         states, weight_N = experience.visits(self.update.state_weight)
         pi_NA = self.policy.probs(self.world.observe(states))
-        shallow = self.lookahead(states, depth=0)
+        shallow = self._look_together(states, 0)
         v_N = (pi_NA * shallow.q_BA).sum(-1)
         check_finite("value", "the policy's value", v_N, states)
         _, occupancy_N = experience.visits("occupancy")
         for depth in self.depths:
-            look = self.lookahead(states, depth=depth) if depth else shallow
+            look = self._look_together(states, depth) if depth else shallow
             gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
             certificate = self._certificate(experience, states, v_N, depth)
             if float(gap_N @ occupancy_N) > self.tolerance * certificate or self._proved(certificate):
@@ -260,17 +288,31 @@ class PGTS:
         depth = self.depths[-1] if depth is None else depth
         return self.search(state_N, depth=depth, generator=self._search_stream(), **{f"{critic.target}_leaf": leaf})
 
+    def _look_together(self, state_N: Tensor, depth: int) -> Lookahead:
+        """`lookahead`, in which each process has its part."""
+        return whole_lookahead(self.ranks, state_N, lambda mine: self.lookahead(mine, depth=depth))
+
+    def _stream(self, *names: str | int) -> torch.Generator:
+        """A stream of this iteration."""
+        return stream(self.seed, "iteration", self.num_iterations, *names, device=self.device)
+
     def _search_stream(self) -> torch.Generator:
         """All searches of an iteration see the same samples, so that their differences are not noise."""
-        return stream(self.seed, "iteration", self.num_iterations, "search", device=self.device)
+        return self._stream("search")
 
     def _certificate(self, experience: Rollout, state_N: Tensor, v_N: Tensor, depth: int) -> float:
         assert self.search is not None
         assert self.world.model is not None
         expansions = depth + (self.critic.target == "v")
-        generator = self._search_stream()
         return certificate(
-            self.search, self.world.model, experience, state_N, v_N, expansions=expansions, generator=generator
+            self.search,
+            self.world.model,
+            experience,
+            state_N,
+            v_N,
+            expansions=expansions,
+            generator=self._search_stream(),
+            ranks=self.ranks,
         )
 
     def _proved(self, certificate: float) -> bool:
@@ -281,7 +323,7 @@ class PGTS:
 
         Args:
             callback: one or more, each called with (self, iteration) after each iteration; if one returns False, the
-                training ends.
+                training ends, in all processes.
             progress: show a progress bar.
 
         Raises:
@@ -290,14 +332,24 @@ class PGTS:
         callbacks = [callback] if callable(callback) else callback
         if not isinstance(callbacks, Sequence) or not all(map(callable, callbacks)):
             raise PgtsError(f"callback is {callback!r}; it must be a function of (model, iteration), or a list of such")
-        with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=not progress) as bar:
+        shown = progress and self.ranks.leads
+        with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=not shown) as bar:
             while self.num_env_steps < total_steps:
                 iteration = self.iterate()
                 bar.update(iteration.experience.num_steps)
                 answers = [call(self, iteration) for call in callbacks]
-                if False in answers or self._proved(iteration.certificate):
+                if not self._all_go_on(answers) or self._proved(iteration.certificate):
                     break
         return self
+
+    def _all_go_on(self, answers: Sequence[bool | None]) -> bool:
+        """Whether no process has an answer that ends the training; PgtsError if their policies differ."""
+        if self.ranks.size == 1:
+            return False not in answers
+        told = self.ranks.gather(lambda: (False not in answers, checksum(self.policy.state_dict())))
+        if len({policy for _, policy in told}) > 1:
+            raise PgtsError("the ranks hold different policies: do they run on different hardware or versions?")
+        return all(go_on for go_on, _ in told)
 
     def predict(
         self, observation: ArrayLike, *, deterministic: bool = True, generator: torch.Generator | None = None
@@ -323,13 +375,19 @@ class PGTS:
     def save(self, path: str | Path) -> None:
         """Write everything that training or acting goes on from into one file with a checksum.
 
-        An environment that was given as an object is left out: `load` must be given one.
+        An environment that was given as an object is left out: `load` must be given one. Of several processes all must
+        call it, and the first one writes.
 
         Raises:
             PgtsError: a part was given as an object, so that no file can describe it, or an argument is no plain value.
         """
-        arguments = described(self._arguments) | {"device": str(self.device)}
-        saving.write(path, {"arguments": arguments, "state": self.state_dict()})
+        content = self.content()
+        if self.ranks.leads:
+            saving.write(path, content)
+
+    def content(self) -> dict[str, Any]:
+        """What `save` writes: the arguments and the state. Of several processes all must ask for it."""
+        return {"arguments": described(self._arguments) | {"device": str(self.device)}, "state": self.state_dict()}
 
     @classmethod
     def load(
@@ -367,10 +425,12 @@ class PGTS:
         return model
 
     def state_dict(self) -> dict[str, Any]:
-        """Policy, critic, update, what the search remembers, and counters, as tensors on the CPU and plain values."""
-        search = {} if self.search is None else self.search.state_dict(with_states=self.world.mdp is not None)
+        """Policy, critic, update, what the search of each rank remembers, and counters: tensors on the CPU and plain
+        values. Of several processes all must ask for it."""
+        search, with_states = self.search, self.world.mdp is not None
+        searches = self.ranks.gather(lambda: {} if search is None else search.state_dict(with_states=with_states))
         return {
-            "search": search,
+            "searches": dict(enumerate(searches)),
             "policy": self.policy.state_dict(),
             "critic": self.critic.state_dict(),
             "update": self.update.state_dict(),
@@ -385,7 +445,7 @@ class PGTS:
         self.critic.load_state_dict(state["critic"])
         self.update.load_state_dict(state["update"])
         if self.search is not None:
-            self.search.load_state_dict(state["search"])
+            self.search.load_state_dict(state["searches"][self.ranks.rank % len(state["searches"])])
         self.num_iterations = state["num_iterations"]
         self.num_env_steps = state["num_env_steps"]
         self.num_model_calls = state["num_model_calls"]

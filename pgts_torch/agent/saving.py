@@ -14,7 +14,7 @@ from pgts_torch.errors import PgtsError
 PARTIAL = ".partial"
 """The end of the name of a file, or a folder, that is being written."""
 
-_MAGIC = b"pgts_torch 2\n"
+_MAGIC = b"pgts_torch 3\n"
 _DIGEST = hashlib.sha256().digest_size
 
 

@@ -74,6 +74,15 @@ class World(ABC):
         """What a policy sees of numbered states."""
 
     @abstractmethod
+    def export(self, state_N: Int[Tensor, "N"]) -> Any:
+        """What another process needs to know these states; it pickles."""
+
+    @abstractmethod
+    def adopt(self, exported: Any) -> Int[Tensor, "N"]:
+        """The numbers of states that another process has exported. Where a world numbers anew, the numbers are the same
+        in all processes that adopt the same states in the same order."""
+
+    @abstractmethod
     def forget(self) -> bool:
         """Begin to number anew where numbers only serve one iteration; whether it was so."""
 
@@ -115,6 +124,14 @@ class TabularWorld(World):
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """The state."""
         return state_N
+
+    def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        """The states."""
+        return state_N.cpu()
+
+    def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
+        """These."""
+        return exported.to(self.device)
 
     def forget(self) -> bool:
         """Nothing: a state keeps its number."""
@@ -164,6 +181,16 @@ class SimulatedWorld(World):
         """What the simulator showed in these states."""
         return self._seen.encode_part(self._model.observations(state_N))
 
+    def export(self, state_N: Int[Tensor, "N"]) -> tuple[list[Any], Tensor]:
+        """What the simulator knows of each distinct state; and which of these each state is."""
+        distinct, index_N = state_N.unique(return_inverse=True)
+        return self._model.export(distinct), index_N.cpu()
+
+    def adopt(self, exported: tuple[list[Any], Tensor]) -> Int[Tensor, "N"]:
+        """New numbers, or those of equal snapshots."""
+        known, index_N = exported
+        return self._model.adopt(known).to(self.device)[index_N.to(self.device)]
+
     def forget(self) -> bool:
         """All snapshots: their number grows with every search, and few of them return."""
         self._model.clear()
@@ -203,6 +230,14 @@ class DynamicsWorld(World):
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """What the environment shows in these states."""
         return self._model.observe(self._model.states(state_N))
+
+    def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        """The vectors."""
+        return self._model.states(state_N).cpu()
+
+    def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
+        """New numbers, or those of equal vectors."""
+        return self.numbers(exported.to(self.device))
 
     def forget(self) -> bool:
         """All states: hardly one of them returns."""
@@ -256,6 +291,14 @@ class PlainWorld(World):
         if len(self._shown) > 1:
             self._shown = [torch.cat(self._shown)]
         return self._shown[0][state_N]
+
+    def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        """The observations."""
+        return self.observe(state_N).cpu()
+
+    def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
+        """The next numbers."""
+        return self.numbers(exported.to(self.device))
 
     def forget(self) -> bool:
         """What was shown before."""

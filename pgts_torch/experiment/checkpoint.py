@@ -20,7 +20,7 @@ from pgts_torch.errors import PgtsError
 
 CHECKPOINTS = "checkpoints"
 MODEL_FILE, MANIFEST_FILE = "model.pt", "manifest.json"
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Notes:
 
     config: every key of the configuration, dotted, with its value.
     versions: of the packages that numbers depend on.
+    world_size: how many processes trained.
     metrics_bytes: the length of metrics.jsonl when it was taken.
     finished: whether the training had come to its end.
     progress: what the loop around the algorithm goes on from.
@@ -39,6 +40,7 @@ class Notes:
     model_calls: int
     config: Mapping[str, Any]
     versions: Mapping[str, str]
+    world_size: int
     metrics_bytes: int
     finished: bool
     progress: Mapping[str, Any]
@@ -49,18 +51,21 @@ class Damaged(PgtsError):
 
 
 def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
-    """Add a checkpoint to a run folder, and `tidy` it.
+    """Add a checkpoint to a run folder, and `tidy` it. Of several processes all must call it, and the first one writes.
 
     Raises:
         PgtsError: it cannot be written; then the others are as they were.
     """
     path = run / CHECKPOINTS / f"{notes.env_steps:012d}"
     partial = path.with_name(f".{path.name}{saving.PARTIAL}")
+    content = algorithm.content()
+    if not algorithm.ranks.leads:
+        return path
     try:
         path.parent.mkdir(exist_ok=True)
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
-        algorithm.save(partial / MODEL_FILE)
+        saving.write(partial / MODEL_FILE, content)
         files = {MODEL_FILE: hashlib.sha256((partial / MODEL_FILE).read_bytes()).hexdigest()}
         saving.replace(partial / MANIFEST_FILE, _sealed({"format": _FORMAT, "files": files, "notes": asdict(notes)}))
         _sync(partial)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from pgts_torch.errors import NotFinite, PgtsError, Stopped
+from pgts_torch.errors import NotFinite, PgtsError, RankLost, Stopped
 from pgts_torch.experiment.arguments import (
     Parser,
     depth_list,
@@ -31,7 +31,7 @@ from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.schema import Schema
 
-CHECK_FAILED = NOT_FINITE = 1
+CHECK_FAILED = TRAINING_FAILED = 1
 USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 
 Arguments = Sequence[str]
@@ -61,15 +61,18 @@ def main(arguments: Arguments | None = None) -> int:
         sys.stdout.flush()  # meets a broken pipe here, not while the interpreter shuts down
         return code
     except PgtsError as error:
-        for line in str(error).splitlines():
-            print(f"error: {line}", file=sys.stderr)
-        return NOT_FINITE if isinstance(error, NotFinite) else USAGE_ERROR
+        rank = _rank()
+        if error.rank in (None, rank) and not (rank and isinstance(error, RankLost)):
+            for line in str(error).splitlines():
+                print(f"error: {f'[rank {rank}] ' if rank else ''}{line}", file=sys.stderr)
+        return TRAINING_FAILED if isinstance(error, NotFinite | RankLost) else USAGE_ERROR
     except BrokenPipeError:
         # Nobody reads on: what is still in the buffer goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except Stopped as stopped:
-        print(stopped, file=sys.stderr)
+        if _rank() == 0:
+            print(stopped, file=sys.stderr)
         return 128 + stopped.signal
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -86,6 +89,9 @@ def train(arguments: Arguments) -> None:
     parser.add_argument(
         "--strict-resume", action="store_true", help="refuse a last checkpoint that is damaged or of other versions"
     )
+    parser.add_argument(
+        "--any-world-size", action="store_true", help="go on with another number of processes than before"
+    )
     parser.add_argument("--print-config", action="store_true", help="print the whole configuration as YAML and stop")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     if {"-h", "--help"} & set(arguments):
@@ -100,13 +106,14 @@ def train(arguments: Arguments) -> None:
     if fixed.print_config:
         sys.stdout.write(dump(config))
         return
-    if fixed.config is None and fixed.resume is None:
+    if fixed.config is None and fixed.resume is None and _rank() == 0:
         print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
     from pgts_torch.experiment import run
     from pgts_torch.experiment.summary import describe
 
-    summary = run.train(config, strict_resume=fixed.strict_resume)
-    print(json.dumps(asdict(summary)) if fixed.json else describe(summary))
+    summary = run.train(config, strict_resume=fixed.strict_resume, any_world_size=fixed.any_world_size)
+    if _rank() == 0:
+        print(json.dumps(asdict(summary)) if fixed.json else describe(summary))
 
 
 @command
@@ -287,6 +294,11 @@ def _run_command(arguments: Arguments) -> None:
         parser.error(f"{given.command!r} is not a command; {hint}")
     else:
         COMMANDS[given.command](given.arguments)
+
+
+def _rank() -> int:
+    """The number of this process among those that torchrun has started, of which the first one speaks."""
+    return int(os.environ["RANK"]) if "TORCHELASTIC_RUN_ID" in os.environ else 0
 
 
 def _version() -> str:

@@ -10,11 +10,16 @@ PLAIN_LINES = 20
 
 
 class Reporter:
-    """A progress bar on a terminal, a line now and then elsewhere."""
+    """A progress bar on a terminal, a line now and then elsewhere.
 
-    def __init__(self, total_steps: int) -> None:
-        self._total = total_steps
-        self._terminal = sys.stderr.isatty()
+    Args:
+        total_steps: of the training.
+        shown: whether anything is shown at all.
+    """
+
+    def __init__(self, total_steps: int, *, shown: bool) -> None:
+        self._total, self._shown = total_steps, shown
+        self._terminal = shown and sys.stderr.isatty()
         self._bar = tqdm(total=total_steps, unit="step", disable=not self._terminal, dynamic_ncols=True)
         self._next = 0
 
@@ -25,7 +30,7 @@ class Reporter:
         if self._terminal:
             self._bar.set_postfix({name: f"{value:.3g}" for name, value in numbers.items()}, refresh=False)
             self._bar.update(min(step, self._total) - self._bar.n)
-        elif step >= self._next:
+        elif self._shown and step >= self._next:
             self._next = step + self._total // PLAIN_LINES
             shown = "  ".join(f"{name} {value:8.3f}" for name, value in numbers.items())
             print(f"step {step:>9}  {shown}", file=sys.stderr)

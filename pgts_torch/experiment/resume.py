@@ -49,12 +49,19 @@ class Start:
             raise PgtsError("\n".join([*lines, f"the environment has changed since; {_ADVICE}"]))
 
 
-def find(config: Config, run: Path, *, strict: bool) -> Start | None:
+def find(
+    config: Config, run: Path, *, strict: bool = False, world_size: int = 1, any_world_size: bool = False
+) -> Start | None:
     """Where the training of a configuration begins in its run folder; None: at the beginning.
 
+    Args:
+        strict: refuse a last checkpoint that is damaged or of other versions.
+        world_size: how many processes are to go on.
+        any_world_size: whether it may have been another number before.
+
     Raises:
-        PgtsError: the folder holds a finished run, or one of another configuration, naming what differs; or no
-            checkpoint in it is intact; or, if `strict`, the newest one is not, or other versions made it.
+        PgtsError: the folder holds a finished run, or one of another configuration, naming what differs, or of another
+            number of processes; or no checkpoint in it is intact, or not the one that is asked for.
     """
     if not (run / CONFIG_FILE).is_file():
         return None
@@ -73,6 +80,11 @@ def find(config: Config, run: Path, *, strict: bool) -> Start | None:
     path, notes, content = found
     _check_metrics(run / METRICS_FILE, notes.metrics_bytes, path)
     _check_versions(notes.versions, path, strict=strict)
+    if notes.world_size != world_size and not any_world_size:
+        raise PgtsError(
+            f"{path} was written by {notes.world_size} processes, and {world_size} are to go on: start as many, or "
+            "give --any-world-size for other bits"
+        )
     return Start(path, notes, content["state"])
 
 

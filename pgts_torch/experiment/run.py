@@ -2,9 +2,11 @@
 
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,8 @@ from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.evaluate import Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.errors import NotFinite, Stopped, failure
+from pgts_torch.agent.ranks import joined_ranks
+from pgts_torch.errors import NotFinite, PgtsError, Stopped, failure
 from pgts_torch.experiment import checkpoint, diagnostics
 from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.config import Config, dump
@@ -34,6 +37,8 @@ from pgts_torch.experiment.tracking import (
     FAILURE_FILE,
     SUMMARY_FILE,
     VERSIONS_FILE,
+    Folder,
+    NoFolder,
     RunFolder,
     RunLock,
     check_folder,
@@ -77,49 +82,78 @@ def build(config: Config) -> PGTS:
     )
 
 
-def train(config: Config, *, strict_resume: bool = False) -> Summary:
+def train(config: Config, *, strict_resume: bool = False, any_world_size: bool = False) -> Summary:
     """Run a configuration to its end and leave a run folder.
 
     If the folder holds an unfinished run of this configuration, the training goes on from its last checkpoint, and
     ends with the same bits as if it had never been cut off.
 
+    Processes that torchrun has started train together; the first one writes and speaks for all.
+
     Args:
         strict_resume: refuse a last checkpoint that is damaged or of other versions, which otherwise is a warning.
+        any_world_size: go on with another number of processes than before.
 
     Raises:
         PgtsError: something in the configuration cannot be built, or the folder is taken; nothing was written.
         NotFinite: training met a number that is not finite; what and where stands in failure.json.
         Stopped: SIGTERM or SIGINT came; the iteration was finished and saved.
+        RankLost: another process is gone; the last checkpoint is what remains.
     """
     torch.set_num_threads(config.threads)
     if config.run.tensorboard:
         event_writer()
-    path = Path(config.run.dir) if config.run.dir else _new_folder(config)
-    check_folder(path)
-    algorithm = build(config)
-    with RunLock(path), StopFlag() as stop:
-        start = None if config.run.overwrite else find(config, path, strict=strict_resume)
-        if start is None:
-            clear_folder(path)
-        else:
-            start.check(algorithm)
-            checkpoint.tidy(path, start.path, keep=config.log.keep)
+    with joined_ranks() as ranks, StopFlag() as stop, ExitStack() as held:
+        path = ranks.first(lambda: _folder_of(config))
+        algorithm = build(config)
+
+        def claim() -> Start | None:
+            held.enter_context(RunLock(path))
+            if config.run.overwrite:
+                return None
+            found = find(config, path, strict=strict_resume, world_size=ranks.size, any_world_size=any_world_size)
+            if found is not None:
+                found.check(algorithm)
+            return found
+
+        start = ranks.first(claim)
+        if start is not None:
             algorithm.load_state_dict(dict(start.state))
-            print(f"going on from {start.path}", file=sys.stderr)
-        if config.critic.type == "exact":
-            print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
-        saving.replace(path / CONFIG_FILE, dump(config).encode())  # before all else: it makes this the folder of a run
-        position = (
-            {} if start is None else {"metrics_bytes": start.notes.metrics_bytes, "after_step": start.notes.env_steps}
-        )
-        with RunFolder(path, tensorboard=config.run.tensorboard, **position) as folder:
-            folder.text(VERSIONS_FILE, json.dumps(versions() | {"threads": config.threads}, indent=2) + "\n")
-            summary = _loop(config, algorithm, folder, start, stop)
-            folder.text(SUMMARY_FILE, json.dumps(asdict(summary), indent=2) + "\n")
+        folder: Folder = NoFolder(path)
+        if ranks.leads:
+            folder = held.enter_context(_opened(config, path, start))
+        summary = _loop(config, algorithm, folder, start, stop)
+        folder.text(SUMMARY_FILE, json.dumps(asdict(summary), indent=2) + "\n")
     return summary
 
 
-def _loop(config: Config, algorithm: PGTS, folder: RunFolder, start: Start | None, stop: StopFlag) -> Summary:
+def _folder_of(config: Config) -> Path:
+    """The run folder, a new one if none is named; PgtsError if it cannot be one."""
+    if not config.run.dir and int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")):
+        raise PgtsError("run.dir is not set; torchrun --max-restarts needs it, so that a restart finds the run")
+    path = Path(config.run.dir) if config.run.dir else _new_folder(config)
+    check_folder(path)
+    return path
+
+
+def _opened(config: Config, path: Path, start: Start | None) -> RunFolder:
+    """The run folder, with what a run leaves before it begins; it holds nothing else, or what it goes on from."""
+    if start is None:
+        clear_folder(path)
+        position = {}
+    else:
+        checkpoint.tidy(path, start.path, keep=config.log.keep)
+        print(f"going on from {start.path}", file=sys.stderr)
+        position = {"metrics_bytes": start.notes.metrics_bytes, "after_step": start.notes.env_steps}
+    if config.critic.type == "exact":
+        print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
+    saving.replace(path / CONFIG_FILE, dump(config).encode())  # before all else: it makes this the folder of a run
+    folder = RunFolder(path, tensorboard=config.run.tensorboard, **position)
+    folder.text(VERSIONS_FILE, json.dumps(versions() | {"threads": config.threads}, indent=2) + "\n")
+    return folder
+
+
+def _loop(config: Config, algorithm: PGTS, folder: Folder, start: Start | None, stop: StopFlag) -> Summary:
     recorder = _Recorder(config, algorithm, folder, stop)
     if start is not None:
         recorder.load(start.notes)
@@ -131,9 +165,9 @@ def _loop(config: Config, algorithm: PGTS, folder: RunFolder, start: Start | Non
             recorder.report.close()
         recorder.save()
         if not recorder.finished:
-            assert stop.signal is not None
+            signal = next(each for each in algorithm.ranks.gather(lambda: stop.signal) if each is not None)
             raise Stopped(
-                f"stopped at step {algorithm.num_env_steps}; `pgts train --resume {folder.path}` goes on", stop.signal
+                f"stopped at step {algorithm.num_env_steps}; `pgts train --resume {folder.path}` goes on", signal
             )
         return recorder.finish()
     except NotFinite as error:
@@ -149,11 +183,11 @@ class _Recorder:
     The tags of an iteration speak of the policy that made its episodes, which is the one before its update.
     """
 
-    def __init__(self, config: Config, algorithm: PGTS, folder: RunFolder, stop: StopFlag) -> None:
+    def __init__(self, config: Config, algorithm: PGTS, folder: Folder, stop: StopFlag) -> None:
         self.config, self.algorithm, self.folder, self.stop = config, algorithm, folder, stop
         self.ended_by: EndedBy | None = None
         self.truth = diagnostics.Truth(algorithm) if algorithm.world.mdp is not None else None
-        self.report = Reporter(config.total_steps)
+        self.report = Reporter(config.total_steps, shown=algorithm.ranks.leads)
         self._clock = time.perf_counter()
         self._started = self._saved_clock = self._clock
         self._saved_at = -1
@@ -189,7 +223,9 @@ class _Recorder:
         elif step >= self.config.total_steps:
             self.ended_by = "total_steps"
         every = self.config.log.checkpoint_every
-        is_due = every and (k % every == 0 or time.perf_counter() - self._saved_clock > MOST_SECONDS)
+        is_due = every and algorithm.ranks.first(
+            lambda: k % every == 0 or time.perf_counter() - self._saved_clock > MOST_SECONDS
+        )
         if is_due and not self.finished:  # the last one waits until the training has ended
             self.save()
         self._pi_SA = self._table()
@@ -213,6 +249,7 @@ class _Recorder:
             model_calls=self.algorithm.num_model_calls,
             config=flat(self.config),
             versions=versions(),
+            world_size=self.algorithm.ranks.size,
             metrics_bytes=self.folder.flush(),
             finished=self.finished,
             progress=progress,
@@ -285,7 +322,7 @@ class _Recorder:
         )
 
 
-def _evaluations(config: EvalConfig, seed: int, folder: RunFolder) -> dict[str, EvalCallback]:
+def _evaluations(config: EvalConfig, seed: int, folder: Folder) -> dict[str, EvalCallback]:
     """The evaluations during training, by how actions are taken; the deterministic ones say what is best and enough."""
     if config.every is None:
         return {}

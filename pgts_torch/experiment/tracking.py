@@ -7,12 +7,13 @@ import os
 import platform
 import shutil
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, final
 
 from matplotlib.figure import Figure
 
@@ -32,7 +33,51 @@ LOCK_FILE = ".lock"
 _PACKAGES = ("pgts_torch", "torch", "numpy", "scipy", "gymnasium", "tensorboard")
 
 
-class RunFolder:
+class Folder(ABC):
+    """Where a run leaves what it has to say."""
+
+    path: Path
+
+    @abstractmethod
+    def log(self, step: int, tags: dict[str, float]) -> None:
+        """Numbers of one step."""
+
+    @abstractmethod
+    def flush(self) -> int:
+        """Have all that was logged on the disk; how many bytes metrics.jsonl holds."""
+
+    @abstractmethod
+    def text(self, name: str, content: str) -> None:
+        """A text file, which is whole or not there."""
+
+    @abstractmethod
+    def picture(self, name: str, figure: Figure, step: int) -> None:
+        """A picture."""
+
+
+@final
+class NoFolder(Folder):
+    """Of a process that leaves nothing, because another one writes for it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def log(self, step: int, tags: dict[str, float]) -> None:
+        """Nothing."""
+
+    def flush(self) -> int:
+        """0."""
+        return 0
+
+    def text(self, name: str, content: str) -> None:
+        """Nothing."""
+
+    def picture(self, name: str, figure: Figure, step: int) -> None:
+        """Nothing."""
+
+
+@final
+class RunFolder(Folder):
     """Writes what a run leaves. Use it as a context: leaving it closes the files.
 
     Args:
@@ -103,7 +148,6 @@ class RunFolder:
                     self._events.add_scalar(tag, value, step)
 
     def flush(self) -> int:
-        """Have all that was logged on the disk; how many bytes metrics.jsonl holds."""
         with self._writing(METRICS_FILE):
             os.fsync(self._metrics.fileno())
         if self._events is not None:
@@ -112,7 +156,6 @@ class RunFolder:
         return os.fstat(self._metrics.fileno()).st_size
 
     def text(self, name: str, content: str) -> None:
-        """A text file, which is whole or not there."""
         saving.replace(self.path / name, content.encode())
 
     def picture(self, name: str, figure: Figure, step: int) -> None:

@@ -163,6 +163,14 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             self._observations[number] = shown
         return number
 
+    def export(self, state_N: Int[Tensor, "N"]) -> list[tuple[Snapshot, Any]]:
+        """The snapshot of each state, and what `observe` made of what it shows: for `adopt` in another process."""
+        return [(self.snapshot(state), self._observations[state]) for state in state_N.tolist()]
+
+    def adopt(self, exported: Iterable[tuple[Snapshot, Any]]) -> Int[Tensor, "N"]:
+        """The numbers of states that another model of the same environment has exported."""
+        return torch.tensor([self._known(*one) for one in exported], dtype=torch.int64, device=self.device)
+
     def snapshot(self, state: int) -> Snapshot:
         """The snapshot behind the number of a state."""
         self._check("state", state, self.num_states)

@@ -29,6 +29,7 @@ def notes(env_steps: int, *, metrics_bytes: int = 17) -> Notes:
         model_calls=3,
         config={"search.depth": 2, "update.step_size": 0.1},
         versions={"torch": "1"},
+        world_size=1,
         metrics_bytes=metrics_bytes,
         finished=False,
         progress={"certificate": None},
@@ -143,7 +144,7 @@ def test_another_format_is_named(tmp_path):
     [path] = written(tmp_path, 10)
     content = json.loads((path / MANIFEST_FILE).read_text())["content"] | {"format": 7}
     (path / MANIFEST_FILE).write_bytes(checkpoint._sealed(content))
-    with pytest.raises(PgtsError, match="has the format 7; this version reads 1") as raised:
+    with pytest.raises(PgtsError, match="has the format 7; this version reads 2") as raised:
         checkpoint.read(path)
     assert not isinstance(raised.value, Damaged)
 

@@ -39,7 +39,7 @@ class FakeRun(types.ModuleType):
         self.calls: list[Any] = []
         self.error: BaseException | None = None
 
-    def train(self, config: Config, *, strict_resume: bool = False) -> Answer:
+    def train(self, config: Config, *, strict_resume: bool, any_world_size: bool) -> Answer:
         self.calls.append(config)
         if self.error is not None:
             raise self.error

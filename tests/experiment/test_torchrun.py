@@ -1,0 +1,175 @@
+"""`torchrun train.py`: one folder, one voice, and nothing lost when a process is."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from pgts_torch.agent.iteration import Iteration
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.experiment import checkpoint, run
+from pgts_torch.experiment.cli import main
+from pgts_torch.experiment.tracking import read_metrics
+from pgts_torch.search.lookahead import check_finite
+from tests.ranks import launched
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+assert run.train  # imported before any process is forked, so that none has to
+ROOT = Path(__file__).parents[2]
+SMALL = ["--env.id", "CartPole-v1", "--policy.type", "mlp", "--policy.hidden", "[8]", "--search.depth", "1"]
+SHORT = ["--total_steps", "100", "--rollout.num_envs", "3", "--rollout.horizon.length", "8", "--eval.episodes", "2"]
+OFTEN = ["--log.checkpoint_every", "1", "--eval.every", "20", "--eval.keep_best", "--run.tensorboard", "false"]
+
+
+def arguments(folder: Path, *more: str) -> list[str]:
+    return ["train", *SMALL, *SHORT, *OFTEN, "--run.dir", str(folder), *more]
+
+
+def trained(folder: Path, *more: str, size: int = 2) -> list[int]:
+    return launched(size, lambda: main(arguments(folder, *more)))
+
+
+def struck(folder: Path, number: int, *, rank: int) -> list[int]:
+    """The exit codes where one process gets a signal in its third iteration."""
+
+    def work() -> int:
+        iterate = PGTS.iterate
+
+        def iterate_under_fire(self: PGTS) -> Iteration:
+            if self.num_iterations == 2 and self.ranks.rank == rank:
+                os.kill(os.getpid(), number)
+            return iterate(self)
+
+        PGTS.iterate = iterate_under_fire  # type: ignore[method-assign]  # in this process, which ends here
+        return main(arguments(folder))
+
+    return launched(2, work)
+
+
+def left(folder: Path) -> dict[str, Any]:
+    """What a run leaves, without what the clock and the name of the folder change."""
+    summary = json.loads((folder / "summary.json").read_text())
+    lines = [{name: value for name, value in line.items() if name != "charts/SPS"} for line in read_metrics(folder)]
+    files = {str(path.relative_to(folder)): (path / "model.pt").read_bytes() for path in checkpoint.listed(folder)}
+    files["best"] = (folder / "best.pt").read_bytes()
+    return files | {"lines": lines, "summary": {k: v for k, v in summary.items() if k not in ("seconds", "run")}}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> dict[str, Any]:
+    """What an uninterrupted run of two processes leaves."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    assert trained(folder) == [0, 0]
+    return left(folder)
+
+
+def test_two_processes_leave_one_run_and_speak_with_one_voice(whole, tmp_path, capfd):
+    folder = tmp_path / "run"
+    assert trained(folder) == [0, 0]
+    said = capfd.readouterr()
+    assert said.out.count("environment steps") == 1
+    shown = re.findall("^step +[0-9]+", said.err, re.MULTILINE)
+    assert len(shown) == len(set(shown)) > 1
+    steps = [line["step"] for line in read_metrics(folder) if "charts/SPS" in line]
+    assert steps == sorted(set(steps))
+    assert left(folder) == whole
+    assert main(["evaluate", str(folder), "--episodes", "2"]) == 0
+
+
+def test_one_process_makes_other_episodes(whole, tmp_path):
+    assert main(arguments(tmp_path / "run")) == 0
+    assert left(tmp_path / "run")["lines"] != whole["lines"]
+
+
+@pytest.mark.fault("lost rank")
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_lost_rank_ends_all_and_the_same_command_goes_on_bit_for_bit(rank, whole, tmp_path, capfd):
+    folder = tmp_path / "run"
+    codes = struck(folder, signal.SIGKILL, rank=rank)
+    assert codes[rank] == -signal.SIGKILL
+    assert codes[1 - rank] == 1
+    said = capfd.readouterr().err
+    assert said.count("error: rank 0 of 2 has lost another one\n") == rank
+    assert "Traceback" not in said
+    assert checkpoint.newest(folder, strict=True)[1].iterations == 2
+    assert trained(folder) == [0, 0]
+    assert left(folder) == whole
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_signal_to_one_process_stops_all_after_the_iteration(rank, whole, tmp_path, capfd):
+    folder = tmp_path / "run"
+    assert struck(folder, signal.SIGTERM, rank=rank) == [143, 143]
+    assert capfd.readouterr().err.count(f"`pgts train --resume {folder}` goes on") == 1
+    assert checkpoint.newest(folder, strict=True)[1].iterations == 3
+    assert trained(folder) == [0, 0]
+    assert left(folder) == whole
+
+
+@pytest.mark.fault("other world size at resume")
+def test_another_world_size_is_refused_unless_it_is_asked_for(tmp_path, capfd):
+    folder = tmp_path / "run"
+    assert struck(folder, signal.SIGTERM, rank=0) == [143, 143]
+    capfd.readouterr()
+    for size in (1, 3):
+        assert trained(folder, size=size) == [2] * size
+        said = capfd.readouterr().err
+        assert said.count("error: ") == 1
+        assert f"was written by 2 processes, and {size} are to go on" in said
+    assert trained(folder, "--any-world-size", size=3) == [0, 0, 0]
+    assert checkpoint.newest(folder, strict=True)[1].world_size == 3
+
+
+def test_a_mistake_that_only_the_first_process_can_see_is_said_once(whole, tmp_path, capfd):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("mine")
+    assert trained(tmp_path / "run") == [2, 2]
+    assert capfd.readouterr().err.count("holds files that no run has left") == 1
+    assert os.listdir(tmp_path / "run") == ["thesis.tex"]
+
+
+def test_a_number_that_is_not_finite_in_the_second_process_stops_both_and_is_written_down(tmp_path, capfd):
+    folder = tmp_path / "run"
+
+    def work() -> int:
+        look = PGTS.lookahead
+
+        def blind(self: PGTS, state_N: torch.Tensor, *, depth: int | None = None) -> Any:
+            found = look(self, state_N, depth=depth)
+            if self.ranks.rank == 1 and self.num_iterations == 1:
+                check_finite("lookahead", "the lookahead", found.q_BA * torch.nan, state_N)
+            return found
+
+        PGTS.lookahead = blind  # type: ignore[method-assign]  # in this process, which ends here
+        return main(arguments(folder))
+
+    assert launched(2, work) == [1, 1]
+    said = capfd.readouterr().err
+    assert said.count("error: ") == said.count("error: [rank 1] ") == 1
+    assert json.loads((folder / "failure.json").read_text())["tensor"] == "lookahead"
+    assert checkpoint.newest(folder, strict=True)[1].iterations == 1
+
+
+def test_torchrun_trains(tmp_path):
+    folder = tmp_path / "run"
+    command = ["-m", "torch.distributed.run", "--nproc-per-node=2", "train.py", *arguments(folder)[1:], "--json"]
+    made = subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    assert json.loads(made.stdout)["env_steps"] == read_metrics(folder)[-1]["step"]
+
+
+def test_a_restart_by_torchrun_needs_a_folder_that_it_can_find(tmp_path, monkeypatch, capfd):
+    monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "3")
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", *SMALL, *SHORT]) == 2
+    assert "run.dir is not set; torchrun --max-restarts needs it" in capfd.readouterr().err
+    assert not list(tmp_path.iterdir())
+    assert main(arguments(tmp_path / "run")) == 0
