@@ -36,10 +36,12 @@ class Start:
 
     def check(self, algorithm: PGTS) -> None:
         """PgtsError, naming each tensor, where the algorithm has others: its environment is no longer what it was."""
-        parts = ("policy", "critic", "update")  # what a search remembers grows
-        now, before = (
-            dict(_flat("", {part: state[part] for part in parts})) for state in (algorithm.state_dict(), self.state)
-        )
+        own = {  # by part: what a search remembers grows, and all ranks must ask for the whole together
+            "policy": algorithm.policy.state_dict(),
+            "critic": algorithm.critic.state_dict(),
+            "update": algorithm.update.state_dict(),
+        }
+        now, before = dict(_flat("", own)), dict(_flat("", {name: self.state[name] for name in own}))
         lines = [
             f"{name} has the shape {tuple(here.shape)}; in {self.path} it is {tuple(there.shape)}"
             for name, here in now.items()
