@@ -29,6 +29,7 @@ class Episodes:
         self._one_by_one = isinstance(env, SyncVectorEnv) and type(env).step is SyncVectorEnv.step
         self._over_B = np.zeros(env.num_envs, dtype=bool)
         self.observation: Any = env.reset(seed=seeds)[0]  # type: ignore[arg-type]  # or one seed for all
+        self._each = list(iterate(env.observation_space, self.observation)) if self._one_by_one else []
 
     def step(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rewards, discounts and whether an episode was truncated; they mean nothing where it was over before.
@@ -57,12 +58,11 @@ class Episodes:
     def _step_alive(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert isinstance(self._env, SyncVectorEnv)
         copies, space = self._env.envs, self._env.single_observation_space
-        each = list(iterate(self._env.observation_space, self.observation))
         reward_B, discount_B = np.zeros((2, len(copies)))
         truncated_B = np.zeros(len(copies), dtype=bool)
         for b in np.flatnonzero(alive_B):
-            each[b], reward_B[b], terminated, truncated_B[b], info = copies[b].step(action_B[b])
+            self._each[b], reward_B[b], terminated, truncated_B[b], info = copies[b].step(action_B[b])
             discount_B[b] = 0.0 if terminated else info.get("discount", self._gamma)
         rows: Any = create_empty_array(space, n=len(copies))
-        self.observation = concatenate(space, each, rows)
+        self.observation = concatenate(space, self._each, rows)
         return reward_B, discount_B, truncated_B
