@@ -166,7 +166,7 @@ def evaluate(arguments: Arguments) -> None:
 
 @command
 def report(arguments: Arguments) -> None:
-    """Write one HTML page about a run: its curves, policy and configuration."""
+    """Write one HTML page about a run, finished or not."""
     parser = Parser("report", report)
     parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run, finished or not")
     parser.add_argument("--out", metavar="FILE", type=html_file, help="where to write (default: RUN_DIR/report.html)")

@@ -36,13 +36,16 @@ $body
 </html>
 """)
 
+PROVED = ("proved", "The critic is exact, so it is a proof.")
+ESTIMATED = ("an estimate", "The critic is learned, so it is off by what the critic is off at the start states.")
+
 
 def page(facts: Facts, trained: Trained | None) -> str:
     """The whole page."""
     parts = [
         _head(facts),
         _notes(facts.notes),
-        _section("Summary", _tiles(facts.rows)),
+        _section("Summary", *_tiles(facts.rows)),
         _section("Certificate", *_certificate(facts.certificate)),
         *([_section("Policy", *_pictures(trained))] if trained else []),
         *(_section(heading, _panels(panels)) for heading, panels in facts.curves.items()),
@@ -96,21 +99,32 @@ def _section(heading: str, *content: Html) -> Html:
     return element("section", element("h2", heading), *content)
 
 
-def _tiles(rows: Mapping[str, str]) -> Html:
-    """Numbers large with what is said about them below; other values as text over the whole width."""
-    tiles = [_tile(typeset(name), value) for name, value in rows.items()]
-    return element("dl", *sorted(tiles, key=lambda tile: "wide" in tile[: tile.index(">")]), class_="tiles")
+def _tiles(rows: Mapping[str, str]) -> Iterator[Html]:
+    """Numbers large, with what is said about them below; then the values that are text."""
+    numbers = {name: value for name, value in rows.items() if _begins_with_a_number(value)}
+    yield element("dl", *(_number(typeset(name), value) for name, value in numbers.items()), class_="tiles")
+    texts = [(name, value) for name, value in rows.items() if name not in numbers]
+    if texts:
+        yield element("dl", *(_tile(name, element("dd", value)) for name, value in texts), class_="tiles text")
 
 
-def _tile(name: str, value: str) -> Html:
-    first, _, rest = value.partition(" ")
+def _begins_with_a_number(value: str) -> bool:
     try:
-        float(first)
+        float(value.partition(" ")[0])
     except ValueError:
-        return element("div", element("dt", name), element("dd", value), class_="tile wide")
-    number = f"{int(first):,}" if first.isdecimal() else typeset(first)
+        return False
+    return True
+
+
+def _number(name: str, value: str) -> Html:
+    first, _, rest = value.partition(" ")
+    shown = f"{int(first):,}" if first.isdecimal() else typeset(first)
     remark = [element("dd", typeset(rest.strip("()")), class_="remark")] if rest else []
-    return element("div", element("dt", name), element("dd", number, class_="number"), *remark, class_="tile")
+    return _tile(name, element("dd", shown, class_="number"), *remark)
+
+
+def _tile(name: str, *values: Html) -> Html:
+    return element("div", element("dt", name), *values, class_="tile")
 
 
 def _certificate(certificate: Certificate) -> Iterator[Html]:
@@ -122,23 +136,15 @@ def _certificate(certificate: Certificate) -> Iterator[Html]:
             "that says what it left out.",
         )
         return
-    kind = "proved" if certificate.is_proved else "estimated"
-    yield element(
-        "p", typeset(f"J* - J <= {certificate.bound:.3g} "), element("span", kind, class_="kind"), class_="bound"
-    )
-    trust = (
-        "It is proved: the critic is exact."
-        if certificate.is_proved
-        else "It is an estimate: the critic is learned, and the bound is off by what its values are off at the start "
-        "states."
-    )
+    kind, trust = PROVED if certificate.is_proved else ESTIMATED
+    missing = "" if certificate.missing is None else f" The truth is known here: {certificate.missing:.3g}."
+    bound = typeset(f"J* - J <= {certificate.bound:.3g} ")
+    yield element("p", bound, element("span", kind, class_="remark"), class_="bound")
     yield element(
         "p",
         "The last lookahead bounds how much more than this policy any policy can get from the start states, in "
-        f"discounted reward. {trust}",
+        f"discounted reward. {trust}{missing}",
     )
-    if certificate.missing is not None:
-        yield element("p", typeset(f"What is really missing is known here: J* - J = {certificate.missing:.3g}."))
 
 
 def _pictures(trained: Trained) -> Iterator[Html]:

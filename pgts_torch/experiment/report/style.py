@@ -12,7 +12,7 @@ body { margin: 0 auto; padding: 2rem 1.25rem 3rem; max-width: 70rem; background:
   font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
 h1 { margin: 0; font-size: 2rem; line-height: 1.2; overflow-wrap: anywhere; }
 h2 { margin: 0 0 0.75rem; font-size: 1.15rem; }
-p { margin: 0 0 0.75rem; max-width: 48rem; }
+p { margin: 0 0 0.75rem; max-width: 60rem; }
 section { margin-top: 2.25rem; }
 code { font-family: ui-monospace, Menlo, Consolas, "DejaVu Sans Mono", monospace; font-size: 0.85em;
   overflow-wrap: anywhere; }
@@ -29,13 +29,12 @@ mark { background: var(--mark); color: inherit; border-radius: 3px; padding: 0 0
 .tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(11.5rem, 1fr)); gap: 0.75rem; margin: 0; }
 .tile, .card { margin: 0; padding: 0.7rem 0.85rem; border: 1px solid var(--line); border-radius: 8px;
   background: var(--card); }
-.wide.tile { grid-column: 1 / -1; }
+.text { margin-top: 0.75rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 22rem), 1fr)); }
 dt { color: var(--faint); font-size: 0.85rem; }
 dd { margin: 0; overflow-wrap: anywhere; }
 .number { font-size: 1.6rem; font-weight: 600; line-height: 1.3; font-variant-numeric: tabular-nums; }
 .remark, .tags { color: var(--faint); font-size: 0.85rem; font-weight: 400; }
 .bound { font-size: 1.3rem; font-weight: 600; }
-.kind { font-size: 0.85rem; font-weight: 400; color: var(--faint); }
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 26rem), 1fr)); gap: 0.75rem;
   margin-bottom: 0.75rem; }
 .grid > section { margin-right: 1.25rem; }
