@@ -16,6 +16,9 @@ from pgts_torch.tabular.mdp import TabularMDP
 FEW = 20
 """Up to so many states have room for large numbers."""
 
+MOST_OUTLINED = 20
+"""More outlines than this would hide what they are around."""
+
 NUMBER_WIDTH = 0.45
 """Inches that a probability needs."""
 
@@ -132,10 +135,10 @@ def _draw_columns(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, *, width: float) -
 
 
 def _draw_marks(axes: Axes, mdp: TabularMDP) -> None:
-    """Start states outlined, unless every state is one."""
+    """Start states outlined, unless every state is one or they are many."""
     columns = mdp.shape[1]
     starts = torch.nonzero(mdp.start_S).flatten().tolist()
-    if len(starts) < mdp.num_states:
+    if len(starts) < mdp.num_states and len(starts) <= MOST_OUTLINED:
         for s in starts:
             corner = (s % columns - 0.5, s // columns - 0.5)
             axes.add_patch(_outline(corner))

@@ -111,7 +111,7 @@ def _curve(lines: Sequence[Mapping[str, Any]], tag: str, label: str) -> Curve:
 
 
 def _thinned(values: Sequence[float | None]) -> list[int]:
-    """The indices that a curve needs: of many points the first, the last, gaps, and each stretch's extremes."""
+    """The indices that a curve needs: of many points the first, the last, and each stretch's extremes or a gap."""
     if len(values) <= MOST_POINTS:
         return list(range(len(values)))
     kept = {0, len(values) - 1}

@@ -170,7 +170,7 @@ def _pictures(trained: Trained) -> Iterator[Html]:
     )
     yield element("div", *figures, class_="wide grid" if _is_row(trained) else "grid")
     if states > 1:
-        yield element("p", "Start states are outlined, unless all are; states that are never visited are pale.")
+        yield element("p", "Start states are outlined, unless many or all are; states that are never visited are pale.")
 
 
 def _is_row(trained: Trained) -> bool:
