@@ -52,7 +52,8 @@ class Episodes:
             self._env.reset(options={"reset_mask": self._over_B})
         self.observation, rewards, terminated_B, truncated_B, info = self._env.step(action_B)
         self._over_B = terminated_B | truncated_B
-        discount_B = np.where(terminated_B, 0.0, info.get("discount", self._gamma))
+        named_B = info.get("_discount", "discount" in info)  # which copies have named a discount
+        discount_B = np.where(terminated_B, 0.0, np.where(named_B, info.get("discount", 0.0), self._gamma))
         return np.array(rewards, dtype=np.float64), discount_B, truncated_B
 
     def _step_alive(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

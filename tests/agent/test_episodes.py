@@ -1,5 +1,7 @@
 """Copies step one by one or together; what follows from their episodes is the same."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -13,14 +15,16 @@ from pgts_torch.seeding import stream
 
 
 class Counted(gymnasium.Wrapper):
-    """Counts its steps; every third one has a discount of its own."""
+    """Counts its steps; every third one has a discount of its own, in each copy another one."""
 
-    num_steps = 0
+    def __init__(self, env, phase):
+        super().__init__(env)
+        self.num_steps, self.phase = 0, phase
 
     def step(self, action):
         self.num_steps += 1
         *answer, info = self.env.step(action)
-        return *answer, info | ({} if self.num_steps % 3 else {"discount": 0.5})
+        return *answer, info | ({} if (self.num_steps + self.phase) % 3 else {"discount": 0.5})
 
 
 class Halved(SyncVectorEnv):
@@ -32,8 +36,8 @@ class Halved(SyncVectorEnv):
 
 
 def copies(kind: type[SyncVectorEnv] = SyncVectorEnv) -> SyncVectorEnv:
-    make = lambda: Counted(gymnasium.make("CartPole-v1", max_episode_steps=-1))  # noqa: E731
-    return kind([make] * 6, autoreset_mode=AutoresetMode.DISABLED)
+    make = lambda phase: Counted(gymnasium.make("CartPole-v1", max_episode_steps=-1), phase)  # noqa: E731
+    return kind([partial(make, phase) for phase in range(6)], autoreset_mode=AutoresetMode.DISABLED)
 
 
 def made(env: VectorEnv, horizon: Horizon = FixedHorizon(100)) -> Rollout:  # noqa: B008 - frozen
@@ -64,10 +68,11 @@ def test_what_copies_do_that_step_one_by_one_is_what_they_do_together(horizon):
     assert np.array_equal(alone.returns(), together.returns())
 
 
-def test_a_discount_of_its_own_belongs_to_the_copy_that_names_it():
-    experience = made(copies(), FixedHorizon(7))
-    expected_T = torch.tensor([0.9, 0.9, 0.5, 0.9, 0.9, 0.5, 0.9], dtype=torch.float64)
-    assert torch.equal(experience.discount_TB, expected_T[:, None].expand(-1, 6))
+@pytest.mark.parametrize("together", [False, True])
+def test_a_discount_of_its_own_belongs_to_the_copy_that_names_it(together):
+    experience = made(VectorWrapper(copies()) if together else copies(), FixedHorizon(7))
+    named_TB = (torch.arange(1, 8)[:, None] + torch.arange(6)) % 3 == 0
+    assert torch.equal(experience.discount_TB, torch.from_numpy(np.where(named_TB, 0.5, 0.9)))
 
 
 def test_a_vector_environment_with_a_step_of_its_own_is_asked_for_it():
