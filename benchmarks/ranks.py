@@ -21,6 +21,7 @@ from typing import Any
 import common
 import torch
 
+from pgts_torch import PGTS
 from pgts_torch.agent.ranks import joined_ranks
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.run import build
@@ -28,42 +29,29 @@ from pgts_torch.experiment.run import build
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 NAMES = ("taxi", "cartpole", "acrobot", "mountain_car", "door_key")
 WORLD_SIZES = (1, 2)
-ITERATIONS, REPEATS = 12, 3
+ITERATIONS, REPEATS = 3, 3
 
 
 def iterations(name: str, count: int) -> dict[str, float]:
     """A training of some iterations, seen by the first process."""
     torch.set_num_threads(1)
+    clock = time.perf_counter
     with joined_ranks():
         model = build(load(str(CONFIGS / f"{name}.yaml"), []))
-        shared = timed(model, "update", "__call__") + timed(model, "critic", "fit")
-        seconds = []
-        for _ in range(count):
-            begun = time.perf_counter()
-            model.iterate()
-            seconds.append(time.perf_counter() - begun)
-        learning = [sum(parts) for parts in zip(*shared, strict=True)]
+        critic, update = type(model.critic), type(model.update)
+        with (
+            common.timed(PGTS, "iterate", clock) as whole,
+            common.timed(critic, "fit", clock) as fits,
+            common.timed(update, "__call__", clock) as updates,
+        ):
+            for _ in range(count):
+                model.iterate()
+        shares = [(fit + move) / all_of_it for fit, move, all_of_it in zip(fits, updates, whole, strict=True)]
         return {
-            "milliseconds": 1e3 * statistics.median(seconds),
-            "learning": statistics.median(part / whole for part, whole in zip(learning, seconds, strict=True)),
+            "milliseconds": 1e3 * statistics.median(whole),
+            "learning": statistics.median(shares),
             "model_calls": model.num_model_calls / model.num_env_steps,
         }
-
-
-def timed(model: Any, part: str, method: str) -> tuple[list[float]]:
-    """The seconds of each call of a method of a part, which are noted from now on."""
-    kind, seconds = type(getattr(model, part)), list[float]()
-    plain = getattr(kind, method)
-
-    def call(*args: Any, **kwargs: Any) -> Any:
-        begun = time.perf_counter()
-        try:
-            return plain(*args, **kwargs)
-        finally:
-            seconds.append(time.perf_counter() - begun)
-
-    setattr(kind, method, call)
-    return (seconds,)
 
 
 def launched(name: str, world_size: int, count: int) -> dict[str, float]:
@@ -91,7 +79,7 @@ def main() -> None:
             print(json.dumps(answer))
         return
     args = common.parser(__doc__).parse_args()
-    count, repeats = (3, 1) if args.quick else (ITERATIONS, REPEATS)
+    count, repeats = (1, 1) if args.quick else (ITERATIONS, REPEATS)
     rows: dict[str, Any] = {}
     print("| configuration | 1 process, ms | 2 processes, ms | ratio | learning, of 1 | model calls a step, 1 | 2 |")
     print("|---|---|---|---|---|---|---|")

@@ -14,8 +14,7 @@ import importlib.util
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,25 +38,6 @@ ITERATIONS = 4
 MOST_SECONDS = 10.0
 STILL = "1e-9"
 SHORT = ["--rollout.horizon.length", "50"]
-
-
-@contextmanager
-def timed(owner: Any, name: str) -> Iterator[list[float]]:
-    """The CPU seconds of each call of `owner.name` within."""
-    plain, seconds = getattr(owner, name), []
-
-    def call(*args: Any, **kwargs: Any) -> Any:
-        begin = time.process_time()
-        try:
-            return plain(*args, **kwargs)
-        finally:
-            seconds.append(time.process_time() - begin)
-
-    setattr(owner, name, call)
-    try:
-        yield seconds
-    finally:
-        setattr(owner, name, plain)
 
 
 @dataclass(frozen=True)
@@ -105,7 +85,7 @@ def our_training(case: Case, steps: int, seed: int) -> dict[str, float]:
         seed=seed,
     )
     asked: list[int] = []
-    with timed(algorithm_module, "rollout") as collecting:
+    with common.timed(algorithm_module, "rollout") as collecting:
         begin = time.process_time()
         model.learn(steps, callback=lambda _, iteration: asked.append(iteration.experience.alive_TB.numel()))
         seconds = time.process_time() - begin
@@ -128,7 +108,7 @@ def peer_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, 
     copies = DummyVecEnv([lambda: gymnasium.make("CartPole-v1", disable_env_checker=True)] * case.num_envs)
     network = {"net_arch": {"pi": list(HIDDEN), "vf": list(HIDDEN)}, "activation_fn": torch.nn.Tanh}
     model = getattr(stable_baselines3, case.kind)("MlpPolicy", copies, policy_kwargs=network, **options)
-    with timed(model, "collect_rollouts") as collecting:
+    with common.timed(model, "collect_rollouts") as collecting:
         begin = time.process_time()
         model.learn(steps)
         seconds = time.process_time() - begin
@@ -207,7 +187,7 @@ def lookahead(config: str, changes: list[str], depth: int, device: str) -> dict[
     found: dict[str, list[float]] = {"seconds": [], "looking": [], "calls": [], "states": []}
     while len(found["seconds"]) < ITERATIONS and sum(found["seconds"]) < MOST_SECONDS:
         begin = time.process_time()
-        with timed(model, "lookahead") as looks:
+        with common.timed(model, "lookahead") as looks:
             iteration = model.iterate()
         found["seconds"].append(time.process_time() - begin)
         found["looking"].append(sum(looks))
