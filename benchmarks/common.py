@@ -8,7 +8,8 @@ import statistics
 import sys
 import time
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,25 @@ def milliseconds(form: Form) -> float:
             torch.cuda.synchronize()
         calls, end = calls + 1, time.perf_counter()
     return (end - begin) / calls * 1e3
+
+
+@contextmanager
+def timed(owner: Any, name: str, clock: Callable[[], float] = time.process_time) -> Iterator[list[float]]:
+    """The CPU seconds, or those of another clock, of each call of `owner.name` within."""
+    plain, seconds = getattr(owner, name), []
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        begin = clock()
+        try:
+            return plain(*args, **kwargs)
+        finally:
+            seconds.append(clock() - begin)
+
+    setattr(owner, name, call)
+    try:
+        yield seconds
+    finally:
+        setattr(owner, name, plain)
 
 
 def median_ratio(above: list[float], below: list[float]) -> float:

@@ -14,8 +14,7 @@ import importlib.util
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,25 +38,6 @@ ITERATIONS = 4
 MOST_SECONDS = 10.0
 STILL = "1e-9"
 SHORT = ["--rollout.horizon.length", "50"]
-
-
-@contextmanager
-def timed(owner: Any, name: str) -> Iterator[list[float]]:
-    """The CPU seconds of each call of `owner.name` within."""
-    plain, seconds = getattr(owner, name), []
-
-    def call(*args: Any, **kwargs: Any) -> Any:
-        begin = time.process_time()
-        try:
-            return plain(*args, **kwargs)
-        finally:
-            seconds.append(time.process_time() - begin)
-
-    setattr(owner, name, call)
-    try:
-        yield seconds
-    finally:
-        setattr(owner, name, plain)
 
 
 @dataclass(frozen=True)
@@ -104,12 +84,12 @@ def our_training(case: Case, steps: int, seed: int) -> dict[str, float]:
         gamma=GAMMA,
         seed=seed,
     )
-    stepped: list[int] = []
-    with timed(algorithm_module, "rollout") as collecting:
+    asked: list[int] = []
+    with common.timed(algorithm_module, "rollout") as collecting:
         begin = time.process_time()
-        model.learn(steps, callback=lambda _, iteration: stepped.append(iteration.experience.alive_TB.numel()))
+        model.learn(steps, callback=lambda _, iteration: asked.append(iteration.experience.alive_TB.numel()))
         seconds = time.process_time() - begin
-    return _figures(model.num_env_steps, len(stepped), sum(stepped), seconds, sum(collecting))
+    return _figures(model.num_env_steps, len(asked), sum(asked), seconds, sum(collecting))
 
 
 def peer_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, float]:
@@ -128,18 +108,18 @@ def peer_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, 
     copies = DummyVecEnv([lambda: gymnasium.make("CartPole-v1", disable_env_checker=True)] * case.num_envs)
     network = {"net_arch": {"pi": list(HIDDEN), "vf": list(HIDDEN)}, "activation_fn": torch.nn.Tanh}
     model = getattr(stable_baselines3, case.kind)("MlpPolicy", copies, policy_kwargs=network, **options)
-    with timed(model, "collect_rollouts") as collecting:
+    with common.timed(model, "collect_rollouts") as collecting:
         begin = time.process_time()
         model.learn(steps)
         seconds = time.process_time() - begin
     return _figures(model.num_timesteps, len(collecting), model.num_timesteps, seconds, sum(collecting))
 
 
-def _figures(steps: int, updates: int, stepped: int, seconds: float, collecting: float) -> dict[str, float]:
-    """Transitions an update, environment steps made for each, and transitions a CPU second by part."""
+def _figures(steps: int, updates: int, asked: int, seconds: float, collecting: float) -> dict[str, float]:
+    """Transitions an update, how often the policy was asked for each, and transitions a CPU second by part."""
     return {
         "batch": steps / updates,
-        "stepped": stepped / steps,
+        "asked": asked / steps,
         "whole": steps / seconds,
         "learning": steps / (seconds - collecting),
         "collecting": steps / collecting,
@@ -166,7 +146,7 @@ def training_line(row: dict[str, Any]) -> str:
         part: {side: statistics.median(values) for side, values in of.items()} for part, of in row["figures"].items()
     }
     batch = middle["batch"]
-    line = f"{row['case']:17}{batch['ours']:7.0f}{batch['SB3']:6.0f}{middle['stepped']['ours']:9.2f}"
+    line = f"{row['case']:17}{batch['ours']:7.0f}{batch['SB3']:6.0f}{middle['asked']['ours']:9.2f}"
     for part in ("whole", "learning", "collecting"):
         line += f"{middle[part]['ours']:9,.0f}{middle[part]['SB3']:8,.0f}{row['ratios'][part]:7.2f}"
     return line
@@ -207,7 +187,7 @@ def lookahead(config: str, changes: list[str], depth: int, device: str) -> dict[
     found: dict[str, list[float]] = {"seconds": [], "looking": [], "calls": [], "states": []}
     while len(found["seconds"]) < ITERATIONS and sum(found["seconds"]) < MOST_SECONDS:
         begin = time.process_time()
-        with timed(model, "lookahead") as looks:
+        with common.timed(model, "lookahead") as looks:
             iteration = model.iterate()
         found["seconds"].append(time.process_time() - begin)
         found["looking"].append(sum(looks))
@@ -234,7 +214,7 @@ def main(arguments: list[str] | None = None) -> None:
     if args.only != "lookahead":
         if importlib.util.find_spec("stable_baselines3"):
             print("CartPole-v1, m = 0, sampled advantages; transitions a CPU second, medians")
-            print(f"{'':17}{'batch':>13}{'stepped':>9}{'whole training':>24}{'learning':>24}{'collecting':>24}")
+            print(f"{'':17}{'batch':>13}{'asked':>9}{'whole training':>24}{'learning':>24}{'collecting':>24}")
             print(f"{'':17}{'ours':>7}{'SB3':>6}{'ours':>9}" + f"{'ours':>9}{'SB3':>8}{'ratio':>7}" * 3)
             report["training"] = []
             for case in CASES:
@@ -262,9 +242,10 @@ def main(arguments: list[str] | None = None) -> None:
     common.write(report, args.json)
 
 
-TRAINING_NOTE = """batch: transitions an update. stepped: environment steps that ours makes for each transition: a copy
-whose episode is over goes on until the longest one ends, and that is not kept. learning: all but collecting, which in
-SB3 includes values and GAE. 8 x episode: whole episodes of 8 copies; 64 x 8: 64 copies, 8 steps each.
+TRAINING_NOTE = """batch: transitions an update. asked: how often our policy is asked for each transition: a copy whose
+episode is over rests until the longest one ends, and what the policy says of it is not kept. learning: all but
+collecting, which in SB3 includes values and GAE. 8 x episode: whole episodes of 8 copies; 64 x 8: 64 copies, 8 steps
+each.
 """
 
 LOOKAHEAD_NOTE = """first: nothing is known of the model yet; later: median of the next iterations.

@@ -146,7 +146,12 @@ def make_depths(depth: int | Literal["adaptive"], max_depth: int | None, toleran
 
 
 def check_parts(
-    arguments: Mapping[str, Any], world: World, policy: Policy, update: Update, estimator: Estimator
+    arguments: Mapping[str, Any],
+    world: World,
+    policy: Policy,
+    critic: Critic,
+    update: Update,
+    estimator: Estimator,
 ) -> None:
     """PgtsError where parts do not fit each other, or where one of the arguments of `PGTS` would have no effect."""
     update.check(policy)
@@ -168,6 +173,11 @@ def check_parts(
             raise PgtsError(f"{name} is {value}; sampled advantages look no step ahead, it must be {default}")
     if not isinstance(update, NetworkUpdate):
         raise PgtsError(f"{type(update).__name__} takes one row a state; sampled advantages have one a visit")
+    if not isinstance(critic, TabularCritic | NetworkCritic) or critic.target != "v":
+        raise PgtsError(
+            f"the critic is {type(critic).__name__} of {critic.target}; sampled advantages stand on what was learned "
+            "before, so they need a tabular or network critic of v"
+        )
     if isinstance(update, NetworkMirrorUpdate):
         raise PgtsError(
             "NetworkMirrorUpdate needs the advantages of all actions, for they stand in an exponent; sampled ones are "

@@ -228,13 +228,19 @@ class Network(nn.Module):
         self.trunk = trunk
         head = skip_init(nn.Linear, trunk.num_features, num_outputs)
         self.head: nn.Linear = _orthogonal(head, gain, generator)
-        self._layers = [*trunk.layers, self.head]  # a plain list: calls of nested modules cost as much as small layers
+        # Plain functions: calls of nested modules cost as much as small layers.
+        self._layers = [layer.forward for layer in (*trunk.layers, self.head)]
         self._most_rows = max(1, _MOST_INPUTS // max(trunk.encoder.num_inputs, trunk.num_features))
 
     @cached_property
     def weights(self) -> list[nn.Parameter]:
         """All parameters, the trunk's first."""
         return list(self.parameters())
+
+    @cached_property
+    def _named(self) -> dict[str, Tensor]:
+        """Weights and running statistics themselves."""
+        return self.state_dict(keep_vars=True)
 
     def encode(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
         """The inputs that `forward` takes; they carry no gradient."""
@@ -252,14 +258,15 @@ class Network(nn.Module):
             return self.forward(self.encode(observation_N))
         return torch.cat([self.forward(self.encode(piece)) for piece in observation_N.split(self._most_rows)])
 
+    @torch.no_grad()
     def plain_state(self) -> dict[str, Tensor]:
         """Weights and running statistics, copied to the CPU."""
-        return {name: value.detach().cpu().clone() for name, value in self.state_dict().items()}
+        return {name: value.to("cpu", copy=True) for name, value in self._named.items()}
 
     @torch.no_grad()
     def take_over(self, state: Mapping[str, Any]) -> None:
         """What `plain_state` gave; PgtsError, and nothing changed, unless all of it fits."""
-        own = self.state_dict()
+        own = self._named
         if unknown := sorted(set(state) - set(own)):
             raise PgtsError(f"{unknown[0]} belongs to another network; this one has {sorted(own)}")
         found = {name: fitting(dict(state), name, like) for name, like in own.items()}

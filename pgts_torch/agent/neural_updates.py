@@ -341,7 +341,7 @@ def _check_numbers(advantage_NA: Tensor, weight_N: Tensor) -> None:
                 raise NotFinite(
                     f"{name}[{where}] is {float(value[place])}; it must be finite", what=name.partition("_")[0]
                 )
-    if not float(weight_N.sum()) > 0 or bool((weight_N < 0).any()):
+    if not float(weight_N.sum()) > 0 or float(weight_N.min()) < 0:
         raise PgtsError(f"weight_N is {weight_N.tolist()[:8]}; weights are at least 0, and some state must count")
 
 

@@ -161,7 +161,7 @@ class PGTS:
         self.search: Search | None = None
         if isinstance(self.estimator, LookaheadAdvantages):
             self.search = make_search(search, self.world)
-        check_parts(self._arguments, self.world, self.policy, self.update, self.estimator)
+        check_parts(self._arguments, self.world, self.policy, self.critic, self.update, self.estimator)
         self._values_of_actions = None if actions_per_dimension is None else divided_actions(self.world.env)
         self.num_iterations = 0
         self.num_env_steps = 0

@@ -11,9 +11,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.copies import env_name
+from pgts_torch.agent.episodes import Episodes
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.world import World
-from pgts_torch.errors import NotFinite, PgtsError, failure
+from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.seeding import draw_keys, seed_sequence
 
@@ -180,8 +181,8 @@ def rollout(
     """
     words = seed_sequence(seed, *names, "env").generate_state(env.num_envs)
     try:
-        observation, _ = env.reset(seed=words.tolist())
-        observation_B, reads = world.encode(observation), [world.read(env, observation)]
+        episodes = Episodes(env, gamma=world.gamma, seeds=words.tolist())
+        observation_B, reads = world.encode(episodes.observation), [world.read(env, episodes.observation)]
     except Exception as error:
         raise _failure(env, "at the start", words.tolist(), error) from error
     # What is small stays in numpy until the end: on tensors of a few numbers, each operation costs several times more.
@@ -190,7 +191,8 @@ def rollout(
     while len(rows) < horizon.limit and alive_B.any():
         action_B = policy.sample(observation_B, generator=generator).cpu().numpy()
         try:
-            reward_B, discount_B, truncated_B, observation_B, read_B = _step(world, env, action_B)
+            reward_B, discount_B, truncated_B = episodes.step(action_B, alive_B)
+            observation_B, read_B = world.encode(episodes.observation), world.read(env, episodes.observation)
         except Exception as error:
             raise _failure(env, f"in step {len(rows)}", words.tolist(), error) from error
         survival_B = horizon.survival(torch.from_numpy(discount_B), generator).numpy()
@@ -218,25 +220,6 @@ def rollout(
 
 def _failure(env: VectorEnv, when: str, seeds: list[int], error: Exception) -> PgtsError:
     return failure(f"{env_name(env)} failed {when} of the episodes with the seeds {seeds}", error)
-
-
-def _step(
-    world: World, env: VectorEnv, action_B: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor, Tensor]:
-    """Rewards, discounts, whether a copy was truncated, observations, and what states are numbered by; copies that are
-    over start again."""
-    observation, rewards, terminated, truncated, info = env.step(action_B)
-    reward_B = np.array(rewards, dtype=np.float64)
-    if not np.isfinite(reward_B).all():
-        raise NotFinite(f"the rewards are {reward_B.tolist()}; they must be finite", what="reward")
-    discount_B = np.where(terminated, 0.0, info.get("discount", world.gamma))
-    if not np.isfinite(discount_B).all():
-        raise NotFinite(f"the discounts are {discount_B.tolist()}; they must be finite", what="discount")
-    observation_B, read_B = world.encode(observation), world.read(env, observation)
-    over = terminated | truncated
-    if over.any():
-        env.reset(options={"reset_mask": over})
-    return reward_B, discount_B, truncated, observation_B, read_B
 
 
 def simulated_returns(

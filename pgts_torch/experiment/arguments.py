@@ -142,6 +142,16 @@ def output_folder(text: str) -> Path:
     return path
 
 
+def html_file(text: str) -> Path:
+    """An argparse type: a file that ends in .html, in a folder that exists."""
+    path = Path(text)
+    if path.suffix != ".html" or path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a file that ends in .html")
+    if not path.parent.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r}: {str(path.parent)!r} is not a folder")
+    return path
+
+
 def run_folder(text: str) -> Path:
     """An argparse type: a folder with the configuration of a run in it."""
     path = Path(text)

@@ -17,6 +17,7 @@ from pgts_torch.experiment.arguments import (
     Parser,
     depth_list,
     describe_options,
+    html_file,
     json_object,
     output_folder,
     print_values,
@@ -162,6 +163,20 @@ def evaluate(arguments: Arguments) -> None:
 
     answer = evaluate_run(given.run_dir, episodes=given.episodes, seed=given.seed)
     print_values({kind: asdict(evaluation) for kind, evaluation in answer.items()}, as_json=given.json)
+
+
+@command
+def report(arguments: Arguments) -> None:
+    """Write one HTML page about a run, finished or not."""
+    parser = Parser("report", report)
+    parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run, finished or not")
+    parser.add_argument("--out", metavar="FILE", type=html_file, help="where to write (default: RUN_DIR/report.html)")
+    parser.add_argument("--json", action="store_true", help="print what the page shows as one JSON object")
+    given = parser.parse_args(arguments)
+    from pgts_torch.experiment.report.command import write
+
+    answer = write(given.run_dir, given.out)
+    print(json.dumps(answer) if given.json else answer["page"])
 
 
 @command

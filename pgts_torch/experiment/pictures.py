@@ -13,6 +13,15 @@ from torch import Tensor
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
 
+FEW = 20
+"""Up to so many states have room for large numbers."""
+
+MOST_OUTLINED = 20
+"""More outlines than this would hide what they are around."""
+
+NUMBER_WIDTH = 0.45
+"""Inches that a probability needs."""
+
 DIRECTIONS = {"left": (-1, 0), "right": (1, 0), "up": (0, 1), "down": (0, -1)}
 
 
@@ -27,12 +36,34 @@ def policy_picture(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], *, title: str =
     figure = Figure(figsize=size, layout="constrained")
     value_axes, policy_axes = figure.subplots(2, 1) if wide else figure.subplots(1, 2)
     _draw_values(value_axes, mdp, evaluation.v_S, evaluation.d_S > 0)
-    if rows > 1 and all(name in DIRECTIONS for name in mdp.action_names):
-        _draw_arrows(policy_axes, mdp, pi_SA, evaluation.d_S > 0)
-    else:
-        _draw_columns(policy_axes, mdp, pi_SA)
+    _draw_policy(policy_axes, mdp, pi_SA, evaluation.d_S > 0, width=size[0] if wide else size[0] / 2)
     figure.suptitle(f"{title}   J = {evaluation.J:.4g}".strip())
     return figure
+
+
+def single_pictures(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> tuple[Figure, Figure]:
+    """The two halves of `policy_picture`, v^pi and pi, each for itself and without a title."""
+    evaluation = exact.evaluate(mdp, pi_SA)
+    rows, columns = mdp.shape
+    size = (min(max(5, 2 + 0.7 * columns), 12), 2.5) if columns > 3 * rows else (5.5, 4.5)
+    figures = Figure(figsize=size, layout="constrained"), Figure(figsize=size, layout="constrained")
+    value_axes, policy_axes = (figure.subplots() for figure in figures)
+    _draw_values(value_axes, mdp, evaluation.v_S, evaluation.d_S > 0)
+    _draw_policy(policy_axes, mdp, pi_SA, evaluation.d_S > 0, width=size[0])
+    for axes in (value_axes, policy_axes):
+        axes.set_title("")
+    if rows == 1:
+        value_axes.set_xlabel("state")
+        if columns <= FEW:
+            value_axes.set_xticks(range(columns))
+    return figures
+
+
+def _draw_policy(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, visited_S: Tensor, *, width: float) -> None:
+    if mdp.shape[0] > 1 and all(name in DIRECTIONS for name in mdp.action_names):
+        _draw_arrows(axes, mdp, pi_SA, visited_S)
+    else:
+        _draw_columns(axes, mdp, pi_SA, width=width)
 
 
 def _draw_values(axes: Axes, mdp: TabularMDP, v_S: Tensor, visited_S: Tensor) -> None:
@@ -43,16 +74,17 @@ def _draw_values(axes: Axes, mdp: TabularMDP, v_S: Tensor, visited_S: Tensor) ->
     _draw_marks(axes, mdp)
     if mdp.num_states <= 100:
         low, high = float(v_S.min()), float(v_S.max())
+        few = mdp.num_states <= FEW
         for s, value in enumerate(v_S.tolist()):
             dark = value < (low + high) / 2
             alpha = 1.0 if visited_S[s] else 0.5
             axes.text(
                 s % columns,
                 s // columns,
-                f"{value:.2g}",
+                f"{value:.3g}" if few else f"{value:.2g}",
                 ha="center",
                 va="center",
-                fontsize=7,
+                fontsize=9 if few else 7,
                 color="w" if dark else "k",
                 alpha=alpha,
             )
@@ -86,13 +118,15 @@ def _draw_arrows(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, visited_S: Tensor) 
     axes.set_title("policy, arrow length is probability")
 
 
-def _draw_columns(axes: Axes, mdp: TabularMDP, pi_SA: Tensor) -> None:
+def _draw_columns(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, *, width: float) -> None:
+    """`width`: of the picture, in inches."""
     image = axes.imshow(pi_SA.T.numpy(), cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     axes.figure.colorbar(image, ax=axes, label="probability")
     axes.set_yticks(range(mdp.num_actions), mdp.action_names)
     axes.set_xlabel("state")
-    if mdp.num_states <= 20:
+    if mdp.num_states <= FEW:
         axes.set_xticks(range(mdp.num_states))
+    if mdp.num_states * NUMBER_WIDTH <= width:
         for s in range(mdp.num_states):
             for a in range(mdp.num_actions):
                 p = float(pi_SA[s, a])
@@ -101,10 +135,10 @@ def _draw_columns(axes: Axes, mdp: TabularMDP, pi_SA: Tensor) -> None:
 
 
 def _draw_marks(axes: Axes, mdp: TabularMDP) -> None:
-    """Start states outlined, unless every state is one."""
+    """Start states outlined, unless every state is one or they are many."""
     columns = mdp.shape[1]
     starts = torch.nonzero(mdp.start_S).flatten().tolist()
-    if len(starts) < mdp.num_states:
+    if len(starts) < mdp.num_states and len(starts) <= MOST_OUTLINED:
         for s in starts:
             corner = (s % columns - 0.5, s // columns - 0.5)
             axes.add_patch(_outline(corner))

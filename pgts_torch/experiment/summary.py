@@ -1,10 +1,11 @@
 """What a finished run came to, for programs and for people."""
 
 import textwrap
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pgts_torch.agent.evaluate import Evaluation
+from pgts_torch.agent.evaluate import Evaluation, Score
 
 EndedBy = Literal["total_steps", "certificate", "return"]
 
@@ -47,9 +48,29 @@ class Summary:
     sampled: Evaluation
 
 
+def from_json(content: Mapping[str, Any]) -> Summary:
+    """The summary that a run has left as JSON; TypeError or KeyError if it is of another form."""
+    evaluations = {kind: _evaluation(content[kind]) for kind in ("deterministic", "sampled")}
+    return Summary(**{**content, **evaluations})
+
+
+def _evaluation(content: Mapping[str, Any]) -> Evaluation:
+    scores = {name: Score(**value) for name, value in content.items() if name != "episodes"}
+    return Evaluation(episodes=content["episodes"], **scores)
+
+
 def describe(summary: Summary) -> str:
     """The summary as a person reads it, within 80 columns."""
-    rows: dict[str, Any] = {}
+    return "\n".join(f"{name:<28}{_folded(name, value)}" for name, value in rows(summary).items())
+
+
+def _folded(name: str, value: str) -> str:
+    return textwrap.fill(value, 50).replace("\n", "\n" + 28 * " ") if name == "search" else value
+
+
+def rows(summary: Summary) -> dict[str, str]:
+    """What `describe` says, by name."""
+    rows: dict[str, str] = {}
     if summary.J is not None and summary.J_optimal is not None:
         share = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 <= summary.J else ""
         rows |= {
@@ -63,14 +84,14 @@ def describe(summary: Summary) -> str:
     rows |= {
         "greedy episodes, return": _score_text(summary.deterministic),
         "sampled episodes, return": _score_text(summary.sampled),
-        "search": textwrap.fill(summary.search, 50).replace("\n", "\n" + 28 * " "),
+        "search": summary.search,
         "training ended by": _ENDINGS[summary.ended_by],
         "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",
-        "model calls": summary.model_calls,
+        "model calls": str(summary.model_calls),
         "seconds": f"{summary.seconds:.1f}",
         "run folder": summary.run,
     }
-    return "\n".join(f"{name:<28}{value}" for name, value in rows.items())
+    return rows
 
 
 def _score_text(evaluation: Evaluation) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
 from torch import Tensor
 
 from pgts_torch import PGTS
@@ -46,34 +47,33 @@ def spoiled(function: Callable[..., Tensor], value: float) -> Callable[..., Tens
     return wrapped
 
 
+def last_replaced(numbers: object, value: float) -> np.ndarray:
+    array = np.array(numbers, dtype=np.float64)
+    array.flat[-1] = value
+    return array
+
+
+def in_steps(patch: pytest.MonkeyPatch, model: PGTS, change: Callable[..., tuple]) -> None:
+    """Change what is answered by the last copy, or by all where copies step together."""
+    env = model.world.env
+    stepped = env.envs[-1] if isinstance(env, SyncVectorEnv) else env
+    step = stepped.step
+    patch.setattr(stepped, "step", lambda action: change(*step(action)))
+
+
 def in_rewards(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
-    step = model.world.env.step
-
-    def wrapped(actions):
-        observation, reward, *rest = step(actions)
-        return observation, np.where(np.arange(len(reward)) == 1, value, reward), *rest
-
-    patch.setattr(model.world.env, "step", wrapped)
+    in_steps(patch, model, lambda observation, reward, *rest: (observation, last_replaced(reward, value), *rest))
 
 
 def in_discounts(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
-    step = model.world.env.step
+    def change(observation, reward, terminated, truncated, info):
+        return observation, reward, terminated, truncated, info | {"discount": np.full(np.shape(reward), value)}
 
-    def wrapped(actions):
-        *answer, info = step(actions)
-        return *answer, info | {"discount": np.full(2, value)}
-
-    patch.setattr(model.world.env, "step", wrapped)
+    in_steps(patch, model, change)
 
 
 def in_observations(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
-    step = model.world.env.step
-
-    def wrapped(actions):
-        observation, *rest = step(actions)
-        return np.where(np.arange(observation.size).reshape(observation.shape) == 1, value, observation), *rest
-
-    patch.setattr(model.world.env, "step", wrapped)
+    in_steps(patch, model, lambda observation, *rest: (last_replaced(observation, value), *rest))
 
 
 def in_rewards_of_the_model(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:

@@ -290,6 +290,10 @@ def test_arguments_that_do_not_fit_are_refused(kwargs, message):
         ({"update": "mirror"}, "NetworkMirrorUpdate needs the advantages of all actions"),
         ({"policy": "softmax", "update": "mirror"}, "MirrorUpdate takes one row a state"),
         ({"depth": 1}, "depth is 1; sampled advantages look no step ahead"),
+        ({"critic": "exact"}, "the critic is ExactCritic of v; sampled advantages"),
+        ({"critic": "rollout"}, "the critic is RolloutCritic of v; sampled advantages"),
+        ({"critic": {"type": "tabular", "target": "q"}}, "the critic is TabularCritic of q; sampled advantages"),
+        ({"critic": {"type": "network", "target": "q"}}, "the critic is NetworkCritic of q; sampled advantages"),
     ],
 )
 def test_sampled_advantages_are_refused_where_they_mean_nothing(options, message):

@@ -1,0 +1,69 @@
+"""One episode of each copy of an environment."""
+
+from typing import Any, final
+
+import numpy as np
+from gymnasium.vector import SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+
+from pgts_torch.errors import NotFinite
+
+
+@final
+class Episodes:
+    """Copies of an environment, from a fresh reset on.
+
+    A copy whose episode is over rests where copies can be stepped one by one; else it starts again, and what it does
+    then is of no interest.
+
+    observation: what the copies show.
+
+    Args:
+        env: copies in `AutoresetMode.DISABLED`.
+        gamma: discount of a step that names none.
+        seeds: of each copy.
+    """
+
+    def __init__(self, env: VectorEnv, *, gamma: float, seeds: list[int]) -> None:
+        self._env, self._gamma = env, gamma
+        self._one_by_one = isinstance(env, SyncVectorEnv) and type(env).step is SyncVectorEnv.step
+        self._over_B = np.zeros(env.num_envs, dtype=bool)
+        self.observation: Any = env.reset(seed=seeds)[0]  # type: ignore[arg-type]  # or one seed for all
+        self._each = list(iterate(env.observation_space, self.observation)) if self._one_by_one else []
+
+    def step(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rewards, discounts and whether an episode was truncated; they mean nothing where it was over before.
+
+        Args:
+            alive_B: the episodes that go on.
+
+        Raises:
+            NotFinite: a reward or a discount is not.
+        """
+        step = self._step_alive if self._one_by_one else self._step_all
+        reward_B, discount_B, truncated_B = step(action_B, alive_B)
+        for what, value_B in (("reward", reward_B), ("discount", discount_B)):
+            if not np.isfinite(value_B).all():
+                raise NotFinite(f"the {what}s are {value_B.tolist()}; they must be finite", what=what)
+        return reward_B, discount_B, truncated_B
+
+    def _step_all(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if self._over_B.any():
+            self._env.reset(options={"reset_mask": self._over_B})
+        self.observation, rewards, terminated_B, truncated_B, info = self._env.step(action_B)
+        self._over_B = terminated_B | truncated_B
+        named_B = info.get("_discount", "discount" in info)  # which copies have named a discount
+        discount_B = np.where(terminated_B, 0.0, np.where(named_B, info.get("discount", 0.0), self._gamma))
+        return np.array(rewards, dtype=np.float64), discount_B, truncated_B
+
+    def _step_alive(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        assert isinstance(self._env, SyncVectorEnv)
+        copies, space = self._env.envs, self._env.single_observation_space
+        reward_B, discount_B = np.zeros((2, len(copies)))
+        truncated_B = np.zeros(len(copies), dtype=bool)
+        for b in np.flatnonzero(alive_B):
+            self._each[b], reward_B[b], terminated, truncated_B[b], info = copies[b].step(action_B[b])
+            discount_B[b] = 0.0 if terminated else info.get("discount", self._gamma)
+        rows: Any = create_empty_array(space, n=len(copies))
+        self.observation = concatenate(space, self._each, rows)
+        return reward_B, discount_B, truncated_B

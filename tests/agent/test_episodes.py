@@ -1,0 +1,79 @@
+"""Copies step one by one or together; what follows from their episodes is the same."""
+
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Horizon, Rollout, rollout
+from pgts_torch.agent.world import make_world
+from pgts_torch.seeding import stream
+
+
+class Counted(gymnasium.Wrapper):
+    """Counts its steps; every third one has a discount of its own, in each copy another one."""
+
+    def __init__(self, env, phase):
+        super().__init__(env)
+        self.num_steps, self.phase = 0, phase
+
+    def step(self, action):
+        self.num_steps += 1
+        *answer, info = self.env.step(action)
+        return *answer, info | ({} if (self.num_steps + self.phase) % 3 else {"discount": 0.5})
+
+
+class Halved(SyncVectorEnv):
+    """Has a step of its own, in which rewards are halved."""
+
+    def step(self, actions):
+        observation, reward_B, *rest = super().step(actions)
+        return observation, reward_B / 2, *rest
+
+
+def copies(kind: type[SyncVectorEnv] = SyncVectorEnv) -> SyncVectorEnv:
+    make = lambda phase: Counted(gymnasium.make("CartPole-v1", max_episode_steps=-1), phase)  # noqa: E731
+    return kind([partial(make, phase) for phase in range(6)], autoreset_mode=AutoresetMode.DISABLED)
+
+
+def made(env: VectorEnv, horizon: Horizon = FixedHorizon(100)) -> Rollout:  # noqa: B008 - frozen
+    world = make_world(env, num_envs=6, gamma=0.9, observation_key=None, plain=True, device="cpu")
+    policy = NetworkPolicy(world.observation_space, 2, seed=1)
+    return rollout(world, env, policy, horizon, seed=0, names=("test",), generator=stream(0, "test"))
+
+
+def test_copies_whose_episode_is_over_are_not_stepped():
+    env, together = copies(), copies()
+    experience = made(env)
+    assert sum(copy.num_steps for copy in env.envs) == experience.num_steps < experience.alive_TB.numel()
+    assert [copy.num_steps for copy in env.envs] == experience.alive_TB.sum(0).tolist()
+    made(VectorWrapper(together))
+    assert sum(copy.num_steps for copy in together.envs) == experience.alive_TB.numel()
+
+
+@pytest.mark.parametrize("horizon", [FixedHorizon(100), FixedHorizon(7), GeometricHorizon()], ids=str)
+def test_what_copies_do_that_step_one_by_one_is_what_they_do_together(horizon):
+    alone, together = made(copies(), horizon), made(VectorWrapper(copies()), horizon)
+    alive_TB = alone.alive_TB
+    assert torch.equal(alive_TB, together.alive_TB)
+    for name in ("action_TB", "reward_TB", "weight_TB", "survival_TB"):
+        assert torch.equal(getattr(alone, name)[alive_TB], getattr(together, name)[alive_TB]), name
+    for name in ("state_TB", "next_state_TB"):
+        shown = [one.observe(getattr(one, name)[alive_TB]) for one in (alone, together)]
+        assert torch.equal(*shown), name
+    assert np.array_equal(alone.returns(), together.returns())
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_a_discount_of_its_own_belongs_to_the_copy_that_names_it(together):
+    experience = made(VectorWrapper(copies()) if together else copies(), FixedHorizon(7))
+    named_TB = (torch.arange(1, 8)[:, None] + torch.arange(6)) % 3 == 0
+    assert torch.equal(experience.discount_TB, torch.from_numpy(np.where(named_TB, 0.5, 0.9)))
+
+
+def test_a_vector_environment_with_a_step_of_its_own_is_asked_for_it():
+    assert float(made(copies(Halved)).returns()[0]) == float(made(copies()).returns()[0]) / 2
