@@ -14,8 +14,8 @@ from pgts_torch.agent import pgts
 from pgts_torch.agent.ranks import Ranks, checksum, present_ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import NotFinite, PgtsError, RankLost
+from tests.forks import on_ranks
 from tests.models.corridors import Corridor
-from tests.ranks import on_ranks
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 

@@ -1,52 +1,27 @@
 """Processes that are killed, stopped or interrupted while they train: nothing is lost and no bit differs."""
 
-import json
 import os
 import resource
 import signal
 import subprocess
 import sys
 import time
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pgts_torch.agent.iteration import Iteration
-from pgts_torch.agent.pgts import PGTS
-from pgts_torch.experiment import checkpoint, run
+from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.tracking import read_metrics
 from tests import reliability
+from tests.experiment.runs import arguments, left, train_under_fire
+from tests.forks import in_child
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
-assert run.train  # imported before any child is made, so that none has to
 ROOT = Path(__file__).parents[2]
-SMALL = ["--env.id", "CartPole-v1", "--policy.type", "mlp", "--policy.hidden", "[8]", "--search.depth", "1"]
-SHORT = ["--total_steps", "100", "--rollout.num_envs", "2", "--rollout.horizon.length", "10", "--eval.episodes", "2"]
-OFTEN = ["--log.checkpoint_every", "1", "--eval.every", "20", "--eval.keep_best", "--run.tensorboard", "false"]
-
-
-def arguments(folder: Path) -> list[str]:
-    return ["train", *SMALL, *SHORT, *OFTEN, "--run.dir", str(folder)]
-
-
-def in_child(work: Callable[[], int]) -> int:
-    """The exit code of a process that does this; minus the signal that killed it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads: the child needs none of them
-        pid = os.fork()
-    if pid == 0:
-        code = 70
-        try:
-            code = work()
-        finally:
-            os._exit(code)
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
 def training(folder: Path, *, kill_at: int = -1, counted: Path | None = None) -> int:
@@ -77,31 +52,7 @@ def training(folder: Path, *, kill_at: int = -1, counted: Path | None = None) ->
 
 def signalled(folder: Path, *numbers: int) -> int:
     """Train in a process that gets these signals in its third iteration; its exit code."""
-
-    def work() -> int:
-        iterate = PGTS.iterate
-
-        def iterate_under_fire(self: PGTS) -> Iteration:
-            for number in numbers if self.num_iterations == 2 else ():
-                os.kill(os.getpid(), number)
-            return iterate(self)
-
-        PGTS.iterate = iterate_under_fire  # type: ignore[method-assign]  # in this process, which ends here
-        return main(arguments(folder))
-
-    return in_child(work)
-
-
-def left(folder: Path) -> dict[str, Any]:
-    """Every byte that a run leaves, without what the clock, the process and the name of the folder change."""
-    files: dict[str, Any] = {name: (folder / name).read_bytes() for name in ("best.pt", "versions.json")}
-    files |= {str(path.relative_to(folder)): (path / "model.pt").read_bytes() for path in checkpoint.listed(folder)}
-    summary = json.loads((folder / "summary.json").read_text())
-    lines = read_metrics(folder)
-    for line in lines:
-        line.pop("charts/SPS", None)
-    files |= {"summary": {name: summary[name] for name in summary if name not in ("seconds", "run")}, "metrics": lines}
-    return files | {"names": sorted(path.name for path in folder.iterdir())}
+    return in_child(lambda: train_under_fire(folder, *numbers))
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import dump
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.tracking import RunLock
-from tests.experiment.test_processes import in_child
+from tests.forks import in_child
 
 HELP = "(see pgts sweep --help)"
 SMALL = ["--total_steps", "60", "--rollout.num_envs", "3", "--rollout.horizon.length", "10", "--eval.episodes", "2"]

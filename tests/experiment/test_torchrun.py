@@ -12,25 +12,17 @@ from typing import Any
 import pytest
 import torch
 
-from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.experiment import checkpoint, run
+from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.search.lookahead import check_finite
-from tests.ranks import launched
+from tests.experiment.runs import SHORT, SMALL, arguments, left, train_under_fire
+from tests.forks import launched
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
-assert run.train  # imported before any process is forked, so that none has to
 ROOT = Path(__file__).parents[2]
-SMALL = ["--env.id", "CartPole-v1", "--policy.type", "mlp", "--policy.hidden", "[8]", "--search.depth", "1"]
-SHORT = ["--total_steps", "100", "--rollout.num_envs", "3", "--rollout.horizon.length", "8", "--eval.episodes", "2"]
-OFTEN = ["--log.checkpoint_every", "1", "--eval.every", "20", "--eval.keep_best", "--run.tensorboard", "false"]
-
-
-def arguments(folder: Path, *more: str) -> list[str]:
-    return ["train", *SMALL, *SHORT, *OFTEN, "--run.dir", str(folder), *more]
 
 
 def trained(folder: Path, *more: str, size: int = 2) -> list[int]:
@@ -39,28 +31,7 @@ def trained(folder: Path, *more: str, size: int = 2) -> list[int]:
 
 def struck(folder: Path, number: int, *, rank: int) -> list[int]:
     """The exit codes where one process gets a signal in its third iteration."""
-
-    def work() -> int:
-        iterate = PGTS.iterate
-
-        def iterate_under_fire(self: PGTS) -> Iteration:
-            if self.num_iterations == 2 and self.ranks.rank == rank:
-                os.kill(os.getpid(), number)
-            return iterate(self)
-
-        PGTS.iterate = iterate_under_fire  # type: ignore[method-assign]  # in this process, which ends here
-        return main(arguments(folder))
-
-    return launched(2, work)
-
-
-def left(folder: Path) -> dict[str, Any]:
-    """What a run leaves, without what the clock and the name of the folder change."""
-    summary = json.loads((folder / "summary.json").read_text())
-    lines = [{name: value for name, value in line.items() if name != "charts/SPS"} for line in read_metrics(folder)]
-    files = {str(path.relative_to(folder)): (path / "model.pt").read_bytes() for path in checkpoint.listed(folder)}
-    files["best"] = (folder / "best.pt").read_bytes()
-    return files | {"lines": lines, "summary": {k: v for k, v in summary.items() if k not in ("seconds", "run")}}
+    return launched(2, lambda: train_under_fire(folder, number, rank=rank))
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +57,7 @@ def test_two_processes_leave_one_run_and_speak_with_one_voice(whole, tmp_path, c
 
 def test_one_process_makes_other_episodes(whole, tmp_path):
     assert main(arguments(tmp_path / "run")) == 0
-    assert left(tmp_path / "run")["lines"] != whole["lines"]
+    assert left(tmp_path / "run")["metrics"] != whole["metrics"]
 
 
 @pytest.mark.fault("lost rank")

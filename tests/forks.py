@@ -1,4 +1,4 @@
-"""Several processes that train together, forked from a test: as torchrun starts them, without its seconds."""
+"""Processes forked from a test, alone or as torchrun starts them, without the seconds that an import takes."""
 
 import os
 import socket
@@ -33,6 +33,11 @@ def forked(works: list[Callable[[], int]]) -> list[int]:
                 os._exit(code)
         children.append(pid)
     return [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in children]
+
+
+def in_child(work: Callable[[], int]) -> int:
+    """The exit code of one process that does this."""
+    return forked([work])[0]
 
 
 def on_ranks(size: int, work: Callable[[], Any]) -> list[Any]:

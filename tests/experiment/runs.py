@@ -1,0 +1,50 @@
+"""A small run of the command line, what it leaves, and how it is struck while it trains."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from pgts_torch.agent.iteration import Iteration
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.experiment import checkpoint, run
+from pgts_torch.experiment.cli import main
+from pgts_torch.experiment.tracking import read_metrics
+
+assert run.train  # imported before any process is forked, so that none has to
+SMALL = ["--env.id", "CartPole-v1", "--policy.type", "mlp", "--policy.hidden", "[8]", "--search.depth", "1"]
+SHORT = ["--total_steps", "100", "--rollout.num_envs", "3", "--rollout.horizon.length", "8", "--eval.episodes", "2"]
+OFTEN = ["--log.checkpoint_every", "1", "--eval.every", "20", "--eval.keep_best", "--run.tensorboard", "false"]
+
+
+def arguments(folder: Path, *more: str) -> list[str]:
+    return ["train", *SMALL, *SHORT, *OFTEN, "--run.dir", str(folder), *more]
+
+
+def train_under_fire(folder: Path, *numbers: int, rank: int = 0) -> int:
+    """Train, and get these signals in the third iteration; the exit code. Only for a process that ends after it.
+
+    Args:
+        rank: the one of several processes that gets them.
+    """
+    iterate = PGTS.iterate
+
+    def iterate_under_fire(self: PGTS) -> Iteration:
+        for number in numbers if self.num_iterations == 2 and self.ranks.rank == rank else ():
+            os.kill(os.getpid(), number)
+        return iterate(self)
+
+    PGTS.iterate = iterate_under_fire  # type: ignore[method-assign]
+    return main(arguments(folder))
+
+
+def left(folder: Path) -> dict[str, Any]:
+    """Every byte that a run leaves, without what the clock, the process and the name of the folder change."""
+    files: dict[str, Any] = {name: (folder / name).read_bytes() for name in ("best.pt", "versions.json")}
+    files |= {str(path.relative_to(folder)): (path / "model.pt").read_bytes() for path in checkpoint.listed(folder)}
+    summary = json.loads((folder / "summary.json").read_text())
+    lines = read_metrics(folder)
+    for line in lines:
+        line.pop("charts/SPS", None)
+    files |= {"summary": {name: summary[name] for name in summary if name not in ("seconds", "run")}, "metrics": lines}
+    return files | {"names": sorted(path.name for path in folder.iterdir())}
