@@ -36,7 +36,7 @@ def iterations(name: str, count: int) -> dict[str, float]:
     """A training of some iterations, seen by the first process."""
     torch.set_num_threads(1)
     clock = time.perf_counter
-    with joined_ranks():
+    with joined_ranks("cpu"):
         model = build(load(str(CONFIGS / f"{name}.yaml"), []))
         critic, update = type(model.critic), type(model.update)
         with (

@@ -1,6 +1,7 @@
 """Processes forked from a test, alone or as torchrun starts them, without the seconds that an import takes."""
 
 import os
+import signal
 import socket
 import tempfile
 import traceback
@@ -13,7 +14,7 @@ from typing import Any
 import torch
 from torch import distributed
 
-PATIENCE = timedelta(seconds=60)
+PATIENCE = timedelta(seconds=180)
 
 
 def forked(works: list[Callable[[], int]]) -> list[int]:
@@ -25,6 +26,7 @@ def forked(works: list[Callable[[], int]]) -> list[int]:
             pid = os.fork()
         if pid == 0:
             code = 70
+            signal.alarm(int(PATIENCE.total_seconds()))  # ends a process that waits for another one in vain
             try:
                 code = work()
             except BaseException:

@@ -72,7 +72,7 @@ class EvalCallback:
         now = algorithm.num_env_steps
         if now // self.every == (now - iteration.experience.num_steps) // self.every:
             return True
-        evaluation = evaluate(algorithm, episodes=self.episodes, deterministic=self.deterministic, seed=self.seed)
+        evaluation = algorithm.ranks.first("an evaluation", lambda: self._evaluated(algorithm))
         latest = Evaluated(now, evaluation)
         self.history.append(latest)
         if self.best is None or latest.mean > self.best.mean:
@@ -80,6 +80,9 @@ class EvalCallback:
             if self.best_path is not None:
                 algorithm.save(self.best_path)
         return self.stop_at_return is None or latest.mean < self.stop_at_return
+
+    def _evaluated(self, algorithm: PGTS) -> Evaluation:
+        return evaluate(algorithm, episodes=self.episodes, deterministic=self.deterministic, seed=self.seed)
 
     def state_dict(self) -> dict[str, Any]:
         """The evaluations so far, as plain values."""

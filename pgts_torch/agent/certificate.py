@@ -31,7 +31,7 @@ def certificate(
         search, model: that can make T^n w, and what it asks.
         experience: whose starts are meant.
         state_N, v_N: the visited states, ascending, and v^pi there.
-        expansions: n. With as many as the lookahead of the iteration has itself, the model is asked nothing new.
+        expansions: n. With as many as the lookahead of the iteration has, a process alone asks the model nothing new.
         generator: of the search.
         ranks: each of which looks from its part of the start states.
 
@@ -54,4 +54,4 @@ def certificate(
         missing_N = upper_N - v_N[torch.searchsorted(state_N, starts)]
         return float(missing_N @ count_N.double() / experience.num_episodes)
 
-    return max(0.0, sum(ranks.gather(missing)))
+    return max(0.0, sum(ranks.gather("certificate", missing)))

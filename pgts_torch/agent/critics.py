@@ -24,9 +24,11 @@ class Critic(ABC):
     """An estimate of the values of the policy it was last fitted to.
 
     target: whether a lookahead stands on its v (one more level) or its Q.
+    draws_when_asked: whether it draws when it is asked for values, not when it is fitted.
     """
 
     target: Target
+    draws_when_asked: bool = False
 
     @abstractmethod
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
@@ -197,6 +199,8 @@ class RolloutCritic(Critic):
         target: whether lookaheads stand on v or on Q; both can be asked for.
         horizon: a fixed one leaves out what comes after it.
     """
+
+    draws_when_asked = True
 
     def __init__(
         self,

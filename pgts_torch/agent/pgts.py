@@ -50,11 +50,10 @@ Callback = Callable[["PGTS", Iteration], bool | None]
 
 
 class _Draws(NamedTuple):
-    """The streams that an iteration draws from."""
+    """What an iteration draws from: for its own part of the work, and for what all processes do alike."""
 
-    episodes: torch.Generator
-    critic: torch.Generator
-    update: torch.Generator
+    own: torch.Generator
+    common: torch.Generator
 
 
 @final
@@ -67,7 +66,7 @@ class PGTS:
     from streams named by (seed, k), so a loaded model goes on exactly as the saved one would have.
 
     Where torch.distributed has a default process group, its processes train one policy together: each makes its part of
-    the episodes and of the lookahead, and all make the same update from the whole batch (`agent.ranks`). They must do
+    the episodes and of the lookahead, and all make the same update from the whole batch (`agent.ranks`). They must make
     the same calls, with the same arguments.
 
     Args:
@@ -86,7 +85,7 @@ class PGTS:
             A2C, which need depth 0, a network and no model.
         policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax", "mlp",
             {"type": "tabular", "target": "q"}, ... Default: tables where the environment is tabular, else networks.
-        num_envs: episodes in each iteration, of all processes together.
+        num_envs: episodes in each iteration, of all processes together; copies that are given belong to this one alone.
         actions_per_dimension: into how many evenly spaced values, from the lowest to the highest, each dimension of
             continuous actions is divided; None: actions are discrete.
         action_repeat: how often the lookahead takes an action before it takes the next, so that it sees as many times
@@ -136,7 +135,7 @@ class PGTS:
         self.device = torch.device(device)
         self.estimator = make_estimator(estimator)
         self.ranks = present_ranks()
-        if num_envs < self.ranks.size:
+        if num_envs < self.ranks.size and not isinstance(env, VectorEnv):
             raise PgtsError(f"num_envs is {num_envs}; {self.ranks.size} ranks need at least as many")
         self.world = make_world(
             env,
@@ -174,11 +173,12 @@ class PGTS:
 
         # Visit states with pi_k and estimate Q^{pi_k} (line 2).
         numbers_anew = self.world.forget()
-        experience = whole_rollout(self.ranks, self.world, lambda: self._visit(draws.episodes))
+        experience = whole_rollout(self.ranks, self.world, lambda: self._visit(draws.own))
         if numbers_anew and self.search is not None:
             self.search.forget()
         taken = self._taken(experience)
-        losses = self.critic.fit(self.policy, experience, generator=draws.critic)
+        fitting = draws.own if self.critic.draws_when_asked else draws.common
+        losses = self.critic.fit(self.policy, experience, generator=fitting)
 
         # Look m steps ahead from the states with d(s) > 0.
         seen = taken or self._look(experience)
@@ -186,11 +186,11 @@ class PGTS:
         # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is proved good enough.
         if not self._proved(seen.certificate):
             observation_N = self.world.observe(seen.state_N)
-            losses |= self.update(self.policy, observation_N, seen.advantage_NA, seen.weight_N, generator=draws.update)
+            losses |= self.update(self.policy, observation_N, seen.advantage_NA, seen.weight_N, generator=draws.common)
 
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
-        model_calls = sum(self.ranks.gather(lambda: self._model_calls() - calls_before))
+        model_calls = self._agreed(self._model_calls() - calls_before)
         self.num_model_calls += model_calls
         return Iteration(**vars(seen), experience=experience, losses=losses, model_calls=model_calls)
 
@@ -201,11 +201,18 @@ class PGTS:
         return rollout(world, world.env, self.policy, horizon, seed=self.seed, names=names, generator=generator)
 
     def _draws(self) -> _Draws:
-        """One stream where this process is alone. Else one of its own for the episodes, and two that all have: what the
-        critic draws in a lookahead in parts must not move the update."""
+        """One stream where this process is alone."""
+        own = self._stream(*self.ranks.names)
+        return _Draws(own, own if self.ranks.size == 1 else self._stream("common"))
+
+    def _agreed(self, model_calls: int) -> int:
+        """The model calls of all processes; PgtsError if these hold different policies."""
         if self.ranks.size == 1:
-            return _Draws(*[self._stream()] * 3)
-        return _Draws(self._stream(*self.ranks.names), self._stream("critic"), self._stream("update"))
+            return model_calls
+        told = self.ranks.gather("policies", lambda: (model_calls, checksum(self.policy.state_dict())))
+        if len({policy for _, policy in told}) > 1:
+            raise PgtsError("the ranks hold different policies: do they run on different hardware or versions?")
+        return sum(calls for calls, _ in told)
 
     def _model_calls(self) -> int:
         return (0 if self.search is None else self.search.model_calls) + self.critic.model_calls
@@ -221,10 +228,10 @@ class PGTS:
         for depth in self.depths:
             look = self._look_together(states, depth) if depth else shallow
             gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
-            certificate = self._certificate(experience, states, v_N, depth)
-            if float(gap_N @ occupancy_N) > self.tolerance * certificate or self._proved(certificate):
+            bound = self._certificate(experience, states, v_N, depth)
+            if float(gap_N @ occupancy_N) > self.tolerance * bound or self._proved(bound):
                 break
-        return Seen(states, weight_N, pi_NA, look.q_BA - v_N.unsqueeze(-1), depth, look, gap_N, certificate)
+        return Seen(states, weight_N, pi_NA, look.q_BA - v_N.unsqueeze(-1), depth, look, gap_N, bound)
 
     def _taken(self, experience: Rollout) -> Seen | None:
         """The advantages of the actions taken, by the critic as it was when they were; None where a lookahead is
@@ -315,8 +322,8 @@ class PGTS:
             ranks=self.ranks,
         )
 
-    def _proved(self, certificate: float) -> bool:
-        return self.stop_at is not None and certificate <= self.stop_at
+    def _proved(self, bound: float) -> bool:
+        return self.stop_at is not None and bound <= self.stop_at
 
     def learn(self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool = False) -> Self:
         """Iterate until `total_steps` environment steps have been made in all, counting those before this call.
@@ -338,18 +345,10 @@ class PGTS:
                 iteration = self.iterate()
                 bar.update(iteration.experience.num_steps)
                 answers = [call(self, iteration) for call in callbacks]
-                if not self._all_go_on(answers) or self._proved(iteration.certificate):
+                going = self.ranks.gather("whether to go on", lambda: False not in answers)  # noqa: B023
+                if not all(going) or self._proved(iteration.certificate):
                     break
         return self
-
-    def _all_go_on(self, answers: Sequence[bool | None]) -> bool:
-        """Whether no process has an answer that ends the training; PgtsError if their policies differ."""
-        if self.ranks.size == 1:
-            return False not in answers
-        told = self.ranks.gather(lambda: (False not in answers, checksum(self.policy.state_dict())))
-        if len({policy for _, policy in told}) > 1:
-            raise PgtsError("the ranks hold different policies: do they run on different hardware or versions?")
-        return all(go_on for go_on, _ in told)
 
     def predict(
         self, observation: ArrayLike, *, deterministic: bool = True, generator: torch.Generator | None = None
@@ -382,8 +381,7 @@ class PGTS:
             PgtsError: a part was given as an object, so that no file can describe it, or an argument is no plain value.
         """
         content = self.content()
-        if self.ranks.leads:
-            saving.write(path, content)
+        self.ranks.first("a saved model", lambda: saving.write(path, content))
 
     def content(self) -> dict[str, Any]:
         """What `save` writes: the arguments and the state. Of several processes all must ask for it."""
@@ -428,7 +426,9 @@ class PGTS:
         """Policy, critic, update, what the search of each rank remembers, and counters: tensors on the CPU and plain
         values. Of several processes all must ask for it."""
         search, with_states = self.search, self.world.mdp is not None
-        searches = self.ranks.gather(lambda: {} if search is None else search.state_dict(with_states=with_states))
+        searches = self.ranks.gather(
+            "searches", lambda: {} if search is None else search.state_dict(with_states=with_states)
+        )
         return {
             "searches": dict(enumerate(searches)),
             "policy": self.policy.state_dict(),

@@ -1,6 +1,7 @@
 """Processes that train one policy together, as torchrun starts them."""
 
 import os
+import pickle
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ class Ranks:
     """All processes of a training, seen from the one with the number `rank`, counted from 0.
 
     Each makes its part of the episodes and of the lookahead, and learns from the whole. So all hold the same policy,
-    bit for bit, and an update is that of one process with the whole batch.
+    bit for bit, and the update is that of one process that has made all of it.
     """
 
     rank: int = 0
@@ -45,37 +46,51 @@ class Ranks:
         """Its part of rows that all have: neighbours, because their searches meet. It may be empty."""
         return x_N.tensor_split(self.size)[self.rank]
 
-    def gather(self, make: Callable[[], T]) -> list[T]:
-        """What `make` gives in each process, in the order of ranks. All processes must ask, in the same order.
+    def gather(self, what: str, make: Callable[[], T]) -> list[T]:
+        """What `make` gives in each process, in the order of ranks. All processes must ask for the same.
 
         Args:
+            what: names it, so that processes that ask for different things are noticed.
             make: gives something that pickles, its tensors on the CPU.
 
         Raises:
-            PgtsError: from `make`, in whichever process: the same one in all, with the `rank` where it happened.
+            PgtsError: from `make`, in whichever process: the same one in all, with the `rank` where it happened; or
+                the processes ask for different things.
             RankLost: a process is gone.
         """
         if self.size == 1:
             return [make()]
-        mine: tuple[T | None, PgtsError | None]
+        answer, mine = None, None
         try:
-            mine = make(), None
+            answer = make()
         except PgtsError as error:
-            mine = None, error
-        answers: list[Any] = [None] * self.size
+            mine = error
+        sent = pickle.dumps((what, answer, mine))
+        told: list[Any] = [None] * self.size
         try:
-            distributed.all_gather_object(answers, mine)
+            distributed.all_gather_object(told, sent)
         except RuntimeError as error:
-            raise RankLost(f"rank {self.rank} of {self.size} has lost another one") from error
-        for rank, (_, mistake) in enumerate(answers):
+            raise RankLost(f"rank {self.rank} of {self.size} has lost another one, asking for {what}") from error
+        answers = []
+        for rank, (other, answer, mistake) in enumerate(map(pickle.loads, told)):
+            if other != what:
+                raise PgtsError(f"rank {self.rank} asks for {what}, rank {rank} for {other}: they have parted ways")
             if mistake is not None:
+                mistake = mine if rank == self.rank and mine is not None else mistake
                 mistake.rank = rank
                 raise mistake
-        return [answer for answer, _ in answers]
+            answers.append(answer)
+        return answers
 
-    def first(self, make: Callable[[], T]) -> T:
+    def together(self, what: str, make: Callable[[], T]) -> T:
+        """What `make` gives in this process, if it fails in none; otherwise as `gather`. It need not pickle."""
+        made: list[T] = []
+        self.gather(what, lambda: made.append(make()))
+        return made[0]
+
+    def first(self, what: str, make: Callable[[], T]) -> T:
         """What `make` gives in rank 0, which alone calls it; otherwise as `gather`."""
-        answers: list[Any] = self.gather(lambda: make() if self.leads else None)
+        answers: list[Any] = self.gather(what, lambda: make() if self.leads else None)
         return answers[0]
 
 
@@ -87,29 +102,36 @@ def present_ranks() -> Ranks:
 
 
 @contextmanager
-def joined_ranks() -> Iterator[Ranks]:
+def joined_ranks(device: str) -> Iterator[Ranks]:
     """The processes that torchrun has started, as the default process group while the context lasts; one alone where
     it has started none.
 
-    What they exchange, episodes and values, lies in host memory: the backend is gloo on every device. Each process
-    takes the GPU of its local rank for "cuda".
+    What they exchange, episodes and values, lies in host memory: the backend is gloo on every device.
+
+    Args:
+        device: where they compute; "cuda" is the GPU of the local rank.
 
     Raises:
-        PgtsError: a machine has fewer GPUs than processes.
+        PgtsError: a machine has fewer GPUs than processes that want one each.
     """
     if not (distributed.is_available() and distributed.is_torchelastic_launched()):
         yield Ranks()
         return
-    if torch.cuda.is_available():
-        local, gpus = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
-        if local >= gpus:
-            raise PgtsError(f"this machine has {gpus} GPUs; local rank {local} has none")
-        torch.cuda.set_device(local)
     distributed.init_process_group("gloo")
     try:
-        yield present_ranks()
+        ranks = present_ranks()
+        if device == "cuda":
+            ranks.gather("a GPU", _take_gpu)
+        yield ranks
     finally:
         distributed.destroy_process_group()
+
+
+def _take_gpu() -> None:
+    local, gpus = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+    if local >= gpus:
+        raise PgtsError(f"this machine has {gpus} GPUs; local rank {local} has none")
+    torch.cuda.set_device(local)
 
 
 def checksum(state: Any, start: int = 0) -> int:

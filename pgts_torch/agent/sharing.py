@@ -29,7 +29,7 @@ def whole_rollout(ranks: Ranks, world: World, make: Callable[[], Rollout]) -> Ro
     """
     if ranks.size == 1:
         return make()
-    parts = ranks.gather(lambda: _sent(world, make()))
+    parts = ranks.gather("episodes", lambda: _sent(world, make()))
     world.forget()
     length = max(len(part["alive_TB"]) for part in parts)
     columns = {
@@ -70,7 +70,7 @@ def whole_lookahead(ranks: Ranks, state_N: Int[Tensor, "N"], look: Callable[[Ten
     if ranks.size == 1:
         return look(state_N)
     mine = ranks.part(state_N)
-    parts = ranks.gather(lambda: _moved(look(mine), "cpu") if len(mine) else None)
+    parts = ranks.gather("lookahead", lambda: _moved(look(mine), "cpu") if len(mine) else None)
     return _moved(_joined([part for part in parts if part is not None]), state_N.device)
 
 

@@ -57,10 +57,18 @@ def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
         PgtsError: it cannot be written; then the others are as they were.
     """
     path = run / CHECKPOINTS / f"{notes.env_steps:012d}"
-    partial = path.with_name(f".{path.name}{saving.PARTIAL}")
     content = algorithm.content()
-    if not algorithm.ranks.leads:
-        return path
+
+    def put() -> None:
+        _put(path, content, notes)
+        tidy(run, path, keep=keep)
+
+    algorithm.ranks.first("a checkpoint", put)
+    return path
+
+
+def _put(path: Path, content: dict[str, Any], notes: Notes) -> None:
+    partial = path.with_name(f".{path.name}{saving.PARTIAL}")
     try:
         path.parent.mkdir(exist_ok=True)
         shutil.rmtree(partial, ignore_errors=True)
@@ -76,8 +84,6 @@ def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
         raise PgtsError(f"the checkpoint {path} cannot be written: {error.strerror}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    tidy(run, path, keep=keep)
-    return path
 
 
 def read(path: Path) -> tuple[Notes, dict[str, Any]]:

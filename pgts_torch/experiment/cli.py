@@ -63,7 +63,7 @@ def main(arguments: Arguments | None = None) -> int:
         return code
     except PgtsError as error:
         rank = _rank()
-        if error.rank in (None, rank) and not (rank and isinstance(error, RankLost)):
+        if rank == (error.rank or 0):  # one that all processes meet is said by the first
             for line in str(error).splitlines():
                 print(f"error: {f'[rank {rank}] ' if rank else ''}{line}", file=sys.stderr)
         return TRAINING_FAILED if isinstance(error, NotFinite | RankLost) else USAGE_ERROR

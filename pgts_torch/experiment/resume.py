@@ -1,6 +1,7 @@
 """Whether a run folder holds a training that goes on, and from where."""
 
 import json
+import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -88,6 +89,12 @@ def find(
             "give --any-world-size for other bits"
         )
     return Start(path, notes, content["state"])
+
+
+def resuming(run: str | Path, world_size: int) -> str:
+    """The command by which as many processes go on with a run."""
+    command = "pgts train" if world_size == 1 else f"torchrun --nproc-per-node={world_size} train.py"
+    return f"{command} --resume {shlex.quote(str(run))}"
 
 
 def flat(config: Config) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.evaluate import KINDS
 from pgts_torch.experiment.pictures import policy_picture
 from pgts_torch.experiment.progress import Reporter
-from pgts_torch.experiment.resume import Start, find, flat
+from pgts_torch.experiment.resume import Start, find, flat, resuming
 from pgts_torch.experiment.sections import EvalConfig
 from pgts_torch.experiment.signals import StopFlag
 from pgts_torch.experiment.summary import EndedBy, Summary
@@ -103,9 +103,10 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
     torch.set_num_threads(config.threads)
     if config.run.tensorboard:
         event_writer()
-    with joined_ranks() as ranks, StopFlag() as stop, ExitStack() as held:
-        path = ranks.first(lambda: _folder_of(config))
-        algorithm = build(config)
+    with joined_ranks(config.device) as ranks, StopFlag() as stop, ExitStack() as held:
+        path = ranks.first("the run folder", lambda: _folder_of(config))
+        algorithm = ranks.together("the algorithm", lambda: build(config))
+        folder: Folder = NoFolder(path)
 
         def claim() -> Start | None:
             held.enter_context(RunLock(path))
@@ -116,12 +117,14 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
                 found.check(algorithm)
             return found
 
-        start = ranks.first(claim)
+        def open_folder() -> None:
+            nonlocal folder
+            folder = held.enter_context(_opened(config, path, start))
+
+        start = ranks.first("where to begin", claim)
         if start is not None:
             algorithm.load_state_dict(dict(start.state))
-        folder: Folder = NoFolder(path)
-        if ranks.leads:
-            folder = held.enter_context(_opened(config, path, start))
+        ranks.first("an open folder", open_folder)
         summary = _loop(config, algorithm, folder, start, stop)
         folder.text(SUMMARY_FILE, json.dumps(asdict(summary), indent=2) + "\n")
     return summary
@@ -165,11 +168,13 @@ def _loop(config: Config, algorithm: PGTS, folder: Folder, start: Start | None, 
             recorder.report.close()
         recorder.save()
         if not recorder.finished:
-            signal = next(each for each in algorithm.ranks.gather(lambda: stop.signal) if each is not None)
+            signals = algorithm.ranks.gather("signals", lambda: stop.signal)
+            again = resuming(folder.path, algorithm.ranks.size)
             raise Stopped(
-                f"stopped at step {algorithm.num_env_steps}; `pgts train --resume {folder.path}` goes on", signal
+                f"stopped at step {algorithm.num_env_steps}; `{again}` goes on",
+                next(each for each in signals if each is not None),
             )
-        return recorder.finish()
+        return algorithm.ranks.first("a summary", recorder.finish)
     except NotFinite as error:
         where = {"iteration": algorithm.num_iterations, "env_step": algorithm.num_env_steps, "seed": config.seed}
         record = where | {"tensor": error.what, "message": str(error)}
@@ -186,7 +191,8 @@ class _Recorder:
     def __init__(self, config: Config, algorithm: PGTS, folder: Folder, stop: StopFlag) -> None:
         self.config, self.algorithm, self.folder, self.stop = config, algorithm, folder, stop
         self.ended_by: EndedBy | None = None
-        self.truth = diagnostics.Truth(algorithm) if algorithm.world.mdp is not None else None
+        is_known = algorithm.world.mdp is not None and algorithm.ranks.leads
+        self.truth = diagnostics.Truth(algorithm) if is_known else None
         self.report = Reporter(config.total_steps, shown=algorithm.ranks.leads)
         self._clock = time.perf_counter()
         self._started = self._saved_clock = self._clock
@@ -205,7 +211,7 @@ class _Recorder:
         seconds = time.perf_counter() - self._clock
         k, step = algorithm.num_iterations, algorithm.num_env_steps
         self._deepest, self._certificate = max(self._deepest, iteration.depth), iteration.certificate
-        if k % self.config.log.every == 0:
+        if k % self.config.log.every == 0 and algorithm.ranks.leads:
             tags = diagnostics.metrics(algorithm, iteration)
             if self.truth is not None and self._pi_SA is not None:
                 tags |= self.truth.metrics(self._pi_SA, iteration)
@@ -223,14 +229,16 @@ class _Recorder:
         elif step >= self.config.total_steps:
             self.ended_by = "total_steps"
         every = self.config.log.checkpoint_every
-        is_due = every and algorithm.ranks.first(
-            lambda: k % every == 0 or time.perf_counter() - self._saved_clock > MOST_SECONDS
-        )
+        is_due = every and (k % every == 0 or algorithm.ranks.first("the time", self._is_long_ago))
         if is_due and not self.finished:  # the last one waits until the training has ended
             self.save()
         self._pi_SA = self._table()
         self._clock = time.perf_counter()
         return not self.finished and self.stop.signal is None
+
+    def _is_long_ago(self) -> bool:
+        """The last checkpoint."""
+        return time.perf_counter() - self._saved_clock > MOST_SECONDS
 
     def save(self) -> None:
         """A checkpoint, unless the last one was taken just now."""

@@ -1,5 +1,6 @@
 """Processes that train together: what they exchange, and that their update is that of one with the whole batch."""
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -11,6 +12,7 @@ from gymnasium import spaces
 
 from pgts_torch import PGTS
 from pgts_torch.agent import pgts
+from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.ranks import Ranks, checksum, present_ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import NotFinite, PgtsError, RankLost
@@ -149,7 +151,6 @@ def test_ranks_that_are_loaded_go_on_as_if_they_had_never_stopped(tmp_path):
         for _ in range(stop):
             model.iterate()
         model.save(tmp_path / "model.pt")
-        present_ranks().gather(lambda: None)  # it is written before it is read
         model = PGTS.load(tmp_path / "model.pt")
         for _ in range(4 - stop):
             model.iterate()
@@ -202,7 +203,7 @@ def test_what_fails_in_one_rank_fails_in_all_with_its_number():
             return 0
 
         with pytest.raises(NotFinite) as caught:
-            ranks.gather(make)
+            ranks.gather("a test", make)
         return str(caught.value), caught.value.what, caught.value.rank
 
     assert on_ranks(2, mistake) == [("the reward is nan", "reward", 1)] * 2
@@ -211,14 +212,53 @@ def test_what_fails_in_one_rank_fails_in_all_with_its_number():
 def test_a_rank_that_is_gone_is_missed():
     def missed() -> str:
         ranks = present_ranks()
-        ranks.gather(lambda: None)
+        ranks.gather("a test", lambda: None)
         if ranks.rank == 1:
             return "gone"
         with pytest.raises(RankLost) as caught:
-            ranks.gather(lambda: None)
+            ranks.gather("a test", lambda: None)
         return str(caught.value)
 
-    assert on_ranks(2, missed) == ["rank 0 of 2 has lost another one", "gone"]
+    assert on_ranks(2, missed) == ["rank 0 of 2 has lost another one, asking for a test", "gone"]
+
+
+def test_ranks_that_ask_for_different_things_say_so():
+    def mistake() -> str:
+        ranks = present_ranks()
+        with pytest.raises(PgtsError) as caught:
+            ranks.gather("bread" if ranks.rank else "wine", lambda: None)
+        return str(caught.value)
+
+    first, second = on_ranks(2, mistake)
+    assert first == "rank 0 asks for wine, rank 1 for bread: they have parted ways"
+    assert second == "rank 1 asks for bread, rank 0 for wine: they have parted ways"
+
+
+def test_an_evaluation_is_made_once_for_all(tmp_path):
+    def evaluated() -> tuple[float, bool]:
+        torch.manual_seed(os.getpid())
+        noise = float(torch.rand(()))
+        model = PGTS("pgts/Ladder-v0", num_envs=2, horizon={"type": "fixed", "length": 5})
+        watch = EvalCallback(every=1, episodes=1, best_path=tmp_path / "best.pt")
+        score = watch._evaluated
+        watch._evaluated = lambda model: replace(score(model), episodes=int(1e6 * noise))  # type: ignore[method-assign]
+        model.learn(30, callback=watch)
+        return watch.history[-1].evaluation.episodes, (tmp_path / "best.pt").exists()
+
+    first, second = on_ranks(2, evaluated)
+    assert first == second
+
+
+def test_a_critic_that_draws_when_it_is_asked_draws_differently_in_each_rank():
+    def values() -> list[float]:
+        model = PGTS(
+            "pgts/Random-v0", depth=0, num_envs=2, critic={"type": "rollout", "samples": 1}, horizon="geometric"
+        )
+        model.iterate()
+        return model.critic.v(torch.arange(5)).tolist()
+
+    first, second = on_ranks(2, values)
+    assert first != second
 
 
 def test_parts_make_the_whole():
@@ -228,7 +268,7 @@ def test_parts_make_the_whole():
         assert torch.equal(torch.cat([each.part(things) for each in ranks]), things)
         assert sum(each.count(7) for each in ranks) == 7
         assert [each.leads for each in ranks] == [True] + [False] * (size - 1)
-    assert Ranks().gather(lambda: "alone") == ["alone"]
+    assert Ranks().gather("a test", lambda: "alone") == ["alone"]
     assert replace(Ranks(), size=2).names == ("rank", 0)
 
 

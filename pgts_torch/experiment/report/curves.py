@@ -69,7 +69,7 @@ class Curves:
 
 
 def panels(lines: Sequence[Mapping[str, Any]]) -> Curves:
-    """The tags of these lines of metrics.jsonl, none left out."""
+    """The tags of these lines of metrics.jsonl; half-widths belong to their means."""
     tags = list(dict.fromkeys(tag for line in lines for tag in line if tag != "step"))
     finite = {tag for line in lines for tag, value in line.items() if value is not None}
     groups: dict[str, list[Panel]] = {}

@@ -17,7 +17,7 @@ from pgts_torch.experiment.report import reading
 from pgts_torch.experiment.report.curves import Panel, panels
 from pgts_torch.experiment.report.settings import Setting, settings
 from pgts_torch.experiment.summary import Summary, rows
-from pgts_torch.experiment.tracking import CONFIG_FILE, FAILURE_FILE, VERSIONS_FILE
+from pgts_torch.experiment.tracking import CONFIG_FILE, VERSIONS_FILE
 from pgts_torch.tabular.mdp import TabularMDP
 
 
@@ -27,11 +27,13 @@ class Certificate:
 
     is_proved: whether that is a proof, because the critic is exact.
     missing: J* - J^pi itself, where it is known.
+    is_known: whether there was an iteration that could say.
     """
 
     bound: float | None
     is_proved: bool
     missing: float | None
+    is_known: bool
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class Facts:
     state: finished, unfinished or failed.
     failure: what failure.json says.
     step: environment steps that were made.
+    world_size: how many processes made them.
     rows: what the run came to, or how far it is: names and values as text.
     curves: by heading.
     files: their sizes in bytes; a folder counts as one.
@@ -55,6 +58,7 @@ class Facts:
     failure: Mapping[str, Any] | None
     step: int
     total_steps: int
+    world_size: int
     rows: Mapping[str, str]
     certificate: Certificate
     curves: Mapping[str, Sequence[Panel]]
@@ -83,7 +87,7 @@ def gather(run: Path) -> tuple[Facts, Trained | None]:
     """
     config = load(run / CONFIG_FILE)
     notes: list[str] = []
-    summary, failure = reading.summary(run, notes), reading.json_object(run / FAILURE_FILE, notes)
+    summary, failure = reading.summary(run, notes), reading.failure(run, notes)
     lines = reading.metrics(run, notes)
     path, last = reading.last_checkpoint(run, notes) or (None, None)
     trained = None if path is None or last is None else _trained(path, last, notes)
@@ -98,6 +102,7 @@ def gather(run: Path) -> tuple[Facts, Trained | None]:
         failure=failure,
         step=max(0 if last is None else last.env_steps, latest.get("step", 0)),
         total_steps=config.total_steps,
+        world_size=1 if last is None else last.world_size,
         rows=dict(_progress(last, latest)) if summary is None else rows(summary),
         certificate=_certificate(config, summary, latest),
         curves=curves.groups,
@@ -129,7 +134,8 @@ def _certificate(config: Config, summary: Summary | None, latest: Mapping[str, A
         bound, missing = summary.certificate, None
         if summary.J is not None and summary.J_optimal is not None:
             missing = max(summary.J_optimal - summary.J, 0.0)
-    return Certificate(bound, config.critic.type == "exact", missing)
+    is_known = summary is not None or "search/certificate" in latest
+    return Certificate(bound, config.critic.type == "exact", missing, is_known)
 
 
 def _progress(last: Notes | None, latest: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

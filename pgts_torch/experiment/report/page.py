@@ -17,6 +17,7 @@ from pgts_torch.experiment.report.facts import Certificate, Facts, Trained
 from pgts_torch.experiment.report.markup import Html, element, join, typeset
 from pgts_torch.experiment.report.settings import Setting
 from pgts_torch.experiment.report.style import STYLE
+from pgts_torch.experiment.resume import resuming
 from pgts_torch.tabular import exact
 
 PAGE = Template("""\
@@ -37,6 +38,7 @@ $body
 """)
 
 PROVED = ("proved", "The critic is exact, so it is a proof.")
+FOLDER = "run folder"
 ESTIMATED = ("an estimate", "The critic is learned, so it is off by what the critic is off at the start states.")
 
 
@@ -81,18 +83,14 @@ def _state(facts: Facts) -> Iterator[Html]:
         yield element(
             "p",
             f"{facts.step:,} of {facts.total_steps:,} environment steps are made. Unless it is still being trained, ",
-            element("code", f"pgts train --resume {facts.run}"),
+            element("code", resuming(facts.run, facts.world_size)),
             " goes on.",
             class_="box",
         )
 
 
 def _notes(notes: Sequence[str]) -> Html:
-    return (
-        element("ul", *(element("li", note[:1].upper() + note[1:]) for note in notes), class_="box notes")
-        if notes
-        else Html("")
-    )
+    return element("ul", *(element("li", note) for note in notes), class_="box notes") if notes else Html("")
 
 
 def _section(heading: str, *content: Html) -> Html:
@@ -101,7 +99,7 @@ def _section(heading: str, *content: Html) -> Html:
 
 def _tiles(rows: Mapping[str, str]) -> Iterator[Html]:
     """Numbers large, with what is said about them below; then the values that are text."""
-    numbers = {name: value for name, value in rows.items() if _begins_with_a_number(value)}
+    numbers = {name: value for name, value in rows.items() if name != FOLDER and _begins_with_a_number(value)}
     yield element("dl", *(_number(typeset(name), value) for name, value in numbers.items()), class_="tiles")
     texts = [(name, value) for name, value in rows.items() if name not in numbers]
     if texts:
@@ -129,6 +127,9 @@ def _tile(name: str, *values: Html) -> Html:
 
 def _certificate(certificate: Certificate) -> Iterator[Html]:
     """What the certificate is, and how far it can be trusted."""
+    if not certificate.is_known:
+        yield element("p", "Not known yet: no iteration has been written down.")
+        return
     if certificate.bound is None:
         yield element(
             "p",

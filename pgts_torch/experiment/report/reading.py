@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,12 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.summary import Summary, from_json, rows
-from pgts_torch.experiment.tracking import LOCK_FILE, METRICS_FILE, SUMMARY_FILE
+from pgts_torch.experiment.tracking import FAILURE_FILE, LOCK_FILE, METRICS_FILE, SUMMARY_FILE
 
 Line = dict[str, Any]
 
 REPORT_FILE = "report.html"
+_LARGEST = 1e300
 
 
 def json_object(path: Path, notes: list[str]) -> dict[str, Any] | None:
@@ -40,11 +40,20 @@ def summary(run: Path, notes: list[str]) -> Summary | None:
         return None
     try:
         found = from_json(content)
-        rows(found)
+        rows(found)  # shows whether all of it can be said
     except (TypeError, KeyError, ValueError, AttributeError):
         notes.append(f"{SUMMARY_FILE} is not as this version writes it; it is left out.")
         return None
     return found
+
+
+def failure(run: Path, notes: list[str]) -> dict[str, Any] | None:
+    """What stopped a training; None if nothing did."""
+    content = json_object(run / FAILURE_FILE, notes)
+    if content is None or {"iteration", "env_step", "tensor", "message"} <= content.keys():
+        return content
+    notes.append(f"{FAILURE_FILE} is not as this version writes it; it is left out.")
+    return None
 
 
 def metrics(run: Path, notes: list[str]) -> list[Line]:
@@ -72,8 +81,8 @@ def _line(raw: bytes) -> Line | None:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite number, also as a float."""
-    return isinstance(value, int | float) and abs(value) <= sys.float_info.max
+    """Whether a value is a number that can be drawn: differences of two of them are finite, too."""
+    return isinstance(value, int | float) and abs(value) <= _LARGEST
 
 
 def last_checkpoint(run: Path, notes: list[str]) -> tuple[Path, Notes] | None:
