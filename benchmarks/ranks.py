@@ -2,9 +2,10 @@
 
     python benchmarks/ranks.py [--json FILE] [--quick]
 
-The first iterations of shipped configurations by one process and by two under torchrun, in turns, with one thread each:
-milliseconds of an iteration (the median over iterations, then over repeats), the share of it that is the critic's fit
-and the update, which all processes make, and model calls, of which two processes need more where their searches meet.
+The first iterations of shipped configurations, with episodes of at most 50 steps, by one process and by two under
+torchrun, in turns, with one thread each: milliseconds of an iteration (the median over iterations, then over repeats),
+the share of it that is the critic's fit and the update, which all processes make, and model calls, of which two
+processes need more where their searches meet.
 
 It needs two cores.
 """
@@ -29,7 +30,8 @@ from pgts_torch.experiment.run import build
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 NAMES = ("taxi", "cartpole", "acrobot", "mountain_car", "door_key")
 WORLD_SIZES = (1, 2)
-ITERATIONS, REPEATS = 3, 3
+ITERATIONS, REPEATS = 5, 3
+SHORT = ["--rollout.horizon.length", "50"]
 
 
 def iterations(name: str, count: int) -> dict[str, float]:
@@ -37,7 +39,7 @@ def iterations(name: str, count: int) -> dict[str, float]:
     torch.set_num_threads(1)
     clock = time.perf_counter
     with joined_ranks("cpu"):
-        model = build(load(str(CONFIGS / f"{name}.yaml"), []))
+        model = build(load(str(CONFIGS / f"{name}.yaml"), SHORT))
         critic, update = type(model.critic), type(model.update)
         with (
             common.timed(PGTS, "iterate", clock) as whole,
