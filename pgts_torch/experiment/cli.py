@@ -87,6 +87,7 @@ def train(arguments: Arguments) -> None:
     parser = Parser("train", train, usage=usage)
     parser.add_argument("--config", metavar="FILE", help="YAML file with any of the keys below; none: the defaults")
     parser.add_argument("--resume", metavar="RUN_DIR", type=run_folder, help="go on with an unfinished run")
+    parser.add_argument("--overwrite", action="store_true", help="start anew, as --run.overwrite")
     parser.add_argument(
         "--strict-resume", action="store_true", help="refuse a last checkpoint that is damaged or of other versions"
     )
@@ -98,8 +99,9 @@ def train(arguments: Arguments) -> None:
     if {"-h", "--help"} & set(arguments):
         parser.epilog = "\n".join(describe_options(Schema(Config).options()))
     fixed, overrides = parser.parse_known_args(arguments)
+    overrides += ["--run.overwrite"] if fixed.overwrite else []
     if fixed.resume is not None:
-        for name in ("config", "run.dir", "run.overwrite"):
+        for name in ("config", "run.dir", "run.overwrite", "overwrite"):
             if any(given.partition("=")[0] == f"--{name}" for given in arguments):
                 parser.error(f"--{name} does not go with --resume, which takes it from the run")
         overrides += [f"--run.dir={fixed.resume}", "--run.overwrite=false"]

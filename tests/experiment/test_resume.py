@@ -254,8 +254,9 @@ def test_what_the_run_says_itself_is_not_said_again(given, cut, capsys):
 
 
 @pytest.mark.fault("finished run")
-def test_overwriting_starts_anew(cut):
-    assert main(arguments("--run.overwrite", "--seed", "1")) == 0
+@pytest.mark.parametrize("flag", ["--overwrite", "--run.overwrite"])
+def test_overwriting_starts_anew(flag, cut):
+    assert main(arguments(flag, "--seed", "1")) == 0
     assert [line["step"] for line in read_metrics(cut)] == [60, 120, 180, 240, 300]
     assert load(cut / "config.yaml").seed == 1
 
