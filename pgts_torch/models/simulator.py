@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
@@ -22,8 +23,11 @@ from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, 
 _KEY_OF_CERTAINTY = 0
 """Outcomes that are listed draw nothing; this is what they would draw from."""
 
-_MOST_BYTES = 2**26
-"""`clear` forgets what the simulator has answered once the keys of the states that it led to are longer than this."""
+_MOST_BYTES = 2**28
+"""`clear` forgets what the simulator has answered once it takes more memory than this, roughly."""
+
+_BYTES_OF_AN_ANSWER = 500
+"""What an answer takes beside the state that it led to and what that shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +154,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         return number
 
     def _see(self, number: int, observation: Any) -> None:
-        self._observations[number] = self._observe(observation) if self._observe else observation
+        shown = self._observe(observation) if self._observe else observation
+        self._observations[number] = _copied(shown)  # an environment may write into what it has shown
 
     def _known(self, snapshot: Snapshot, shown: Any) -> int:
         """The number of a state that shows this."""
@@ -278,7 +283,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         step = _Step(total, discount, self._snapshots[child], self._observations[child], random)
         if not random:
             self._sure[asked] = step
-            self._sure_bytes += len(step.child.key)
+            self._sure_bytes += _BYTES_OF_AN_ANSWER + len(step.child.key) + sys.getsizeof(step.child.data)
+            self._sure_bytes += _bytes_of(step.shown)
         return step
 
     def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, bool, bool]:
@@ -304,3 +310,19 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
     def _check(self, what: str, number: int, count: int) -> None:
         if not 0 <= number < count:
             raise PgtsError(f"{self.name}: {what} {number} does not exist; there are {count}, from 0 on")
+
+
+def _copied(shown: Any) -> Any:
+    """The same, in arrays and lists that nobody else holds."""
+    if isinstance(shown, dict):
+        return {name: _copied(part) for name, part in shown.items()}
+    if isinstance(shown, tuple):
+        return tuple(map(_copied, shown))
+    return shown.copy() if isinstance(shown, np.ndarray | list) else shown
+
+
+def _bytes_of(shown: Any) -> int:
+    """The bytes of the arrays in what was shown."""
+    if isinstance(shown, dict | tuple):
+        return sum(map(_bytes_of, shown.values() if isinstance(shown, dict) else shown))
+    return np.asarray(shown).nbytes
