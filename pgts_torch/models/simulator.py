@@ -53,7 +53,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
-        gamma: discount in [0, 1] of an outcome that ends no episode; truncation does not end it.
+        gamma: discount in [0, 1] of an outcome that ends no episode and names none, `info["discount"]`; truncation does
+            not end it.
         actions: the actions, in the order of their numbers. Default: all of a discrete space; for a continuous one see
             `grid_actions` and `sampled_actions`.
         action_repeat: how often an action is taken in one outcome, as in `TensorModel`.
@@ -269,10 +270,10 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             self.adapter.set_state(self.env, self._snapshots[state].data)
             total, discount, random = 0.0, 1.0, False
             for _ in range(self.action_repeat):
-                observation, reward, terminated, drew = self._stepped(taken, None if random else key)
+                observation, reward, weight, drew = self._stepped(taken, None if random else key)
                 total, random = total + discount * reward, random or drew
-                discount *= 0.0 if terminated else self.gamma
-                if terminated:
+                discount *= weight
+                if discount == 0:
                     break
             child = self._known(self.adapter.get_state(self.env), None)
             if self._observations[child] is None:
@@ -287,20 +288,20 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             self._sure_bytes += _bytes_of(step.shown)
         return step
 
-    def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, bool, bool]:
-        """Observation, reward, end, and whether chance decided, of one step. The generator is seeded by the key, where
+    def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, float, bool]:
+        """Observation, reward, discount, and whether chance decided, of one step. The generator is seeded by the key, where
         there is one; later draws of the same outcome go on from it."""
         known = self.adapter.is_random(self.env, taken)
         if known is not False and key is not None:
             self.adapter.seed(self.env, key)
         before = generator_state(self.env) if known is None else None
-        observation, reward, terminated, _, _ = self.env.step(taken)
+        observation, reward, terminated, _, info = self.env.step(taken)
         self.simulator_steps += 1
         drew = generator_state(self.env) != before if known is None else known
         reward = float(reward)
         if self._show is None:
             self._checked(observation, reward)
-        return observation, reward, bool(terminated), drew
+        return observation, reward, 0.0 if terminated else float(info.get("discount", self.gamma)), drew
 
     def _checked(self, observation: Any, reward: float) -> Any:
         """The observation; PgtsError unless it and the reward are what the environment declares."""

@@ -250,6 +250,24 @@ def test_only_distinct_states_are_looked_at_and_what_others_make_of_a_step_is_ke
     assert images[1].any()
 
 
+class Hasty(Corridor):
+    """Its steps name a discount while there is much fuel."""
+
+    def step(self, action):
+        *told, info = super().step(action)
+        return (*told, {"discount": 0.5} if self.fuel > 18 else info)
+
+
+def test_an_outcome_has_the_discount_that_the_step_names():
+    model, env = SimulatorModel(lambda: Hasty(slip=0.0), gamma=0.9), reset(Hasty(slip=0.0), 0)
+    first = model.outcomes(torch.tensor([model.root(env)]))
+    assert first.discount_NAK.flatten().tolist() == [0.5, 0.5]
+    second = model.outcomes(first.child_NAK[0, :1, 0])
+    assert second.discount_NAK.flatten().tolist() == [0.9, 0.9]
+    twice = SimulatorModel(lambda: Hasty(slip=0.0), gamma=0.9, action_repeat=2)
+    assert twice.outcomes(torch.tensor([twice.root(env)])).discount_NAK.flatten().tolist() == [0.45, 0.0]  # the end is two to the right
+
+
 def test_what_chance_decides_is_asked_for_every_key():
     model = SimulatorModel(Corridor, gamma=0.9)
     root = model.root(reset(Corridor(), 0))
