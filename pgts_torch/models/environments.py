@@ -194,5 +194,7 @@ def wrappers_of(env: gymnasium.Env) -> list[gymnasium.Wrapper]:
 
 def changing_wrapper(env: gymnasium.Env) -> str:
     """The name of a wrapper that may change observations, rewards or ends; empty where there is none."""
-    changing = (wrapper for wrapper in wrappers_of(env) if not isinstance(wrapper, _HARMLESS))
+    # An ActionWrapper, but what it makes of an action depends on the last one, and on chance.
+    sticky = wrappers.StickyAction
+    changing = (w for w in wrappers_of(env) if isinstance(w, sticky) or not isinstance(w, _HARMLESS))
     return next((type(wrapper).__name__ for wrapper in changing), "")
