@@ -22,6 +22,7 @@ from pgts_torch.agent.build import (
     described,
     make_critic,
     make_depths,
+    make_device,
     make_estimator,
     make_horizon,
     make_policy,
@@ -125,17 +126,20 @@ class PGTS:
         device: torch.device | str = "cpu",
         env_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
-        self._arguments = {name: value for name, value in locals().items() if name != "self"}
+        given = {name: value for name, value in locals().items() if name != "self"}
+        self._arguments = {
+            name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()
+        }
         self.depths = make_depths(depth, max_depth, tolerance)
         self.tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
         if stop_at is not None and not 0 <= stop_at < math.inf:
             raise PgtsError(f"stop_at is {stop_at}; it must be finite and at least 0")
         self.stop_at = stop_at
         self.seed = seed
-        self.device = torch.device(device)
+        self.device = make_device(device)
         self.estimator = make_estimator(estimator)
         self.ranks = present_ranks()
-        if num_envs < self.ranks.size and not isinstance(env, VectorEnv):
+        if num_envs < self.ranks.size > 1 and not isinstance(env, VectorEnv):
             raise PgtsError(f"num_envs is {num_envs}; {self.ranks.size} ranks need at least as many")
         self.world = make_world(
             env,

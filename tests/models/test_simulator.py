@@ -265,7 +265,10 @@ def test_an_outcome_has_the_discount_that_the_step_names():
     second = model.outcomes(first.child_NAK[0, :1, 0])
     assert second.discount_NAK.flatten().tolist() == [0.9, 0.9]
     twice = SimulatorModel(lambda: Hasty(slip=0.0), gamma=0.9, action_repeat=2)
-    assert twice.outcomes(torch.tensor([twice.root(env)])).discount_NAK.flatten().tolist() == [0.45, 0.0]  # the end is two to the right
+    assert twice.outcomes(torch.tensor([twice.root(env)])).discount_NAK.flatten().tolist() == [
+        0.45,
+        0.0,
+    ]  # the end is two to the right
 
 
 def test_what_chance_decides_is_asked_for_every_key():
