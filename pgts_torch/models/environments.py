@@ -45,6 +45,8 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
     if not isinstance(env, str | EnvSpec):
         try:
             made = env()
+        except PgtsError:
+            raise
         except Exception as error:
             raise failure(f"{getattr(env, '__name__', env)} cannot be made", error) from error
         if not isinstance(made, gymnasium.Env):
