@@ -166,6 +166,7 @@ class PGTS:
             self.search = make_search(search, self.world)
         check_parts(self._arguments, self.world, self.policy, self.critic, self.update, self.estimator)
         self._values_of_actions = None if actions_per_dimension is None else divided_actions(self.world.env)
+        self._predicting = stream(seed, "predict", device=self.device)
         self.num_iterations = 0
         self.num_env_steps = 0
         self.num_model_calls = 0
@@ -362,7 +363,7 @@ class PGTS:
         Args:
             observation: what the environment shows, or an array of it.
             deterministic: the most probable action, else one drawn from pi.
-            generator: for drawing; default a stream of this model's seed, the same in each call.
+            generator: for drawing; default one from this model's seed, which goes on from call to call.
         """
         observation_N = self.world.encode(observation)
         shape = observation_N.shape[: observation_N.ndim - len(self.world.observation_space.shape or ())]
@@ -370,8 +371,7 @@ class PGTS:
         if deterministic:
             action_N = self.policy.probs(observation_N).argmax(-1)
         else:
-            generator = generator or stream(self.seed, "predict", device=self.device)
-            action_N = self.policy.sample(observation_N, generator=generator)
+            action_N = self.policy.sample(observation_N, generator=generator or self._predicting)
         action = action_N.cpu().numpy().reshape(shape)
         return action[()] if self._values_of_actions is None else self._values_of_actions[action]
 

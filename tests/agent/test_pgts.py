@@ -131,13 +131,15 @@ def test_predict_answers_in_the_shape_it_is_asked():
 
 
 def test_predict_draws_from_the_policy_where_it_is_asked_to():
-    # 5 standard errors of 4,000 draws: fails by chance with probability 6e-7.
+    # 5 standard errors of 4,000 draws: fails by chance with probability 6e-7, here and call by call.
     policy = SimplexPolicy(5, 2)
     policy.load_state_dict({"probs_SA": right_with(0.7, 0.0, 0.0, 0.0, 1.0)})
-    model = PGTS(copies(ladder(), 2), policy=policy)
+    model, twin = (PGTS(copies(ladder(), 2), policy=policy) for _ in range(2))
     drawn = model.predict(np.zeros(4000, dtype=np.int64), deterministic=False)
     assert abs(drawn.mean() - 0.7) < 5 * (0.21 / 4000) ** 0.5
-    assert np.array_equal(drawn, model.predict(np.zeros(4000, dtype=np.int64), deterministic=False))
+    assert np.array_equal(drawn, twin.predict(np.zeros(4000, dtype=np.int64), deterministic=False))
+    one_by_one = np.array([model.predict(0, deterministic=False) for _ in range(4000)])
+    assert abs(one_by_one.mean() - 0.7) < 5 * (0.21 / 4000) ** 0.5
     given = model.predict(np.zeros(4000, dtype=np.int64), deterministic=False, generator=stream(1, "mine"))
     assert not np.array_equal(drawn, given)
     assert model.predict([1, 4], deterministic=False).tolist() == [0, 1]
