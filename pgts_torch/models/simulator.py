@@ -289,8 +289,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         return step
 
     def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, float, bool]:
-        """Observation, reward, discount, and whether chance decided, of one step. The generator is seeded by the key, where
-        there is one; later draws of the same outcome go on from it."""
+        """Observation, reward, discount, and whether chance decided, of one step. The generator is seeded by the key,
+        where there is one; later draws of the same outcome go on from it."""
         known = self.adapter.is_random(self.env, taken)
         if known is not False and key is not None:
             self.adapter.seed(self.env, key)

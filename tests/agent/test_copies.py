@@ -169,7 +169,7 @@ def test_an_environment_that_raises_while_it_is_made_is_named():
     gymnasium.register("Unbuilt-v0", Unbuilt)
     try:
         for make in (lambda: PGTS("Unbuilt-v0", **SHORT), lambda: check_model(lambda: make_env("Unbuilt-v0"))):
-            with pytest.raises(PgtsError, match="^Unbuilt-v0 cannot be made: RuntimeError: no licence"):
+            with pytest.raises(PgtsError, match=r"^Unbuilt-v0 cannot be made: RuntimeError: no licence"):
                 make()
     finally:
         gymnasium.registry.pop("Unbuilt-v0")

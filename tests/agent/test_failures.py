@@ -174,7 +174,7 @@ def test_an_environment_without_a_model_is_refused_where_a_lookahead_needs_one_a
 
     with pytest.raises(MissingModel, match="Unknown cannot be restored: give Unknown the methods get_state"):
         make(Unknown, depth=1, estimator="lookahead")
-    with pytest.raises(MissingModel, match="or take depth 0 and the estimator 'sampled', which need no model"):
+    with pytest.raises(MissingModel, match=r"or take depth 0 and the estimator 'sampled', which need no model"):
         make(Unknown, depth=0, estimator="lookahead")
     assert make(Unknown).iterate().model_calls == 0
 
