@@ -26,10 +26,10 @@ def seed_sequence(seed: int, *names: str | int) -> np.random.SeedSequence:
         names: what the stream is for, for instance ("rollout", 3); integers 0 <= name < 2**32.
 
     Raises:
-        ValueError: the seed or an integer name is negative or too large.
+        ValueError: the seed is no whole number, or it or an integer name is negative or too large.
     """
-    if not 0 <= seed < 2**63:
-        raise ValueError(f"seed is {seed}; it must be at least 0 and below 2**63")
+    if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
+        raise ValueError(f"seed is {seed}; it must be a whole number, at least 0 and below 2**63")
     for name in names:
         if isinstance(name, int) and not 0 <= name < 2**32:
             raise ValueError(f"stream name {name} must be at least 0 and below 2**32")

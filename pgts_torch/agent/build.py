@@ -54,6 +54,16 @@ _TABLE_UPDATES: _Choices = {"projected": ProjectedUpdate, "softmax": SoftmaxUpda
 _NETWORK_UPDATES: _Choices = {"gradient": GradientUpdate, "ppo": PPOUpdate, "mirror": NetworkMirrorUpdate}
 
 
+def make_device(device: torch.device | str) -> torch.device:
+    """A device; PgtsError unless torch can compute there."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        why = str(error).partition("\n")[0]
+        raise PgtsError(f"device is {str(device)!r}, where torch cannot compute: {why}") from error
+    return torch.device(device)
+
+
 def make_horizon(description: Description) -> Horizon:
     """A horizon: fixed(length), geometric(max_length)."""
     return _make("horizon", _HORIZONS, description)

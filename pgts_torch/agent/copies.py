@@ -10,11 +10,12 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers import TimeLimit
 
 from pgts_torch.agent.optimisers import check_count
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models import snapshots
-from pgts_torch.models.environments import EnvSource, all_actions, make_env, spec_of, with_torques
+from pgts_torch.models.environments import EnvSource, all_actions, make_env, spec_of, with_torques, wrappers_of
 
 
 def make_vector_env(
@@ -49,8 +50,12 @@ def make_vector_env(
         else:
             options |= {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode.DISABLED}}
         return gymnasium.make_vec(env, num_envs=num_envs, **options)
+    except PgtsError:
+        raise
     except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
         raise PgtsError(f"{env} cannot be made: {error}") from error
+    except Exception as error:
+        raise failure(f"{env} cannot be made", error) from error
 
 
 def more_copies(env: VectorEnv, num_envs: int) -> VectorEnv:
@@ -86,7 +91,8 @@ def env_name(env: VectorEnv) -> str:
 
 
 def registered_limit(env: EnvSource | VectorEnv, copies: VectorEnv) -> int | None:
-    """The most steps of an episode of an environment of which copies were made, as registered; None: no limit."""
+    """The most steps of an episode of an environment of which copies were made, as registered or by a TimeLimit around
+    it; None: no limit."""
     spec: EnvSpec | None
     if isinstance(env, str):
         spec = spec_of(env)
@@ -95,6 +101,9 @@ def registered_limit(env: EnvSource | VectorEnv, copies: VectorEnv) -> int | Non
     else:
         spec = copies.envs[0].spec if isinstance(copies, SyncVectorEnv) else copies.spec
     limit = None if spec is None else spec.max_episode_steps
+    if spec is None and isinstance(copies, SyncVectorEnv):
+        limits = [w._max_episode_steps for w in wrappers_of(copies.envs[0]) if isinstance(w, TimeLimit)]
+        limit = min(limits, default=None)
     return limit if limit is not None and limit > 0 else None
 
 

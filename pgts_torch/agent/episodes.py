@@ -6,7 +6,8 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from pgts_torch.errors import NotFinite
+from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.models.environments import check_step
 
 
 @final
@@ -25,9 +26,11 @@ class Episodes:
     """
 
     def __init__(self, env: VectorEnv, *, gamma: float, seeds: list[int]) -> None:
-        self._env, self._gamma = env, gamma
+        self._env, self._gamma, self._seeds = env, gamma, seeds
         self._one_by_one = isinstance(env, SyncVectorEnv) and type(env).step is SyncVectorEnv.step
         self._over_B = np.zeros(env.num_envs, dtype=bool)
+        self._reward_B = np.zeros(env.num_envs)
+        self._stepping: int | None = None
         self.observation: Any = env.reset(seed=seeds)[0]  # type: ignore[arg-type]  # or one seed for all
         self._each = list(iterate(env.observation_space, self.observation)) if self._one_by_one else []
 
@@ -60,10 +63,26 @@ class Episodes:
         assert isinstance(self._env, SyncVectorEnv)
         copies, space = self._env.envs, self._env.single_observation_space
         reward_B, discount_B = np.zeros((2, len(copies)))
+        self._reward_B = reward_B
         truncated_B = np.zeros(len(copies), dtype=bool)
         for b in np.flatnonzero(alive_B):
+            self._stepping = int(b)
             self._each[b], reward_B[b], terminated, truncated_B[b], info = copies[b].step(action_B[b])
             discount_B[b] = 0.0 if terminated else info.get("discount", self._gamma)
+        self._stepping = None
         rows: Any = create_empty_array(space, n=len(copies))
         self.observation = concatenate(space, self._each, rows)
         return reward_B, discount_B, truncated_B
+
+    def blame(self, error: Exception) -> tuple[list[int], Exception]:
+        """The seeds of the copies that an error may come from; and the error, or what is wrong with the one copy that
+        it comes from."""
+        if self._stepping is not None:
+            return [self._seeds[self._stepping]], error
+        space = self._env.single_observation_space
+        for seed, observation, reward in zip(self._seeds, self._each, self._reward_B, strict=False):
+            try:
+                check_step(space, observation, float(reward))
+            except PgtsError as found:
+                return [seed], found
+        return self._seeds, error

@@ -22,6 +22,7 @@ from pgts_torch.agent.build import (
     described,
     make_critic,
     make_depths,
+    make_device,
     make_estimator,
     make_horizon,
     make_policy,
@@ -125,17 +126,20 @@ class PGTS:
         device: torch.device | str = "cpu",
         env_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
-        self._arguments = {name: value for name, value in locals().items() if name != "self"}
+        given = {name: value for name, value in locals().items() if name != "self"}
+        self._arguments = {
+            name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()
+        }
         self.depths = make_depths(depth, max_depth, tolerance)
         self.tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
         if stop_at is not None and not 0 <= stop_at < math.inf:
             raise PgtsError(f"stop_at is {stop_at}; it must be finite and at least 0")
         self.stop_at = stop_at
         self.seed = seed
-        self.device = torch.device(device)
+        self.device = make_device(device)
         self.estimator = make_estimator(estimator)
         self.ranks = present_ranks()
-        if num_envs < self.ranks.size and not isinstance(env, VectorEnv):
+        if num_envs < self.ranks.size > 1 and not isinstance(env, VectorEnv):
             raise PgtsError(f"num_envs is {num_envs}; {self.ranks.size} ranks need at least as many")
         self.world = make_world(
             env,
@@ -162,6 +166,7 @@ class PGTS:
             self.search = make_search(search, self.world)
         check_parts(self._arguments, self.world, self.policy, self.critic, self.update, self.estimator)
         self._values_of_actions = None if actions_per_dimension is None else divided_actions(self.world.env)
+        self._predicting = stream(seed, "predict", device=self.device)
         self.num_iterations = 0
         self.num_env_steps = 0
         self.num_model_calls = 0
@@ -358,7 +363,7 @@ class PGTS:
         Args:
             observation: what the environment shows, or an array of it.
             deterministic: the most probable action, else one drawn from pi.
-            generator: for drawing; default a stream of this model's seed, the same in each call.
+            generator: for drawing; default one from this model's seed, which goes on from call to call.
         """
         observation_N = self.world.encode(observation)
         shape = observation_N.shape[: observation_N.ndim - len(self.world.observation_space.shape or ())]
@@ -366,8 +371,7 @@ class PGTS:
         if deterministic:
             action_N = self.policy.probs(observation_N).argmax(-1)
         else:
-            generator = generator or stream(self.seed, "predict", device=self.device)
-            action_N = self.policy.sample(observation_N, generator=generator)
+            action_N = self.policy.sample(observation_N, generator=generator or self._predicting)
         action = action_N.cpu().numpy().reshape(shape)
         return action[()] if self._values_of_actions is None else self._values_of_actions[action]
 

@@ -182,9 +182,12 @@ def rollout(
     words = seed_sequence(seed, *names, "env").generate_state(env.num_envs)
     try:
         episodes = Episodes(env, gamma=world.gamma, seeds=words.tolist())
-        observation_B, reads = world.encode(episodes.observation), [world.read(env, episodes.observation)]
     except Exception as error:
         raise _failure(env, "at the start", words.tolist(), error) from error
+    try:
+        observation_B, reads = world.encode(episodes.observation), [world.read(env, episodes.observation)]
+    except Exception as error:
+        raise _failure(env, "at the start", *episodes.blame(error)) from error
     # What is small stays in numpy until the end: on tensors of a few numbers, each operation costs several times more.
     alive_B, weight_B = np.ones(env.num_envs, dtype=bool), np.ones(env.num_envs)
     rows: list[tuple[np.ndarray, ...]] = []
@@ -194,7 +197,7 @@ def rollout(
             reward_B, discount_B, truncated_B = episodes.step(action_B, alive_B)
             observation_B, read_B = world.encode(episodes.observation), world.read(env, episodes.observation)
         except Exception as error:
-            raise _failure(env, f"in step {len(rows)}", words.tolist(), error) from error
+            raise _failure(env, f"in step {len(rows)}", *episodes.blame(error)) from error
         survival_B = horizon.survival(torch.from_numpy(discount_B), generator).numpy()
         rows.append((action_B, reward_B, discount_B, alive_B, weight_B * alive_B, survival_B))
         reads.append(read_B)
@@ -219,7 +222,8 @@ def rollout(
 
 
 def _failure(env: VectorEnv, when: str, seeds: list[int], error: Exception) -> PgtsError:
-    return failure(f"{env_name(env)} failed {when} of the episodes with the seeds {seeds}", error)
+    episodes = f"the episode with the seed {seeds[0]}" if len(seeds) == 1 else f"the episodes with the seeds {seeds}"
+    return failure(f"{env_name(env)} failed {when} of {episodes}", error)
 
 
 def simulated_returns(

@@ -24,6 +24,8 @@ from pgts_torch.models.snapshots import adapter_for
 from pgts_torch.models.tabular import TabularModel, tabular_truth
 from pgts_torch.tabular.mdp import TabularMDP
 
+_NO_MODEL_NEEDED = "; or take depth 0 and the estimator 'sampled', which need no model"
+
 DEFAULT_GAMMA = 0.99
 """Discount of an environment that carries none."""
 
@@ -347,6 +349,7 @@ def make_world(
         raise MissingModel(
             f"{env_name(copies)} is wrapped in {wrapper}, which may change what a step gives, and a model only knows "
             "the environment inside: leave it out, or make it part of an environment with get_state and set_state"
+            + _NO_MODEL_NEEDED
         )
     if observation_key is None and not wrapper and isinstance(copies.single_observation_space, spaces.Discrete):
         try:
@@ -361,11 +364,17 @@ def make_world(
         _check_single(action_repeat, "without a model")
         return PlainWorld(copies, gamma=discount, observation_key=observation_key, device=device)
     if not isinstance(copies, SyncVectorEnv):
-        raise MissingModel(f"{env_name(copies)} steps its copies together; a simulator needs a SyncVectorEnv of them")
+        raise MissingModel(
+            f"{env_name(copies)} steps its copies together; a simulator needs a SyncVectorEnv of them"
+            + _NO_MODEL_NEEDED
+        )
     if (dynamics := dynamics_of(copies.envs[0])) is not None:
         vectors = dynamics(copies.envs[0], gamma=discount, action_repeat=action_repeat, device=device)
         return DynamicsWorld(copies, vectors, observation_key=observation_key)
-    adapter = adapter_for(copies.envs[0])
+    try:
+        adapter = adapter_for(copies.envs[0])
+    except MissingModel as missing:
+        raise MissingModel(f"{missing}{_NO_MODEL_NEEDED}") from None
     model = SimulatorModel(
         copies.env_fns[0],
         gamma=discount,

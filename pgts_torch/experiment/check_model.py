@@ -64,11 +64,11 @@ def _lines(report: Report) -> Iterator[str]:
         yield from textwrap.wrap(
             f"{check.name:<9}  {mark:<3}  {check.detail}", _WIDTH, subsequent_indent=" " * 16, break_on_hyphens=False
         )
-    cost = report.cost
-    yield ""
-    yield (
-        f"a call   {cost.call:.0f} us = restore {cost.restore:.0f} + step {cost.step:.0f} + snapshot "
-        f"{cost.snapshot:.0f}; a snapshot has {cost.bytes:,} bytes"
-    )
+    if (cost := report.cost) is not None:
+        yield ""
+        yield (
+            f"a call   {cost.call:.0f} us = restore {cost.restore:.0f} + step {cost.step:.0f} + snapshot "
+            f"{cost.snapshot:.0f}; a snapshot has {cost.bytes:,} bytes"
+        )
     yield ""
     yield from textwrap.wrap(report.verdict, _WIDTH, break_on_hyphens=False)

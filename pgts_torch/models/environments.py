@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces, wrappers
 from gymnasium.envs.registration import EnvSpec
 
-from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.errors import NotFinite, PgtsError, failure
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.seeding import numpy_stream
 
@@ -33,7 +33,8 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
     is made from its spec.
 
     Raises:
-        PgtsError: there is no such id, an extra is missing, an instance has no spec, or a function makes none.
+        PgtsError: there is no such id, an extra is missing, an instance has no spec, a function makes none, or the
+            environment raises an error of its own.
     """
     if isinstance(env, gymnasium.Env):
         if env.spec is None:
@@ -42,7 +43,12 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
             )
         env = env.spec
     if not isinstance(env, str | EnvSpec):
-        made = env()
+        try:
+            made = env()
+        except PgtsError:
+            raise
+        except Exception as error:
+            raise failure(f"{getattr(env, '__name__', env)} cannot be made", error) from error
         if not isinstance(made, gymnasium.Env):
             raise PgtsError(f"{env!r} gave {made!r}; it must be a Gymnasium environment")
         return made
@@ -54,6 +60,8 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
         raise PgtsError(f"{name} needs something that is not installed: {error}") from error
     except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
         raise PgtsError(f"{name} cannot be made: {error}") from error
+    except Exception as error:
+        raise failure(f"{name} cannot be made", error) from error
 
 
 _MODULES = {"MiniGrid-": ("minigrid", "envs"), "BabyAI-": ("minigrid", "envs"), "ALE/": ("ale_py", "atari")}
@@ -194,5 +202,7 @@ def wrappers_of(env: gymnasium.Env) -> list[gymnasium.Wrapper]:
 
 def changing_wrapper(env: gymnasium.Env) -> str:
     """The name of a wrapper that may change observations, rewards or ends; empty where there is none."""
-    changing = (wrapper for wrapper in wrappers_of(env) if not isinstance(wrapper, _HARMLESS))
+    # An ActionWrapper, but what it makes of an action depends on the last one, and on chance.
+    sticky = wrappers.StickyAction
+    changing = (w for w in wrappers_of(env) if isinstance(w, sticky) or not isinstance(w, _HARMLESS))
     return next((type(wrapper).__name__ for wrapper in changing), "")

@@ -5,6 +5,7 @@ import random
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,7 @@ class Report:
     """The answer of `check_model`.
 
     random_share: how many of the (state, action) tried are decided by chance, in [0, 1].
+    cost: of a call; None where one fails.
     """
 
     env: str
@@ -67,7 +69,7 @@ class Report:
     num_actions: int
     random_share: float
     checks: tuple[Check, ...]
-    cost: Cost
+    cost: Cost | None
 
     @property
     def usable(self) -> bool:
@@ -139,7 +141,13 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
         _check("chance", lambda: _chance(setup, walks)),
         _check("untouched", lambda: _untouched(setup, length)),
     )
-    return Report(setup.name, setup.adapter.name, len(actions), tried.random_share, checks, _cost(setup, walks))
+    report = Report(setup.name, setup.adapter.name, len(actions), tried.random_share, checks, cost=None)
+    try:
+        return replace(report, cost=_cost(setup, walks))
+    except Exception as error:
+        if report.usable:
+            raise PgtsError(f"{setup.name} fails where its calls are timed: {_told(error)}") from error
+        return report
 
 
 def _check(name: str, check: Callable[[], str], *, needed: bool = True) -> Check:
@@ -192,9 +200,8 @@ def _merge(walks: Sequence[Walk], repeated: Sequence[Walk]) -> str:
 def _chance(setup: Setup, walks: Sequence[Walk]) -> str:
     """A look for generators that a search does not own, and what another key changes."""
     env = setup.fresh()
-    for name, value in vars(env).items():
-        if isinstance(value, _GENERATORS) and value is not env.np_random:
-            raise _Missing(f"attribute {name} is a generator of its own: draw from self.np_random only")
+    if name := _own_generator(env):
+        raise _Missing(f"attribute {name} is a generator of its own: draw from self.np_random only")
     differ = 0
     for walk in walks:
         setup.adapter.set_state(env, walk.start.data)
@@ -209,6 +216,29 @@ def _chance(setup: Setup, walks: Sequence[Walk]) -> str:
         if moved := [name for name, state in _global_generators().items() if state != before[name]]:
             raise _Missing(f"step draws from the global generator of {moved[0]}: draw from self.np_random only")
     return f"of the key alone; {differ} of {len(walks)} continuations differ under another key"
+
+
+def _own_generator(env: Any) -> str:
+    """Where in an environment there is another generator than `np_random`; empty where there is none."""
+    seen, known = [("", env)], {id(env), id(env.np_random)}
+    for where, holder in seen:
+        for name, value in _held(holder):
+            if id(value) in known:
+                continue
+            if isinstance(value, _GENERATORS):
+                return f"{where}{name}"
+            known.add(id(value))
+            seen.append((f"{where}{name}.", value))
+    return ""
+
+
+def _held(value: Any) -> list[tuple[Any, Any]]:
+    """The names and values that something consists of; spaces have generators, but none that a step draws from."""
+    if isinstance(value, dict):
+        return list(value.items())
+    if isinstance(value, list | tuple):
+        return list(enumerate(value))
+    return [] if isinstance(value, spaces.Space | type | ModuleType) else list(getattr(value, "__dict__", {}).items())
 
 
 def _stable_key(setup: Setup, env: Any) -> bytes | None:
@@ -234,7 +264,7 @@ def _untouched(setup: Setup, length: int) -> str:
     seed, actions = setup.number(), [setup.action() for _ in range(2 * length)]
     for env in (real, twin):
         env.reset(seed=seed)
-    lives = live(real, actions[:length]), live(twin, actions[:length])
+    begun = live(real, actions[:length]), live(twin, actions[:length])
     before = _stable_key(setup, real.unwrapped), repr(generator_state(real.unwrapped))
     model = setup.model()
     frontier_N = model.roots([real])
@@ -247,8 +277,12 @@ def _untouched(setup: Setup, length: int) -> str:
     after = _stable_key(setup, real.unwrapped), repr(generator_state(real.unwrapped))
     if before != after:
         raise _Missing("a search changes the real environment: instances share something, or get_state changes its own")
-    lives = lives[0] + live(real, actions[length:]), lives[1] + live(twin, actions[length:])
-    if lives[0] != lives[1]:
+    if begun[0] != begun[1]:
+        raise _Missing(
+            "after reset with the same seed two instances go on differently: reset must hand its seed to "
+            "super().reset, and draw from self.np_random only"
+        )
+    if live(real, actions[length:]) != live(twin, actions[length:]):
         raise _Missing("a real environment goes on differently after a search: it shares something with the model's")
     return f"a search of {model.simulator_steps} steps left a real environment as it was, bit for bit"
 

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
@@ -22,8 +23,11 @@ from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, 
 _KEY_OF_CERTAINTY = 0
 """Outcomes that are listed draw nothing; this is what they would draw from."""
 
-_MOST_BYTES = 2**26
-"""`clear` forgets what the simulator has answered once the keys of the states that it led to are longer than this."""
+_MOST_BYTES = 2**28
+"""`clear` forgets what the simulator has answered once it takes more memory than this, roughly."""
+
+_BYTES_OF_AN_ANSWER = 500
+"""What an answer takes beside the state that it led to and what that shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +53,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
-        gamma: discount in [0, 1] of an outcome that ends no episode; truncation does not end it.
+        gamma: discount in [0, 1] of an outcome that ends no episode and names none, `info["discount"]`; truncation does
+            not end it.
         actions: the actions, in the order of their numbers. Default: all of a discrete space; for a continuous one see
             `grid_actions` and `sampled_actions`.
         action_repeat: how often an action is taken in one outcome, as in `TensorModel`.
@@ -150,7 +155,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         return number
 
     def _see(self, number: int, observation: Any) -> None:
-        self._observations[number] = self._observe(observation) if self._observe else observation
+        shown = self._observe(observation) if self._observe else observation
+        self._observations[number] = _copied(shown)  # an environment may write into what it has shown
 
     def _known(self, snapshot: Snapshot, shown: Any) -> int:
         """The number of a state that shows this."""
@@ -264,10 +270,10 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             self.adapter.set_state(self.env, self._snapshots[state].data)
             total, discount, random = 0.0, 1.0, False
             for _ in range(self.action_repeat):
-                observation, reward, terminated, drew = self._stepped(taken, None if random else key)
+                observation, reward, weight, drew = self._stepped(taken, None if random else key)
                 total, random = total + discount * reward, random or drew
-                discount *= 0.0 if terminated else self.gamma
-                if terminated:
+                discount *= weight
+                if discount == 0:
                     break
             child = self._known(self.adapter.get_state(self.env), None)
             if self._observations[child] is None:
@@ -278,23 +284,24 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         step = _Step(total, discount, self._snapshots[child], self._observations[child], random)
         if not random:
             self._sure[asked] = step
-            self._sure_bytes += len(step.child.key)
+            self._sure_bytes += _BYTES_OF_AN_ANSWER + len(step.child.key) + sys.getsizeof(step.child.data)
+            self._sure_bytes += _bytes_of(step.shown)
         return step
 
-    def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, bool, bool]:
-        """Observation, reward, end, and whether chance decided, of one step. The generator is seeded by the key, where
-        there is one; later draws of the same outcome go on from it."""
+    def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, float, bool]:
+        """Observation, reward, discount, and whether chance decided, of one step. The generator is seeded by the key,
+        where there is one; later draws of the same outcome go on from it."""
         known = self.adapter.is_random(self.env, taken)
         if known is not False and key is not None:
             self.adapter.seed(self.env, key)
         before = generator_state(self.env) if known is None else None
-        observation, reward, terminated, _, _ = self.env.step(taken)
+        observation, reward, terminated, _, info = self.env.step(taken)
         self.simulator_steps += 1
         drew = generator_state(self.env) != before if known is None else known
         reward = float(reward)
         if self._show is None:
             self._checked(observation, reward)
-        return observation, reward, bool(terminated), drew
+        return observation, reward, 0.0 if terminated else float(info.get("discount", self.gamma)), drew
 
     def _checked(self, observation: Any, reward: float) -> Any:
         """The observation; PgtsError unless it and the reward are what the environment declares."""
@@ -304,3 +311,19 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
     def _check(self, what: str, number: int, count: int) -> None:
         if not 0 <= number < count:
             raise PgtsError(f"{self.name}: {what} {number} does not exist; there are {count}, from 0 on")
+
+
+def _copied(shown: Any) -> Any:
+    """The same, in arrays and lists that nobody else holds."""
+    if isinstance(shown, dict):
+        return {name: _copied(part) for name, part in shown.items()}
+    if isinstance(shown, tuple):
+        return tuple(map(_copied, shown))
+    return shown.copy() if isinstance(shown, np.ndarray | list) else shown
+
+
+def _bytes_of(shown: Any) -> int:
+    """The bytes of the arrays in what was shown."""
+    if isinstance(shown, dict | tuple):
+        return sum(map(_bytes_of, shown.values() if isinstance(shown, dict) else shown))
+    return np.asarray(shown).nbytes

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 
 from pgts_torch import PGTS
 from pgts_torch.agent.callbacks import EvalCallback
@@ -12,6 +13,8 @@ from pgts_torch.agent.copies import make_vector_env
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.world import DynamicsWorld, PlainWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
+from pgts_torch.models import check_model
+from pgts_torch.models.environments import make_env
 from tests.agent.helpers import same_bits
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -151,3 +154,29 @@ def test_copies_that_were_made_take_their_own_actions():
     assert PGTS(copies, **SHORT).iterate().look.q_BA.shape[-1] == 3
     with pytest.raises(PgtsError, match="actions_per_dimension is 3; a VectorEnv takes its own actions"):
         PGTS(copies, **SHORT, actions_per_dimension=3)
+
+
+class Unbuilt(Field):
+    """It cannot be made."""
+
+    def __init__(self):
+        raise RuntimeError("no licence")
+
+
+def test_an_environment_that_raises_while_it_is_made_is_named():
+    with pytest.raises(PgtsError, match="Unbuilt cannot be made: RuntimeError: no licence"):
+        PGTS(Unbuilt, **SHORT)
+    gymnasium.register("Unbuilt-v0", Unbuilt)
+    try:
+        for make in (lambda: PGTS("Unbuilt-v0", **SHORT), lambda: check_model(lambda: make_env("Unbuilt-v0"))):
+            with pytest.raises(PgtsError, match=r"^Unbuilt-v0 cannot be made: RuntimeError: no licence"):
+                make()
+    finally:
+        gymnasium.registry.pop("Unbuilt-v0")
+
+
+def test_a_time_limit_around_an_environment_of_ones_own_is_that_of_its_evaluation():
+    model = PGTS(lambda: TimeLimit(Field(), 1200), **SHORT, actions_per_dimension=2)
+    assert model.time_limit == 1200
+    assert evaluate(model, episodes=1).episodic_length.mean == 1200
+    assert PGTS(Field, **SHORT, actions_per_dimension=2).time_limit is None

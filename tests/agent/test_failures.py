@@ -1,5 +1,7 @@
 """A user's environment that fails: one error names the environment, the step and the seeds of its copies."""
 
+import re
+
 import gymnasium
 import numpy as np
 import pytest
@@ -94,18 +96,18 @@ def make(env: type[gymnasium.Env], **kwargs) -> PGTS:
     return PGTS(env, **short | kwargs)
 
 
-def seeds(*names: str | int) -> str:
-    return str(seed_sequence(5, *names, "env").generate_state(2).tolist())
+def seeds(*names: str | int) -> list[int]:
+    return seed_sequence(5, *names, "env").generate_state(2).tolist()
 
 
 FAILURES = {
     Raises: "in step 3 .* RuntimeError: the spring broke",
-    Unseen: r"in step 3 .* an observation is not finite: \[nan, nan, nan\]",
-    Longer: "in step 3 .* Output array is the wrong shape",
-    Shorter: "in step 3 .* Output array is the wrong shape",
-    Worthless: r"in step 3 .* the rewards are \[nan, nan\]; they must be finite",
+    Unseen: r"in step 3 .* the observation is \[nan, nan\]; it must be finite",
+    Longer: r"in step 3 .* the observation has shape \(3,\); \(2,\) is declared",
+    Shorter: r"in step 3 .* the observation has shape \(1,\); \(2,\) is declared",
+    Worthless: "in step 3 .* the reward is nan",
     Terse: "in step 3 .* not enough values to unpack",
-    Unborn: r"at the start .* an observation is not finite: \[nan, nan, nan\]",
+    Unborn: r"at the start .* the observation is \[nan, nan\]; it must be finite",
     Misborn: "at the start .* Output array is the wrong shape",
 }
 NOT_FINITE = {Unseen: "observation", Worthless: "reward", Unborn: "observation"}
@@ -117,9 +119,29 @@ NOT_FINITE = {Unseen: "observation", Worthless: "reward", Unborn: "observation"}
 def test_what_fails_in_a_rollout_is_named_with_its_step_and_seeds(env, options):
     with pytest.raises(PgtsError, match=f"^{env.__name__} failed {FAILURES[env]}") as caught:
         make(env, **options).iterate()
-    assert f"the seeds {seeds('iteration', 0)}: " in str(caught.value)
+    both = seeds("iteration", 0)
+    named = f"the episodes with the seeds {both}: " if env is Misborn else f"the episode with the seed {both[0]}: "
+    assert named in str(caught.value)
     assert getattr(caught.value, "what", None) == NOT_FINITE.get(env)
     assert make(Clock, **options).iterate().experience.num_steps == 12
+
+
+@pytest.mark.parametrize("env", [Raises, Unseen, Longer, Worthless])
+def test_of_many_copies_the_one_that_failed_is_named(env):
+    class Sometimes(env):
+        def reset(self, *, seed=None, options=None):
+            observation = super().reset(seed=seed)
+            self.unlucky = self.np_random.random() < 0.1
+            return observation
+
+        def fourth(self):
+            return super().fourth() if self.unlucky else Clock.fourth(self)
+
+    with pytest.raises(PgtsError, match=r"with the seed \d+: ") as caught:
+        make(Sometimes, num_envs=32).iterate()
+    failed = Sometimes()
+    failed.reset(seed=int(re.search(r"seed (\d+): ", str(caught.value))[1]))
+    assert failed.unlucky
 
 
 def test_what_cannot_start_is_named_by_whoever_starts_it_first():
@@ -133,7 +155,7 @@ def test_what_fails_in_an_evaluation_is_named_too():
     model = make(Raises, horizon={"type": "fixed", "length": 3})
     with pytest.raises(PgtsError, match=r"Raises failed in step 3 .* the spring broke") as caught:
         model.learn(100, callback=EvalCallback(every=1, episodes=2, seed=5))
-    assert f"the seeds {seeds('evaluate', 'deterministic')}: " in str(caught.value)
+    assert f"the seed {seeds('evaluate', 'deterministic')[0]}: " in str(caught.value)
 
 
 @pytest.mark.parametrize("env", [Raises, Worthless, Unseen, Longer])
@@ -152,6 +174,8 @@ def test_an_environment_without_a_model_is_refused_where_a_lookahead_needs_one_a
 
     with pytest.raises(MissingModel, match="Unknown cannot be restored: give Unknown the methods get_state"):
         make(Unknown, depth=1, estimator="lookahead")
+    with pytest.raises(MissingModel, match=r"or take depth 0 and the estimator 'sampled', which need no model"):
+        make(Unknown, depth=0, estimator="lookahead")
     assert make(Unknown).iterate().model_calls == 0
 
 

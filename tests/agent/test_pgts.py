@@ -131,13 +131,15 @@ def test_predict_answers_in_the_shape_it_is_asked():
 
 
 def test_predict_draws_from_the_policy_where_it_is_asked_to():
-    # 5 standard errors of 4,000 draws: fails by chance with probability 6e-7.
+    # 5 standard errors of 4,000 draws: fails by chance with probability 6e-7, here and call by call.
     policy = SimplexPolicy(5, 2)
     policy.load_state_dict({"probs_SA": right_with(0.7, 0.0, 0.0, 0.0, 1.0)})
-    model = PGTS(copies(ladder(), 2), policy=policy)
+    model, twin = (PGTS(copies(ladder(), 2), policy=policy) for _ in range(2))
     drawn = model.predict(np.zeros(4000, dtype=np.int64), deterministic=False)
     assert abs(drawn.mean() - 0.7) < 5 * (0.21 / 4000) ** 0.5
-    assert np.array_equal(drawn, model.predict(np.zeros(4000, dtype=np.int64), deterministic=False))
+    assert np.array_equal(drawn, twin.predict(np.zeros(4000, dtype=np.int64), deterministic=False))
+    one_by_one = np.array([model.predict(0, deterministic=False) for _ in range(4000)])
+    assert abs(one_by_one.mean() - 0.7) < 5 * (0.21 / 4000) ** 0.5
     given = model.predict(np.zeros(4000, dtype=np.int64), deterministic=False, generator=stream(1, "mine"))
     assert not np.array_equal(drawn, given)
     assert model.predict([1, 4], deterministic=False).tolist() == [0, 1]
@@ -270,7 +272,9 @@ def test_an_environment_without_a_model_is_refused_with_what_is_missing():
         ({"policy": SoftmaxPolicy(4, 2)}, r"\(4, 2\); the environment has \(5, 2\)"),
         ({"gamma": 1.5}, "gamma is 1.5"),
         ({"seed": -1}, "seed is -1"),
-        ({"num_envs": 0}, "num_envs is 0"),
+        ({"seed": None}, "seed is None; it must be a whole number"),
+        ({"device": "auto"}, "device is 'auto', where torch cannot compute: Expected one of cpu"),
+        ({"num_envs": 0}, "num_envs is 0; it must be at least 1"),
         ({"env_kwargs": {"length": 3}}, "no argument 'length'"),
         ({"env": "pgts/Nowhere-v0"}, "pgts/Nowhere-v0 cannot be made"),
         ({"horizon": 3}, "horizon is 3"),

@@ -86,6 +86,13 @@ def test_a_model_is_loaded_with_everything_that_it_was_made_with(tmp_path):
     assert PGTS.load(path).iterate().experience.num_steps == made.iterate().experience.num_steps
 
 
+def test_a_seed_and_a_discount_from_numpy_are_saved(tmp_path):
+    path = tmp_path / "model.pt"
+    PGTS("FrozenLake-v1", depth=1, seed=np.arange(4)[3], gamma=np.linspace(0, 1, 5)[3]).save(path)
+    model = PGTS.load(path)
+    assert (model.seed, model.gamma) == (3, 0.75)
+
+
 def test_a_model_saved_over_itself_leaves_one_file(tmp_path):
     path, model = tmp_path / "model.pt", make()
     model.save(path)

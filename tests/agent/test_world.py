@@ -388,6 +388,12 @@ def test_a_model_is_refused_where_a_wrapper_may_change_what_it_knows(env):
     assert isinstance(plain, PlainWorld)
 
 
+def test_a_model_is_refused_where_a_wrapper_repeats_actions_at_random():
+    sticky = functools.partial(gymnasium.wrappers.StickyAction, repeat_action_probability=0.5)
+    with pytest.raises(MissingModel, match="CartPole-v1 is wrapped in StickyAction"):
+        make_world("CartPole-v1", **KEYWORDS, wrappers=[sticky])
+
+
 def test_images_of_a_minigrid_are_learned_from_with_a_lookahead():
     pytest.importorskip("minigrid")
     model = PGTS(

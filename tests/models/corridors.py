@@ -105,6 +105,49 @@ class OwnGenerator(Corridor):
         return self.dice.random()
 
 
+class Clairvoyant(Corridor):
+    """It draws from a generator inside of something, which is a part of its state."""
+
+    def __init__(self, slip: float = 0.3) -> None:
+        super().__init__(slip)
+        self.box = [{"dice": np.random.default_rng(0)}]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        if seed is not None:
+            self.box = [{"dice": np.random.default_rng(seed)}]
+        return super().reset(seed=seed)
+
+    def draw(self) -> float:
+        return self.box[0]["dice"].random()
+
+    def get_state(self) -> Any:
+        return self.position, self.fuel, self.box
+
+    def set_state(self, state: Any) -> None:
+        self.position, self.fuel, self.box = state
+
+
+class Heedless(Corridor):
+    """Where an episode begins its seed does not say."""
+
+    count: ClassVar = itertools.count()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
+        self.position = next(self.count) % 3
+        return self.look(), {}
+
+
+class Stuck(Corridor):
+    """It cannot be set to any state, and its episodes never end."""
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict]:
+        return self.look(), 0.0, False, False, {}
+
+    def set_state(self, state: Any) -> None:
+        raise NotImplementedError("later")
+
+
 class GlobalGenerator(Corridor):
     """It draws from a generator that all programs share."""
 

@@ -167,6 +167,27 @@ def test_answers_outlive_the_numbers_of_states_unless_they_take_much_memory(most
     assert (steps[2] > steps[1]) == asked_again
 
 
+class Panorama(Corridor):
+    """Its state takes two bytes, and what it shows a million."""
+
+    def __init__(self):
+        super().__init__(slip=0.0)
+        self.observation_space = spaces.Box(0, 255, (1000, 1000), np.uint8)
+
+    def look(self):
+        return np.full((1000, 1000), self.position, np.uint8)
+
+
+def test_what_states_show_counts_as_memory(monkeypatch):
+    monkeypatch.setattr(simulator, "_MOST_BYTES", 2**20)
+    for make, asked_again in ((lambda: Corridor(slip=0.0), False), (Panorama, True)):
+        model = SimulatorModel(make, gamma=0.9)
+        for _ in range(2):
+            model.clear()
+            model.outcomes(model.roots([reset(make(), 0)]))
+        assert model.simulator_steps == (4 if asked_again else 2)
+
+
 def test_numbers_do_not_depend_on_what_is_remembered():
     fresh, knowing = (SimulatorModel("CliffWalking-v1", gamma=0.9) for _ in range(2))
     knowing.outcomes(every_state("CliffWalking-v1", knowing, 48)[[30]])
@@ -227,6 +248,27 @@ def test_only_distinct_states_are_looked_at_and_what_others_make_of_a_step_is_ke
     assert look.model_calls > 2 * model.num_states
     assert np.array_equal(images[0] // 2, images[1])
     assert images[1].any()
+
+
+class Hasty(Corridor):
+    """Its steps name a discount while there is much fuel."""
+
+    def step(self, action):
+        *told, info = super().step(action)
+        return (*told, {"discount": 0.5} if self.fuel > 18 else info)
+
+
+def test_an_outcome_has_the_discount_that_the_step_names():
+    model, env = SimulatorModel(lambda: Hasty(slip=0.0), gamma=0.9), reset(Hasty(slip=0.0), 0)
+    first = model.outcomes(torch.tensor([model.root(env)]))
+    assert first.discount_NAK.flatten().tolist() == [0.5, 0.5]
+    second = model.outcomes(first.child_NAK[0, :1, 0])
+    assert second.discount_NAK.flatten().tolist() == [0.9, 0.9]
+    twice = SimulatorModel(lambda: Hasty(slip=0.0), gamma=0.9, action_repeat=2)
+    assert twice.outcomes(torch.tensor([twice.root(env)])).discount_NAK.flatten().tolist() == [
+        0.45,
+        0.0,
+    ]  # the end is two to the right
 
 
 def test_what_chance_decides_is_asked_for_every_key():
@@ -293,6 +335,42 @@ def test_observations_are_those_of_the_environment_and_wait_for_those_of_roots()
     assert seen.dtype == np.float32
     assert np.array_equal(seen, np.stack([observation, after]))
     assert model.root(env) == child
+
+
+class Canvas(Corridor):
+    """Shows one array again and again, and writes into it."""
+
+    def __init__(self):
+        super().__init__(slip=0.0)
+        self.canvas = np.zeros(2)
+
+    def look(self):
+        self.canvas[:] = self.position, self.fuel
+        return self.canvas
+
+
+class Diptych(Canvas):
+    """Shows it as a part of others."""
+
+    def __init__(self):
+        super().__init__()
+        alone = self.observation_space
+        self.observation_space = spaces.Dict({"a": alone, "b": spaces.Tuple([alone])})
+
+    def look(self):
+        canvas = super().look()
+        return {"a": canvas, "b": (canvas,)}
+
+
+@pytest.mark.parametrize("make", [Canvas, Diptych])
+def test_what_a_state_showed_stays_when_the_environment_writes_into_it(make):
+    model, env = SimulatorModel(make, gamma=0.9), make()
+    root_B = torch.tensor([model.root(env, env.reset(seed=0)[0])])
+    model.outcomes(model.outcomes(root_B).child_NAK.flatten())
+    where = [model.adapter.set_state(env, model.snapshot(s).data) or env.get_state() for s in range(model.num_states)]
+    assert len(set(where)) == model.num_states > 3
+    seen = model.observations(torch.arange(model.num_states))
+    assert np.array_equal(seen, np.tile(where, (1, 1 if make is Canvas else 2)))
 
 
 def test_observe_decides_what_is_remembered():
