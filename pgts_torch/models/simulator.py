@@ -246,7 +246,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
     def is_random(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Whether chance decides what follows each (state, action). The simulator is asked; raises as `sample`."""
         asked = zip(state_N.tolist(), action_N.tolist(), strict=True)
-        return torch.tensor([self._step(*pair, _KEY_OF_CERTAINTY).random for pair in asked], device=self.device)
+        random = [self._step(*pair, _KEY_OF_CERTAINTY).random for pair in asked]
+        return torch.tensor(random, dtype=torch.bool, device=self.device)
 
     def _answer(self, steps: Sequence[_Step]) -> tuple[Tensor, Tensor, Tensor]:
         """Rewards, discounts and children."""

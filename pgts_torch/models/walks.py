@@ -42,13 +42,15 @@ class Setup:
 
 @dataclass(frozen=True)
 class Walk:
-    """A continuation: where it began, the key of its draws, what was done, what was seen and which states were met."""
+    """A continuation: where it began, the key of its draws, what was done, what was seen and which states were met; and
+    the state in which the environment truncated it, if it did."""
 
     start: Snapshot
     key: int
     actions: tuple[Any, ...]
     seen: tuple[bytes, ...]
     states: tuple[bytes, ...]
+    cut: Snapshot | None
 
 
 def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
@@ -71,14 +73,16 @@ def walk_on(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
     """What these actions give from here on, up to an end."""
     start = setup.adapter.get_state(env)
     setup.adapter.seed(env, key)
-    seen, states = [], []
+    seen, states, cut = [], [], None
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
+        state = setup.adapter.get_state(env)
         seen.append(bits((observation, float(reward), bool(terminated), bool(truncated))))
-        states.append(setup.adapter.get_state(env).key)
+        states.append(state.key)
         if terminated or truncated:
+            cut = None if terminated else state
             break
-    return Walk(start, key, actions, tuple(seen), tuple(states))
+    return Walk(start, key, actions, tuple(seen), tuple(states), cut)
 
 
 def again(setup: Setup, env: Any, walk: Walk) -> Walk:
