@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward, TimeLimit
 
 from pgts_torch.agent.optimisers import check_count
 from pgts_torch.errors import PgtsError, failure
@@ -105,6 +105,13 @@ def registered_limit(env: EnvSource | VectorEnv, copies: VectorEnv) -> int | Non
         limits = [w._max_episode_steps for w in wrappers_of(copies.envs[0]) if isinstance(w, TimeLimit)]
         limit = min(limits, default=None)
     return limit if limit is not None and limit > 0 else None
+
+
+def normalizing_wrapper(env: VectorEnv) -> str:
+    """The name of a wrapper that normalises by running statistics of its own; empty where there is none."""
+    around = wrappers_of(env.envs[0]) if isinstance(env, SyncVectorEnv) else []
+    kinds = NormalizeObservation, NormalizeReward
+    return next((type(wrapper).__name__ for wrapper in around if isinstance(wrapper, kinds)), "")
 
 
 def divided_actions(env: VectorEnv) -> np.ndarray:

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import iterate
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from pgts_torch.agent.copies import check_vector_env, env_name, make_vector_env
+from pgts_torch.agent.copies import check_vector_env, env_name, make_vector_env, normalizing_wrapper
 from pgts_torch.agent.observations import Observations, states_of
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import Model
@@ -361,6 +361,11 @@ def make_world(
             _check_single(action_repeat, "in a table")
             return TabularWorld(copies, truth, device=device)
     if plain:
+        if name := normalizing_wrapper(copies):
+            raise PgtsError(
+                f"{env_name(copies)} is wrapped in {name}, whose running statistics no evaluation shares and no file "
+                "keeps: leave it out, and set normalize of the network or normalize_returns of the critic"
+            )
         _check_single(action_repeat, "without a model")
         return PlainWorld(copies, gamma=discount, observation_key=observation_key, device=device)
     if not isinstance(copies, SyncVectorEnv):

@@ -394,6 +394,13 @@ def test_a_model_is_refused_where_a_wrapper_repeats_actions_at_random():
         make_world("CartPole-v1", **KEYWORDS, wrappers=[sticky])
 
 
+@pytest.mark.parametrize("wrapper", [gymnasium.wrappers.NormalizeObservation, gymnasium.wrappers.NormalizeReward])
+def test_statistics_that_no_evaluation_would_share_are_refused(wrapper):
+    mistake = f"CartPole-v1 is wrapped in {wrapper.__name__}, whose running statistics no evaluation shares"
+    with pytest.raises(PgtsError, match=mistake):
+        make_world("CartPole-v1", **KEYWORDS | {"plain": True}, wrappers=[wrapper])
+
+
 def test_images_of_a_minigrid_are_learned_from_with_a_lookahead():
     pytest.importorskip("minigrid")
     model = PGTS(
