@@ -121,9 +121,15 @@ def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
     A run that was cut off goes on from its last checkpoint.
 
     Raises:
+        PgtsError: what a configuration describes cannot be built; nothing was started.
         Stopped: a signal came; see `train_all`.
     """
-    failures = train_all({run.name: run.arguments for run in runs if _summary(run) is None}, jobs=jobs)
+    from pgts_torch.experiment.run import build  # torch waits until the arguments have proved themselves
+
+    waiting = [run for run in runs if _summary(run) is None]
+    for config in {run.depth: run.config for run in waiting}.values():
+        build(config)
+    failures = train_all({run.name: run.arguments for run in waiting}, jobs=jobs)
     finished = [run for run in runs if _summary(run) is not None]
     answer = Sweep(tuple(_rows(finished)), _score_is(finished), failures, str(out))
     out.mkdir(parents=True, exist_ok=True)
