@@ -52,7 +52,10 @@ class Observations:
         """The same, of the part that is meant."""
         if isinstance(self.space, spaces.Discrete):
             return states_of(part, int(self.space.n)).to(self.device)
-        array = np.asarray(part)
+        try:
+            array = np.asarray(part)
+        except ValueError as error:
+            raise PgtsError(f"an observation is {part!r}; its space is {self.space}") from error
         if array.shape[max(0, array.ndim - len(self.space.shape)) :] != self.space.shape:
             raise PgtsError(f"an observation has shape {array.shape}; its space is {self.space}")
         if array.dtype.kind == "f" and not np.isfinite(array).all():

@@ -234,6 +234,7 @@ def test_observations_that_the_environment_cannot_make_are_refused(kind):
         wrong = [
             (np.full((2, *shape), np.nan, np.float32), "an observation is not finite"),
             (np.zeros((2, *shape, 5), np.float32), "an observation has shape"),
+            ((np.zeros(shape, np.float32), {}), "an observation is .array"),  # all that reset gives
         ]
     for observation, message in wrong:
         given = {"map": observation} if "parts" in kind else observation
