@@ -34,6 +34,7 @@ NUM_ENVS, HIDDEN, RATE, GAMMA, LAMBDA = 8, (64, 64), 3e-4, 0.99, 0.95
 EPOCHS, MINIBATCH, CLIP = 10, 64, 0.5
 WHOLE, WARM_STEPS = 500, 1_000
 DEPTHS = (0, 1, 2, 3, 4, 8)
+TABLE_DEPTHS = (0, 1, 2, 4, 8, 16, 64)
 ITERATIONS = 4
 MOST_SECONDS = 10.0
 STILL = "1e-9"
@@ -166,9 +167,9 @@ SIMULATED: dict[str, Callable[..., gymnasium.Env]] = {
 }
 
 PROBLEMS: dict[str, tuple[str, list[str], tuple[int, ...]]] = {
-    "Grid, table": ("grid", [], DEPTHS),
-    "FrozenLake8x8, table": ("frozen_lake_8x8", [], DEPTHS),
-    "Taxi, table": ("taxi", [], DEPTHS),
+    "Grid, table": ("grid", [], TABLE_DEPTHS),
+    "FrozenLake8x8, table": ("frozen_lake_8x8", [], TABLE_DEPTHS),
+    "Taxi, table": ("taxi", [], TABLE_DEPTHS),
     "CartPole, dynamics": ("cartpole", [], DEPTHS),
     "CartPole, simulator": ("cartpole", ["--env.id", "SimulatedCartPole-v0"], DEPTHS),
     "Acrobot, dynamics": ("acrobot", SHORT, DEPTHS[:-1]),
