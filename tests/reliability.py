@@ -42,7 +42,7 @@ FAULTS: dict[str, dict[str, str]] = {
         "missing extra": "the `pip install` that brings it, exit code 2",
         "no time limit and no horizon": "the guard of the geometric horizon, or of evaluations, ends it",
         "autoreset in the next step": "refused with the mode that works",
-        "environment raises an error": "environment, step and seed are named, exit code 2",
+        "environment raises an error": "environment, step and seed are named, `failure.json`, exit code 2",
         "environment without a model": "the two methods that it lacks are named, exit code 2",
     },
     "MDP files": {

@@ -1,4 +1,4 @@
-"""A run that meets a number that is not finite: it says which, keeps what was good, and exits with 1."""
+"""A run that meets a number that is not finite, or an environment that fails: it says where and keeps what was good."""
 
 import json
 from pathlib import Path
@@ -48,6 +48,23 @@ def test_a_run_that_meets_what_is_not_finite_keeps_its_checkpoints_writes_what_i
     assert complaint == f"error: iteration 2 of {folder} stopped: {message}"
     assert PGTS.load(last_checkpoint(folder)).num_env_steps == 120
     assert not (folder / "summary.json").exists()
+
+
+@pytest.mark.fault("environment raises an error")
+def test_a_run_whose_environment_raises_writes_down_where_and_what(tmp_path, monkeypatch, capsys):
+    step, calls = TabularVectorEnv.step, iter(range(10**6))
+    monkeypatch.setattr(
+        TabularVectorEnv, "step", lambda self, actions: step(self, actions) if next(calls) < 30 else 1 / 0
+    )
+    folder = tmp_path / "run"
+    assert train(folder, "--log.checkpoint_every=1") == 2
+    record = json.loads((folder / "failure.json").read_text())
+    assert (record["iteration"], record["env_step"], record["tensor"]) == (2, 120, None)
+    assert record["message"].endswith("ZeroDivisionError: division by zero")
+    complaint = capsys.readouterr().err.splitlines()[-1]
+    assert complaint == f"error: iteration 2 of {folder} stopped: {record['message']}"
+    assert main(["report", str(folder)]) == 0
+    assert "Training stopped in iteration 2, at step 120: pgts/Ladder-v0 failed" in (folder / "report.html").read_text()
 
 
 def test_what_is_not_finite_in_the_last_evaluation_is_written_down_too(tmp_path, monkeypatch):

@@ -77,8 +77,10 @@ def _state(facts: Facts) -> Iterator[Html]:
     """Why a run has not come to its end."""
     failure = facts.failure
     if failure is not None:
-        where = f"Training stopped in iteration {failure.get('iteration')}, at step {failure.get('env_step')}, by a "
-        yield element("p", f"{where}{failure.get('tensor')} that is not finite: {failure.get('message')}", class_="box")
+        tensor = failure.get("tensor")
+        what = "" if tensor is None else f", by a {tensor} that is not finite"
+        where = f"Training stopped in iteration {failure.get('iteration')}, at step {failure.get('env_step')}{what}"
+        yield element("p", f"{where}: {failure.get('message')}", class_="box")
     elif facts.state == "unfinished":
         yield element(
             "p",
