@@ -2,8 +2,9 @@
 
 import functools
 import itertools
-from collections.abc import Callable
-from typing import Any
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, final
 
 import gymnasium
 import numpy as np
@@ -15,19 +16,28 @@ from gymnasium.wrappers import NormalizeObservation, NormalizeReward, TimeLimit
 from pgts_torch.agent.optimisers import check_count
 from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models import snapshots
-from pgts_torch.models.environments import EnvSource, all_actions, make_env, spec_of, with_torques, wrappers_of
+from pgts_torch.models.environments import (
+    MOST_ACTIONS,
+    EnvSource,
+    all_actions,
+    grid_actions,
+    make_env,
+    spec_of,
+    wrappers_of,
+)
 
 
 def make_vector_env(
     env: EnvSource, num_envs: int, *, gamma: float | None, actions_per_dimension: int | None = None, **kwargs: Any
 ) -> VectorEnv:
-    """Copies of an environment that reset by mask, without its registered time limit: the horizon is ours.
+    """Copies of an environment that reset by mask, without its registered time limit: the horizon is ours. Actions
+    that are not numbers from 0 on, of Discrete(n, start) and MultiDiscrete, are numbered.
 
     Args:
         env: an id; or an instance or a spec, of which others are made; or a function that makes one.
         gamma: handed to environments that carry a discount of their own (pgts/*), if given.
         actions_per_dimension: into how many values each dimension of continuous actions is divided
-            (`models.with_torques`); None: actions are discrete.
+            (`models.environments.grid_actions`); None: actions are discrete.
         kwargs: for gymnasium.make_vec, of an id.
 
     Raises:
@@ -38,9 +48,6 @@ def make_vector_env(
     if not isinstance(env, str):
         return SyncVectorEnv([_maker(env, actions_per_dimension)] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
     options: dict[str, Any] = {"max_episode_steps": -1, **kwargs}
-    if actions_per_dimension is not None:
-        divide = functools.partial(_divided, count=actions_per_dimension)
-        options["wrappers"] = [*options.get("wrappers", ()), divide]
     try:
         if spec_of(env).namespace == "pgts":
             if actions_per_dimension is not None:
@@ -49,6 +56,8 @@ def make_vector_env(
             options |= {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.DISABLED}
         else:
             options |= {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode.DISABLED}}
+            numbered = functools.partial(_numbered, per_dimension=actions_per_dimension)
+            options["wrappers"] = [*options.get("wrappers", ()), numbered]
         return gymnasium.make_vec(env, num_envs=num_envs, **options)
     except PgtsError:
         raise
@@ -76,7 +85,7 @@ def check_vector_env(env: VectorEnv) -> None:
             f"the actions of {env_name(env)} are continuous, {space}: set actions_per_dimension, into how many values "
             "each dimension of them is divided"
         )
-    if not isinstance(space, spaces.Discrete) or space.start != 0:
+    if not _is_numbered(space):
         raise PgtsError(f"the actions of {env_name(env)} are {space}; they must be Discrete(n) counted from 0")
     mode = env.metadata.get("autoreset_mode")
     if mode != AutoresetMode.DISABLED:
@@ -114,14 +123,6 @@ def normalizing_wrapper(env: VectorEnv) -> str:
     return next((type(wrapper).__name__ for wrapper in around if isinstance(wrapper, kinds)), "")
 
 
-def divided_actions(env: VectorEnv) -> np.ndarray:
-    """What each action of `actions_per_dimension` is to the environment itself, a row each."""
-    assert isinstance(env, SyncVectorEnv)
-    outermost = env.envs[0]
-    assert isinstance(outermost, gymnasium.ActionWrapper)
-    return np.stack([outermost.action(action) for action in all_actions(outermost.action_space)])
-
-
 def _maker(env: Any, actions_per_dimension: int | None) -> Callable[[], gymnasium.Env]:
     """A function that makes another instance of an environment."""
     if not isinstance(env, gymnasium.Env | EnvSpec) and not callable(env):
@@ -132,18 +133,46 @@ def _maker(env: Any, actions_per_dimension: int | None) -> Callable[[], gymnasiu
     source = env.spec or env if isinstance(env, gymnasium.Env) else env
     limit = {"max_episode_steps": -1} if isinstance(source, EnvSpec) else {}
     make = functools.partial(make_env, source, **limit)
-    return make if actions_per_dimension is None else lambda: _divided(make(), count=actions_per_dimension)
+    return lambda: _numbered(make(), per_dimension=actions_per_dimension)
 
 
-def _divided(env: gymnasium.Env, *, count: int) -> gymnasium.Env:
-    if not isinstance(env.action_space, spaces.Box):
-        raise PgtsError(
-            f"actions_per_dimension is {count}; {snapshots.env_name(env)} has discrete actions, {env.action_space}"
-        )
-    check_count("actions_per_dimension", count)
+@final
+class _Numbered(gymnasium.ActionWrapper):
+    """An environment of which some actions are numbered from 0 on."""
+
+    def __init__(self, env: gymnasium.Env, actions: Sequence[Any]) -> None:
+        super().__init__(env)
+        self.actions = actions
+        self.action_space = spaces.Discrete(len(actions))
+
+    def action(self, action: Any) -> Any:
+        return self.actions[action]
+
+
+def _numbered(env: gymnasium.Env, *, per_dimension: int | None) -> gymnasium.Env:
+    """With actions that are numbers from 0 on, where that can be."""
+    space, name = env.action_space, snapshots.env_name(env)
+    if per_dimension is None:
+        if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete) or _is_numbered(space):
+            return env
+        if isinstance(space, spaces.MultiDiscrete) and math.prod(space.nvec.reshape(-1).tolist()) > MOST_ACTIONS:
+            raise PgtsError(f"the actions of {name} are {space}: more than {MOST_ACTIONS:,} combinations")
+        return _Numbered(env, list(all_actions(space)))
+    if not isinstance(space, spaces.Box):
+        raise PgtsError(f"actions_per_dimension is {per_dimension}; {name} has discrete actions, {space}")
+    check_count("actions_per_dimension", per_dimension)
     try:
-        return with_torques(env, count)
+        return _Numbered(env, grid_actions(space, per_dimension))
     except PgtsError as error:
-        raise PgtsError(
-            f"actions_per_dimension is {count}, but {snapshots.env_name(env)} cannot have it: {error}"
-        ) from error
+        raise PgtsError(f"actions_per_dimension is {per_dimension}, but {name} cannot have it: {error}") from error
+
+
+def own_actions(env: VectorEnv) -> np.ndarray | None:
+    """What the numbers of the actions stand for in copies that `make_vector_env` made, a row each; None: the numbers
+    themselves."""
+    outermost = env.envs[0] if isinstance(env, SyncVectorEnv) else None
+    return np.stack(outermost.actions) if isinstance(outermost, _Numbered) else None
+
+
+def _is_numbered(space: spaces.Space) -> bool:
+    return isinstance(space, spaces.Discrete) and space.start == 0

@@ -30,7 +30,7 @@ from pgts_torch.agent.build import (
     make_update,
 )
 from pgts_torch.agent.certificate import certificate
-from pgts_torch.agent.copies import divided_actions, make_vector_env, more_copies, registered_limit
+from pgts_torch.agent.copies import make_vector_env, more_copies, own_actions, registered_limit
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.iteration import Iteration, Seen
 from pgts_torch.agent.policies import Policy, listed
@@ -88,7 +88,7 @@ class PGTS:
             {"type": "tabular", "target": "q"}, ... Default: tables where the environment is tabular, else networks.
         num_envs: episodes in each iteration, of all processes together; copies that are given belong to this one alone.
         actions_per_dimension: into how many evenly spaced values, from the lowest to the highest, each dimension of
-            continuous actions is divided; None: actions are discrete.
+            continuous actions is divided; None: actions are discrete, of MultiDiscrete each combination of them.
         action_repeat: how often the lookahead takes an action before it takes the next, so that it sees as many times
             further at the same depth (`TensorModel` says what T^m Q is then); not in tables. Experience, and the
             policy, take single actions.
@@ -165,7 +165,7 @@ class PGTS:
         if isinstance(self.estimator, LookaheadAdvantages):
             self.search = make_search(search, self.world)
         check_parts(self._arguments, self.world, self.policy, self.critic, self.update, self.estimator)
-        self._values_of_actions = None if actions_per_dimension is None else divided_actions(self.world.env)
+        self._own_actions = None if isinstance(env, VectorEnv) else own_actions(self.world.env)
         self._predicting = stream(seed, "predict", device=self.device)
         self.num_iterations = 0
         self.num_env_steps = 0
@@ -373,7 +373,7 @@ class PGTS:
         else:
             action_N = self.policy.sample(observation_N, generator=generator or self._predicting)
         action = action_N.cpu().numpy().reshape(shape)
-        return action[()] if self._values_of_actions is None else self._values_of_actions[action]
+        return action[()] if self._own_actions is None else self._own_actions[action]
 
     def save(self, path: str | Path) -> None:
         """Write everything that training or acting goes on from into one file with a checksum.

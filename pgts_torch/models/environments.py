@@ -18,6 +18,9 @@ from pgts_torch.seeding import numpy_stream
 EnvSource = str | EnvSpec | gymnasium.Env | Callable[[], gymnasium.Env]
 """What an environment can be made from: an id, a spec, another instance (by its spec) or a function."""
 
+MOST_ACTIONS = 10_000
+"""That are made of those of several dimensions."""
+
 _HARMLESS = (
     wrappers.TimeLimit,
     wrappers.OrderEnforcing,
@@ -116,7 +119,7 @@ def grid_actions(space: spaces.Space, per_dimension: int) -> list[np.ndarray]:
         PgtsError: the space is no bounded Box, there are fewer than 2 values, or more than 10,000 actions.
     """
     low, high = _bounds(space)
-    if per_dimension < 2 or per_dimension**low.size > 10_000:
+    if per_dimension < 2 or per_dimension**low.size > MOST_ACTIONS:
         raise PgtsError(
             f"per_dimension is {per_dimension}; it must be at least 2 and give at most 10,000 actions in "
             f"{low.size} dimensions: see sampled_actions"

@@ -16,6 +16,7 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.models import check_model
 from pgts_torch.models.environments import make_env
 from tests.agent.helpers import same_bits
+from tests.models.corridors import Corridor
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -147,6 +148,38 @@ def test_continuous_actions_need_no_model_where_advantages_are_sampled():
 def test_what_cannot_be_acted_in_is_refused_by_name(env, options, message):
     with pytest.raises(PgtsError, match=message):
         PGTS(env, **SHORT, **options)
+
+
+class Switches(Field):
+    """Two switches, of two and of three positions, counted from 0 and from 5."""
+
+    action_space = spaces.MultiDiscrete([2, 3], start=[0, 5])
+
+
+@pytest.mark.parametrize("options", [{}, {"depth": 0, "estimator": "sampled"}])
+def test_combinations_of_actions_are_numbered(options):
+    model = PGTS(Switches, **SHORT | options)
+    model.iterate()
+    assert model.policy.num_actions == 6
+    seen = {tuple(action.tolist()) for action in model.predict(np.zeros((200, 2)), deterministic=False)}
+    assert seen == {(x, y) for x in (0, 1) for y in (5, 6, 7)}
+    assert evaluate(model, episodes=2).episodic_return.mean < 0
+
+
+def test_actions_that_are_counted_from_elsewhere_are_numbered(tmp_path):
+    model = PGTS(Corridor, **SHORT)
+    model.iterate()
+    model.save(tmp_path / "m.pt")
+    loaded = PGTS.load(tmp_path / "m.pt", env=Corridor)
+    assert set(loaded.predict(np.zeros((50, 2)), deterministic=False).tolist()) == {5, 6}
+
+
+def test_more_combinations_than_a_policy_can_list_are_refused():
+    class Panel(Field):
+        action_space = spaces.MultiDiscrete([10] * 5)
+
+    with pytest.raises(PgtsError, match=r"the actions of Panel are MultiDiscrete.*: more than 10,000 combinations"):
+        PGTS(Panel, **SHORT)
 
 
 def test_copies_that_were_made_take_their_own_actions():
