@@ -38,12 +38,16 @@ class NotFinite(PgtsError):
         self.what = what
 
 
-def failure(where: str, error: Exception) -> PgtsError:
+class Failed(PgtsError):
+    """Something of the caller's, as an environment, raised an error or answered wrongly."""
+
+
+def failure(where: str, error: Exception) -> NotFinite | Failed:
     """The error that says where another one happened; NotFinite stays NotFinite."""
     if not isinstance(error, PgtsError):
-        return PgtsError(f"{where}: {type(error).__name__}: {error}")
+        return Failed(f"{where}: {type(error).__name__}: {error}")
     story = f"{where}: {error}"
-    told = NotFinite(story, what=error.what) if isinstance(error, NotFinite) else PgtsError(story)
+    told = NotFinite(story, what=error.what) if isinstance(error, NotFinite) else Failed(story)
     told.rank = error.rank
     return told
 

@@ -20,7 +20,7 @@ from pgts_torch.agent.evaluate import Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.ranks import joined_ranks
-from pgts_torch.errors import NotFinite, PgtsError, RankLost, Stopped, failure
+from pgts_torch.errors import Failed, NotFinite, PgtsError, Stopped, failure
 from pgts_torch.experiment import checkpoint, diagnostics
 from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.config import Config, dump
@@ -95,9 +95,9 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
         any_world_size: go on with another number of processes than before.
 
     Raises:
-        PgtsError: something in the configuration cannot be built, or the folder is taken; nothing was written. Or the
-            training failed, as where the environment did; where stands in failure.json.
-        NotFinite: it met a number that is not finite; which and where stands in failure.json, too.
+        PgtsError: something in the configuration cannot be built, or the folder is taken; nothing was written.
+        Failed: the environment failed in training; where stands in failure.json.
+        NotFinite: training met a number that is not finite; which and where stands in failure.json, too.
         Stopped: SIGTERM or SIGINT came; the iteration was finished and saved.
         RankLost: another process is gone; the last checkpoint is what remains.
     """
@@ -176,9 +176,7 @@ def _loop(config: Config, algorithm: PGTS, folder: Folder, start: Start | None, 
                 next(each for each in signals if each is not None),
             )
         return algorithm.ranks.first("a summary", recorder.finish)
-    except RankLost:
-        raise
-    except PgtsError as error:
+    except (NotFinite, Failed) as error:
         where = {"iteration": algorithm.num_iterations, "env_step": algorithm.num_env_steps, "seed": config.seed}
         tensor = error.what if isinstance(error, NotFinite) else None
         record = where | {"tensor": tensor, "message": str(error)}

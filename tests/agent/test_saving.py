@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import pickle
+from fractions import Fraction
 
 import gymnasium
 import numpy as np
@@ -227,6 +228,6 @@ def test_what_could_not_be_read_again_does_not_replace_what_can(tmp_path):
     make().save(path)
     whole = path.read_bytes()
     with pytest.raises(PgtsError, match="something other than tensors and plain values"):
-        make(gamma=np.float64(0.9)).save(path)
+        make(stop_at=Fraction(1, 2)).save(path)
     assert path.read_bytes() == whole
     assert len(list(tmp_path.iterdir())) == 1
