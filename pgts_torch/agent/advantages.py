@@ -31,7 +31,7 @@ class SampledAdvantages:
 
     def __call__(self, rollout: Rollout, critic: Critic) -> Float[Tensor, "T B"]:
         """The advantages; where an episode is over, they mean nothing."""
-        v_TB, next_v_TB = rollout.values(critic.v)
+        v_TB, next_v_TB = critic.values(rollout)
         return gae(rollout, v_TB, next_v_TB, self.lambda_)
 
 

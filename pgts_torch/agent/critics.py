@@ -42,6 +42,10 @@ class Critic(ABC):
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
         """Estimates of Q^pi(s, .). Only where target is "q" does a lookahead ask for them."""
 
+    def values(self, rollout: Rollout) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
+        """v(s_t) and v(s_{t+1}), as `Rollout.values`."""
+        return rollout.values(self.v)
+
     @property
     def model_calls(self) -> int:
         """How many (state, action) this critic has asked of a model so far."""

@@ -65,7 +65,7 @@ class Episodes:
         reward_B, discount_B = np.zeros((2, len(copies)))
         self._reward_B = reward_B
         truncated_B = np.zeros(len(copies), dtype=bool)
-        for b in np.flatnonzero(alive_B):
+        for b in alive_B.nonzero()[0]:
             self._stepping = int(b)
             self._each[b], reward_B[b], terminated, truncated_B[b], info = copies[b].step(action_B[b])
             discount_B[b] = 0.0 if terminated else info.get("discount", self._gamma)

@@ -99,9 +99,9 @@ class _Watched(World):
         """As in the world."""
         return self._world.encode(observation)
 
-    def read(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
-        """0 for all."""
-        return torch.zeros(env.num_envs, dtype=torch.int64, device=self.device)
+    def see(self, env: VectorEnv, observation: Any) -> tuple[Tensor, Int[Tensor, "B"]]:
+        """The observation, and 0 for all."""
+        return self.encode(observation), torch.zeros(env.num_envs, dtype=torch.int64, device=self.device)
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
         """0 for all."""

@@ -128,6 +128,7 @@ class NetworkCritic(Critic):
         self._target_network = copy.deepcopy(self.network) if self._lags else self.network
         self._optimiser = Optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
         self._policy: Policy | None = None
+        self._asked: tuple[Rollout, tuple[Tensor, Tensor]] | None = None
         self._mean, self._scale, self._num_fits = 0.0, 1.0, 0
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
@@ -140,6 +141,8 @@ class NetworkCritic(Critic):
         Raises:
             PgtsError: a target, a loss or a gradient is not finite.
         """
+        if self.target == "q" and policy is not self._policy:
+            self._asked = None  # they were sums over the actions of another policy
         self._policy = policy
         alive_TB = rollout.alive_TB
         observation_V, action_V = rollout.observe(rollout.state_TB[alive_TB]), rollout.action_TB[alive_TB]
@@ -175,6 +178,11 @@ class NetworkCritic(Critic):
         """The network's value, or sum_a pi(a|o) Q(o, a) of it."""
         return self._v(self.network, observation_N)
 
+    def values(self, rollout: Rollout) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
+        """v(s_t) and v(s_{t+1}). If a fit to the same rollout comes next, it takes them as they are."""
+        self._asked = rollout, rollout.values(self.v)
+        return self._asked[1]
+
     def q(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         if self.target != "q":
             raise PgtsError("this critic learns v; it has no Q. Make it with target='q', or search with v_leaf")
@@ -198,6 +206,7 @@ class NetworkCritic(Critic):
         if self._lags:
             self._target_network.take_over(state["target_network"])
         self._optimiser.load_state_dict(state["optimiser"])
+        self._asked = None
         self._mean, self._scale, self._num_fits = state["mean"], state["scale"], state["num_fits"]
 
     def _values(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N D"]:
@@ -217,7 +226,11 @@ class NetworkCritic(Critic):
 
     def _targets(self, rollout: Rollout) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
         """v of the target network at the visits, and the targets, which stand on it."""
-        v_TB, next_v_TB = rollout.values(lambda observation_N: self._v(self._target_network, observation_N))
+        asked, self._asked = self._asked, None
+        if asked is not None and asked[0] is rollout and not self._lags:
+            v_TB, next_v_TB = asked[1]
+        else:
+            v_TB, next_v_TB = rollout.values(lambda observation_N: self._v(self._target_network, observation_N))
         if isinstance(self.method, MonteCarlo):
             return v_TB, lambda_returns(rollout, next_v_TB, rollout.survival_TB, 1.0)
         return v_TB, lambda_returns(rollout, next_v_TB, rollout.discount_TB, self.method.lambda_)

@@ -123,7 +123,10 @@ def _check_finite(what: str, name: str, value: float) -> None:
 
 
 def minibatches(columns: Sequence[Tensor], size: int, *, generator: torch.Generator) -> Iterator[tuple[Tensor, ...]]:
-    """Rows of all columns in one common random order, `size` at a time, the last ones fewer; each row once."""
+    """Rows of all columns in one common random order, `size` at a time, the last ones fewer; each row once. Not more
+    than `size` rows stay as they are."""
+    if len(columns[0]) <= size:
+        return iter([tuple(columns)])
     order_N = torch.randperm(len(columns[0]), generator=generator, device=generator.device)
     return zip(*(column[order_N.to(column.device)].split(size) for column in columns), strict=True)
 

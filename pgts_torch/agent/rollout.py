@@ -185,17 +185,18 @@ def rollout(
     except Exception as error:
         raise _failure(env, "at the start", words.tolist(), error) from error
     try:
-        observation_B, reads = world.encode(episodes.observation), [world.read(env, episodes.observation)]
+        observation_B, read_B = world.see(env, episodes.observation)
     except Exception as error:
         raise _failure(env, "at the start", *episodes.blame(error)) from error
     # What is small stays in numpy until the end: on tensors of a few numbers, each operation costs several times more.
     alive_B, weight_B = np.ones(env.num_envs, dtype=bool), np.ones(env.num_envs)
+    reads = [read_B]
     rows: list[tuple[np.ndarray, ...]] = []
     while len(rows) < horizon.limit and alive_B.any():
         action_B = policy.sample(observation_B, generator=generator).cpu().numpy()
         try:
             reward_B, discount_B, truncated_B = episodes.step(action_B, alive_B)
-            observation_B, read_B = world.encode(episodes.observation), world.read(env, episodes.observation)
+            observation_B, read_B = world.see(env, episodes.observation)
         except Exception as error:
             raise _failure(env, f"in step {len(rows)}", *episodes.blame(error)) from error
         survival_B = horizon.survival(torch.from_numpy(discount_B), generator).numpy()
@@ -206,7 +207,7 @@ def rollout(
     horizon.check_end(int(alive_B.sum()))
     number_TB = world.numbers(torch.cat(reads)).view(len(reads), -1)
     action_TB, reward_TB, discount_TB, alive_TB, weight_TB, survival_TB = (
-        torch.from_numpy(np.stack(column)).to(world.device) for column in zip(*rows, strict=True)
+        torch.from_numpy(np.array(column)).to(world.device) for column in zip(*rows, strict=True)
     )
     return Rollout(
         number_TB[:-1],

@@ -59,8 +59,12 @@ class World(ABC):
         """
 
     @abstractmethod
-    def read(self, env: VectorEnv, observation: Any) -> Shaped[Tensor, "B ..."]:
-        """What the states that the copies are in now are told apart by; `observation` is what they have just said."""
+    def see(self, env: VectorEnv, observation: Any) -> tuple[Tensor, Shaped[Tensor, "B ..."]]:
+        """What a policy sees of copies, encoded, and what the states that they are in now are told apart by.
+
+        Args:
+            observation: what the copies have just said.
+        """
 
     @abstractmethod
     def numbers(self, read_N: Shaped[Tensor, "N ..."]) -> Int[Tensor, "N"]:
@@ -69,7 +73,7 @@ class World(ABC):
     @final
     def number(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
         """The numbers of the states that the copies are in now."""
-        return self.numbers(self.read(env, observation))
+        return self.numbers(self.see(env, observation)[1])
 
     @abstractmethod
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
@@ -115,9 +119,10 @@ class TabularWorld(World):
         """The states, int64."""
         return states_of(observation, self.model.num_states).to(self.device)
 
-    def read(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
-        """The observation."""
-        return self.encode(observation)
+    def see(self, env: VectorEnv, observation: Any) -> tuple[Tensor, Int[Tensor, "B"]]:
+        """The states, twice."""
+        state_B = self.encode(observation)
+        return state_B, state_B
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
         """The observations."""
@@ -169,11 +174,11 @@ class SimulatedWorld(World):
         """Numbers, vectors or images."""
         return self._seen.encode(observation)
 
-    def read(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
-        """The number of a snapshot of each copy."""
+    def see(self, env: VectorEnv, observation: Any) -> tuple[Tensor, Int[Tensor, "B"]]:
+        """The observation, and the number of a snapshot of each copy."""
         assert isinstance(env, SyncVectorEnv)
         each = list(iterate(env.observation_space, observation))
-        return self._model.roots(env.envs, each).to(self.device)
+        return self.encode(observation), self._model.roots(env.envs, each).to(self.device)
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
         """These."""
@@ -220,10 +225,10 @@ class DynamicsWorld(World):
         """Vectors, float32."""
         return self._seen.encode(observation)
 
-    def read(self, env: VectorEnv, observation: Any) -> Float[Tensor, "B D"]:
-        """The vector of each copy."""
+    def see(self, env: VectorEnv, observation: Any) -> tuple[Tensor, Float[Tensor, "B D"]]:
+        """The observation, and the vector of each copy."""
         assert isinstance(env, SyncVectorEnv)
-        return self._model.vectors(env.envs)
+        return self.encode(observation), self._model.vectors(env.envs)
 
     def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
         """Equal vectors have one number."""
@@ -278,9 +283,10 @@ class PlainWorld(World):
         """Numbers, vectors or images."""
         return self._seen.encode(observation)
 
-    def read(self, env: VectorEnv, observation: Any) -> Tensor:
-        """The observation."""
-        return self.encode(observation)
+    def see(self, env: VectorEnv, observation: Any) -> tuple[Tensor, Tensor]:
+        """The observation, twice."""
+        observation_B = self.encode(observation)
+        return observation_B, observation_B
 
     def numbers(self, read_N: Tensor) -> Int[Tensor, "N"]:
         """The next numbers."""
@@ -351,15 +357,9 @@ def make_world(
             "the environment inside: leave it out, or make it part of an environment with get_state and set_state"
             + _NO_MODEL_NEEDED
         )
-    if observation_key is None and not wrapper and isinstance(copies.single_observation_space, spaces.Discrete):
-        try:
-            truth = tabular_truth(copies, gamma=discount)
-        except MissingModel:
-            if not isinstance(copies, SyncVectorEnv):
-                raise
-        else:
-            _check_single(action_repeat, "in a table")
-            return TabularWorld(copies, truth, device=device)
+    if observation_key is None and not wrapper and (truth := _truth(copies, discount)) is not None:
+        _check_single(action_repeat, "in a table")
+        return TabularWorld(copies, truth, device=device)
     if plain:
         if name := normalizing_wrapper(copies):
             raise PgtsError(
@@ -376,20 +376,39 @@ def make_world(
     if (dynamics := dynamics_of(copies.envs[0])) is not None:
         vectors = dynamics(copies.envs[0], gamma=discount, action_repeat=action_repeat, device=device)
         return DynamicsWorld(copies, vectors, observation_key=observation_key)
+    model = _simulator(copies, observation_key, gamma=discount, action_repeat=action_repeat, device=device)
+    return SimulatedWorld(copies, model, observation_key=observation_key, device=device)
+
+
+def _truth(copies: VectorEnv, gamma: float) -> TabularMDP | None:
+    """The table of copies that show their states; None if there is none, and they may have another model."""
+    if not isinstance(copies.single_observation_space, spaces.Discrete):
+        return None
+    try:
+        return tabular_truth(copies, gamma=gamma)
+    except MissingModel:
+        if isinstance(copies, SyncVectorEnv):
+            return None
+        raise
+
+
+def _simulator(
+    copies: SyncVectorEnv, observation_key: str | None, *, gamma: float, action_repeat: int, device: torch.device | str
+) -> SimulatorModel:
+    """A simulator of the environment that these are copies of; MissingModel without an adapter."""
     try:
         adapter = adapter_for(copies.envs[0])
     except MissingModel as missing:
         raise MissingModel(f"{missing}{_NO_MODEL_NEEDED}") from None
-    model = SimulatorModel(
+    return SimulatorModel(
         copies.env_fns[0],
-        gamma=discount,
+        gamma=gamma,
         actions=base_actions(copies.envs[0]),
         action_repeat=action_repeat,
         adapter=adapter,
         observe=None if observation_key is None else lambda observation: observation[observation_key],
         device=device,
     )
-    return SimulatedWorld(copies, model, observation_key=observation_key, device=device)
 
 
 def _check_single(action_repeat: int, where: str) -> None:

@@ -1,5 +1,6 @@
 """Policies and critics of networks: what they answer, what they learn, and that they can be taken up again."""
 
+import dataclasses
 import math
 
 import pytest
@@ -199,6 +200,38 @@ def test_a_target_network_lags_behind(polyak, target_period):
             lagging_S = lagging_S + polyak * (critic.v(states) - lagging_S)
         torch.testing.assert_close(critic._v(critic._target_network, states), lagging_S)
     assert not torch.allclose(lagging_S, torch.zeros(4))
+
+
+@pytest.mark.parametrize(("polyak", "asks"), [(1.0, 1), (0.5, 2)])
+def test_values_that_were_asked_for_before_a_fit_are_not_asked_for_again(polyak, asks, monkeypatch):
+    asking, silent = (tabular_critic([0.5, -1.0, 2.0, 0.0], learning_rate=0.1, polyak=polyak) for _ in range(2))
+    counted, evaluate = [], asking.network.evaluate
+    monkeypatch.setattr(asking.network, "evaluate", lambda seen_N: counted.append(seen_N) or evaluate(seen_N))
+    made = by_hand()
+    for k in range(3):
+        counted.clear()
+        asking.values(made)
+        policy = following(torch.ones(4, 2) / 2)
+        losses = [critic.fit(policy, made, generator=stream(k, "critic")) for critic in (asking, silent)]
+        assert losses[0] == losses[1]
+        assert len(counted) == asks
+    assert torch.equal(asking.v(torch.arange(4)), silent.v(torch.arange(4)))
+
+
+@pytest.mark.parametrize("asked", ["of another rollout", "of another policy", "before a fit already"])
+def test_values_are_not_taken_for_what_they_are_not(asked):
+    asking, silent = (tabular_critic(torch.eye(4)[:, :2], target="q", learning_rate=0.1) for _ in range(2))
+    made = by_hand()
+    first, second = following(torch.tensor([[0.9, 0.1]] * 4)), following(torch.tensor([[0.1, 0.9]] * 4))
+    for critic in (asking, silent):
+        critic.fit(first, made, generator=stream(0, "critic"))
+    backward = dataclasses.replace(made, state_TB=made.next_state_TB, next_state_TB=made.state_TB)
+    asking.values(backward if asked == "of another rollout" else made)
+    policy = second if asked == "of another policy" else first
+    for k in range(3 if asked == "before a fit already" else 1):
+        losses = [critic.fit(policy, made, generator=stream(k, "critic")) for critic in (asking, silent)]
+        assert losses[0] == losses[1]
+    assert torch.equal(asking.q(torch.arange(4)), silent.q(torch.arange(4)))
 
 
 def test_a_policy_and_a_critic_can_share_a_trunk():

@@ -143,13 +143,13 @@ def test_the_states_of_a_rollout_are_numbered_at_once_as_one_after_the_other(id,
 
 def test_changed_constants_are_honoured_and_must_be_the_same_in_all_copies():
     world = world_of("CartPole-v1", sutton_barto_reward=True)
-    world.env.reset(seed=0)
-    assert float(world.model.outcomes(world.number(world.env, None)).reward_NA.max()) == 0.0
+    observation, _ = world.env.reset(seed=0)
+    assert float(world.model.outcomes(world.number(world.env, observation)).reward_NA.max()) == 0.0
     copies = world_of("CartPole-v1").env
     copies.envs[1].unwrapped.gravity = 1.6
-    copies.reset(seed=0)
+    observation, _ = copies.reset(seed=0)
     with pytest.raises(PgtsError, match=r"CartPole-v1 has gravity = 1\.6; the model's is 9\.8"):
-        world_of(copies).number(copies, None)
+        world_of(copies).number(copies, observation)
 
 
 def test_actions_are_those_of_the_copies_also_in_a_simulator():
