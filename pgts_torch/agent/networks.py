@@ -7,9 +7,9 @@ no weights, so a training loop encodes its batch once.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, final
 
 import torch
@@ -228,14 +228,22 @@ class Network(nn.Module):
         self.trunk = trunk
         head = skip_init(nn.Linear, trunk.num_features, num_outputs)
         self.head: nn.Linear = _orthogonal(head, gain, generator)
-        # Plain functions: calls of nested modules cost as much as small layers.
-        self._layers = [layer.forward for layer in (*trunk.layers, self.head)]
         self._most_rows = max(1, _MOST_INPUTS // max(trunk.encoder.num_inputs, trunk.num_features))
 
     @cached_property
     def weights(self) -> list[nn.Parameter]:
         """All parameters, the trunk's first."""
         return list(self.parameters())
+
+    @cached_property
+    def _functions(self) -> list[Callable[[Tensor], Tensor]]:
+        """The layers without their modules, whose calls and attributes cost as much as a small layer."""
+        return [
+            partial(nn.functional.linear, weight=layer.weight, bias=layer.bias)
+            if isinstance(layer, nn.Linear)
+            else layer.forward
+            for layer in (*self.trunk.layers, self.head)
+        ]
 
     @cached_property
     def _named(self) -> dict[str, Tensor]:
@@ -247,8 +255,8 @@ class Network(nn.Module):
         return self.trunk.encoder(observation_N)
 
     def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
-        for layer in self._layers:
-            input_N = layer(input_N)
+        for function in self._functions:
+            input_N = function(input_N)
         return input_N
 
     @torch.no_grad()
