@@ -233,14 +233,14 @@ def test_an_iteration_looks_once_at_depth_0_and_once_at_its_own(depth, looks, mo
     assert made == looks
 
 
-def test_with_sampled_advantages_a_critic_values_each_visit_and_each_end_twice_and_then_learns(monkeypatch):
+def test_with_sampled_advantages_a_critic_values_each_visit_and_each_end_once_and_then_learns(monkeypatch):
     estimator = {"type": "sampled", "lambda": 0.9}
     model = make("CartPole-v1", depth=0, estimator=estimator, policy="mlp", critic={"type": "network", "num_epochs": 1})
     network, rows = model.critic.network, []
     evaluate = network.evaluate
     monkeypatch.setattr(network, "evaluate", lambda seen_N: rows.append(len(seen_N)) or evaluate(seen_N))
     experience = model.iterate().experience
-    assert rows == 2 * [experience.num_steps + experience.num_episodes]
+    assert rows == [experience.num_steps + experience.num_episodes]
 
 
 def test_what_the_rollout_critic_asks_is_counted_too():
