@@ -215,7 +215,7 @@ NetworkDescription = MLP | CNN
 
 @final
 class Network(nn.Module):
-    """A trunk and a linear head.
+    """A trunk and a linear head. Not to be moved to another device once it was used.
 
     Args:
         trunk: may be another network's, too.

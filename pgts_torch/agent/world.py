@@ -70,11 +70,6 @@ class World(ABC):
     def numbers(self, read_N: Shaped[Tensor, "N ..."]) -> Int[Tensor, "N"]:
         """The numbers of states that were read. Many at once cost little more than a few."""
 
-    @final
-    def number(self, env: VectorEnv, observation: Any) -> Int[Tensor, "B"]:
-        """The numbers of the states that the copies are in now."""
-        return self.numbers(self.see(env, observation)[1])
-
     @abstractmethod
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """What a policy sees of numbered states."""

@@ -88,14 +88,19 @@ WORLDS = {
 }
 
 
+def numbered(world: World, observation: np.ndarray) -> Tensor:
+    """The numbers of the states that the copies are in now."""
+    return world.numbers(world.see(world.env, observation)[1])
+
+
 def walked(world: World, steps: int) -> tuple[list[Tensor], list[Tensor]]:
     """What the copies show, encoded, and the numbers of their states, in each step of a random walk."""
     observation, _ = world.env.reset(seed=1)
-    seen, numbers = [world.encode(observation)], [world.number(world.env, observation)]
+    seen, numbers = [world.encode(observation)], [numbered(world, observation)]
     for action_B in torch.randint(world.num_actions, (steps, 3), generator=stream(0, "walk")):
         observation, _, over, *_ = world.env.step(action_B.numpy())
         seen.append(world.encode(observation))
-        numbers.append(world.number(world.env, observation))
+        numbers.append(numbered(world, observation))
         if over.any():
             world.env.reset(options={"reset_mask": over})
     return seen, numbers
@@ -134,22 +139,22 @@ def test_the_states_of_a_rollout_are_numbered_at_once_as_one_after_the_other(id,
     assert asked == [7 * 3]
     observation, _ = other.env.reset(seed=seed_sequence(0, "test", "env").generate_state(3).tolist())
     for state_B, action_B in zip(made.state_TB, made.action_TB, strict=True):
-        assert torch.equal(other.number(other.env, observation), state_B)
+        assert torch.equal(numbered(other, observation), state_B)
         observation, _, over, *_ = other.env.step(action_B.numpy())
         assert not over.any()
-    assert torch.equal(other.number(other.env, observation), made.next_state_TB[-1])
+    assert torch.equal(numbered(other, observation), made.next_state_TB[-1])
     assert torch.equal(made.next_state_TB[:-1], made.state_TB[1:])
 
 
 def test_changed_constants_are_honoured_and_must_be_the_same_in_all_copies():
     world = world_of("CartPole-v1", sutton_barto_reward=True)
     observation, _ = world.env.reset(seed=0)
-    assert float(world.model.outcomes(world.number(world.env, observation)).reward_NA.max()) == 0.0
+    assert float(world.model.outcomes(numbered(world, observation)).reward_NA.max()) == 0.0
     copies = world_of("CartPole-v1").env
     copies.envs[1].unwrapped.gravity = 1.6
     observation, _ = copies.reset(seed=0)
     with pytest.raises(PgtsError, match=r"CartPole-v1 has gravity = 1\.6; the model's is 9\.8"):
-        world_of(copies).number(copies, observation)
+        numbered(world_of(copies), observation)
 
 
 def test_actions_are_those_of_the_copies_also_in_a_simulator():
@@ -159,7 +164,7 @@ def test_actions_are_those_of_the_copies_also_in_a_simulator():
     following = []
     for world in (world_of(copies_of(Cart)), world_of(copies_of(mirrored))):
         observation, _ = world.env.reset(seed=3)
-        answer = world.model.outcomes(world.number(world.env, observation)[:1])
+        answer = world.model.outcomes(numbered(world, observation)[:1])
         following.append(world.observe(answer.child_NAK[0, :, 0]))
     assert torch.equal(following[0], following[1].flip(0))
     assert not torch.equal(following[0], following[1])
@@ -259,7 +264,7 @@ def test_dynamics_and_simulator_answer_alike(name, repeat, monkeypatch):
         world = world_of(name, action_repeat=repeat)
         assert isinstance(world, SimulatedWorld) == simulate
         observation, _ = world.env.reset(seed=5)
-        state_B = world.number(world.env, observation)
+        state_B = numbered(world, observation)
         for _ in range(2):
             answer = world.model.outcomes(state_B)
             state_B = answer.child_NAK.flatten().unique()
