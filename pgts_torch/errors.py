@@ -42,12 +42,21 @@ class Failed(PgtsError):
     """Something of the caller's, as an environment, raised an error or answered wrongly."""
 
 
-def failure(where: str, error: Exception) -> NotFinite | Failed:
-    """The error that says where another one happened; NotFinite stays NotFinite."""
+class ModelMismatch(PgtsError):
+    """The environment did what its model rules out, or not as often as the model says: one of the two is wrong, and a
+    lookahead is not to be trusted. The policy has not been moved by it."""
+
+
+def failure(where: str, error: Exception) -> NotFinite | ModelMismatch | Failed:
+    """The error that says where another one happened; NotFinite and ModelMismatch stay what they are."""
     if not isinstance(error, PgtsError):
         return Failed(f"{where}: {type(error).__name__}: {error}")
     story = f"{where}: {error}"
-    told = NotFinite(story, what=error.what) if isinstance(error, NotFinite) else Failed(story)
+    told: NotFinite | ModelMismatch | Failed
+    if isinstance(error, NotFinite):
+        told = NotFinite(story, what=error.what)
+    else:
+        told = ModelMismatch(story) if isinstance(error, ModelMismatch) else Failed(story)
     told.rank = error.rank
     return told
 

@@ -20,7 +20,7 @@ from pgts_torch.agent.evaluate import Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.ranks import joined_ranks
-from pgts_torch.errors import Failed, NotFinite, PgtsError, Stopped, failure
+from pgts_torch.errors import Failed, ModelMismatch, NotFinite, PgtsError, Stopped, failure
 from pgts_torch.experiment import checkpoint, diagnostics
 from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.config import Config, dump
@@ -98,6 +98,7 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
         PgtsError: something in the configuration cannot be built, or the folder is taken; nothing was written.
         Failed: the environment failed in training; where stands in failure.json.
         NotFinite: training met a number that is not finite; which and where stands in failure.json, too.
+        ModelMismatch: the environment contradicted its model; what happened stands in failure.json.
         Stopped: SIGTERM or SIGINT came; the iteration was finished and saved.
         RankLost: another process is gone; the last checkpoint is what remains.
     """
@@ -176,7 +177,7 @@ def _loop(config: Config, algorithm: PGTS, folder: Folder, start: Start | None, 
                 next(each for each in signals if each is not None),
             )
         return algorithm.ranks.first("a summary", recorder.finish)
-    except (NotFinite, Failed) as error:
+    except (NotFinite, ModelMismatch, Failed) as error:
         where = {"iteration": algorithm.num_iterations, "env_step": algorithm.num_env_steps, "seed": config.seed}
         tensor = error.what if isinstance(error, NotFinite) else None
         record = where | {"tensor": tensor, "message": str(error)}

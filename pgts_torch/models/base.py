@@ -30,12 +30,15 @@ class Transitions:
 class Model(ABC):
     """A finite action set over numbered states.
 
+    exact: whether it claims to be the environment, as a table, dynamics or a simulator do, and a learned model does
+        not: what the environment does is held to it, and a bound that it proves is called proved.
     highest_value: an upper bound of v* in every state; infinite where none is known.
     generation: how often the model has forgotten its states and begun to number them anew.
     """
 
     num_states: int
     num_actions: int
+    exact: bool = False
     highest_value: float = math.inf
     generation: int = 0
     device: torch.device

@@ -45,6 +45,7 @@ class ClassicModel(TensorModel):
             discount.
     """
 
+    exact = True
     env_class: type
     size: int
     constants: tuple[str, ...]

@@ -69,6 +69,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             or above 1 beside a highest value.
     """
 
+    exact = True
+
     def __init__(
         self,
         env: EnvSource,

@@ -24,6 +24,8 @@ class TabularModel(EnumeratingModel, SamplingModel):
         dtype: float64 keeps the exact values; float32 halves the memory.
     """
 
+    exact = True
+
     def __init__(
         self, mdp: TabularMDP, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
     ) -> None:

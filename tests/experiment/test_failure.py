@@ -8,7 +8,7 @@ import pytest
 
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.envs.vector import TabularVectorEnv
-from pgts_torch.errors import NotFinite
+from pgts_torch.errors import ModelMismatch, NotFinite
 from pgts_torch.experiment import run
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.evaluate import last_checkpoint
@@ -81,3 +81,18 @@ def test_what_is_not_finite_in_the_last_evaluation_is_written_down_too(tmp_path,
 def test_a_run_that_meets_nothing_of_the_kind_leaves_no_failure(tmp_path):
     assert train(tmp_path / "run", "--total_steps=60") == 0
     assert not (tmp_path / "run" / "failure.json").exists()
+
+
+def test_a_run_whose_environment_contradicts_its_model_writes_down_what_happened_and_exits_with_2(
+    tmp_path, monkeypatch, capsys
+):
+    def contradicted(*args):
+        raise ModelMismatch("state 1 under action 0 led to 3")
+
+    monkeypatch.setattr(PGTS, "_visit", contradicted)
+    folder = tmp_path / "run"
+    assert train(folder) == 2
+    record = json.loads((folder / "failure.json").read_text())
+    assert (record["iteration"], record["tensor"], record["message"]) == (0, None, "state 1 under action 0 led to 3")
+    complaint = capsys.readouterr().err.splitlines()[-1]
+    assert complaint == f"error: iteration 0 of {folder} stopped: state 1 under action 0 led to 3"
