@@ -16,7 +16,8 @@ class Seen:
     state_N, weight_N: the states that it visited, and what each counts for in the update; with sampled advantages every
         visit has a row of its own.
     pi_NA: pi_k at these states.
-    advantage_NA: how much better each action is.
+    advantage_NA: how much better each action is than the policy, with sum_a pi(a|s) A(s, a) = 0. Of a lookahead
+        (T^m Q)(s, a) - <pi, T^m Q>; of what was sampled in expectation only.
     depth: m.
     look: (T^m Q)(s, .) at these states; None with sampled advantages.
     gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, with v(s) = <pi(.|s), Q(s, .)> of the same critic.

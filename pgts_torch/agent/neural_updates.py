@@ -189,7 +189,7 @@ class PPOUpdate(NetworkUpdate):
         entropy_coef: at least 0, in units of the advantages (after their normalisation).
         target_kl: no further step once the mean KL(pi_old || pi) of a minibatch, over all actions, exceeds it.
         normalize_advantage: divide by the root of mean_s w(s) (sum_a pi_old(a|s) |adv(s, a)|)^2; for sampled advantages
-            that is their root mean square. Nothing is subtracted: sums over all actions are 0 already.
+            that is their root mean square. Nothing is subtracted: their mean under pi is 0 already.
     """
 
     clip_range: float = 0.2

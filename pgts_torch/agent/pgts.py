@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pgts_torch.agent import saving
-from pgts_torch.agent.advantages import LookaheadAdvantages, SampledAdvantages, score_function
+from pgts_torch.agent.advantages import LookaheadAdvantages, SampledAdvantages, centred, score_function
 from pgts_torch.agent.build import (
     DEFAULT_TOLERANCE,
     Description,
@@ -236,7 +236,7 @@ class PGTS:
             bound = self._certificate(experience, states, v_N, depth)
             if float(gap_N @ occupancy_N) > self.tolerance * bound or self._proved(bound):
                 break
-        return Seen(states, weight_N, pi_NA, look.q_BA - v_N.unsqueeze(-1), depth, look, gap_N, bound)
+        return Seen(states, weight_N, pi_NA, centred(look.q_BA, pi_NA), depth, look, gap_N, bound)
 
     def _taken(self, experience: Rollout) -> Seen | None:
         """The advantages of the actions taken, by the critic as it was when they were; None where a lookahead is

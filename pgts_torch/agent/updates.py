@@ -41,7 +41,7 @@ class Update(ABC):
 
         Args:
             observation_N: what the policy sees of N visited states.
-            advantage_NA: (T^m Q)(s, a) - <pi, Q>. What all actions of a state have in common moves nothing.
+            advantage_NA: (T^m Q)(s, a) - <pi, T^m Q> (`advantages.centred`), or sampled ones.
             weight_N: w(s).
         """
 
