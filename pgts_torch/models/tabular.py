@@ -1,6 +1,7 @@
 """A tabular MDP as a model: it enumerates and it samples."""
 
 import math
+from dataclasses import replace
 from typing import Any, final
 
 import gymnasium
@@ -66,7 +67,10 @@ def tabular_truth(env: gymnasium.Env | gymnasium.vector.VectorEnv, *, gamma: flo
     base: Any = env.unwrapped
     single: Any = base.envs[0] if isinstance(base, gymnasium.vector.SyncVectorEnv) else base
     mdp = getattr(single.unwrapped, "mdp", None)
-    return mdp if isinstance(mdp, TabularMDP) else TabularMDP.from_gymnasium(single, gamma)
+    if not isinstance(mdp, TabularMDP):
+        return TabularMDP.from_gymnasium(single, gamma)
+    # Ours pay r(s, a), whichever outcome is drawn.
+    return mdp if mdp.reward_SAK is None else replace(mdp, reward_SAK=None)
 
 
 def _highest_value(outcomes: Outcomes) -> float:

@@ -21,6 +21,9 @@ from pgts_torch.errors import MissingModel, PgtsError
 ROW_SUM_TOLERANCE = 1e-9
 """How far from 1 the probabilities of a row may sum before it is refused."""
 
+MEAN_TOLERANCE = 1e-8
+"""How far the mean of the rewards of outcomes may be from r(s, a), as a share of the largest of them."""
+
 Transition = tuple[float, int, float, bool]
 """(probability, next state, reward, terminated), as in the P tables of Gymnasium's toy-text environments."""
 
@@ -34,6 +37,8 @@ class TabularMDP:
         start_S: start distribution mu [PGTS Sec. 2].
         action_names: one word an action, for pictures and messages. Default "0", "1", ...
         shape: (rows, columns) in which a picture lays the states out, row by row. Default one row.
+        reward_SAK: reward of each outcome, where outcomes of one (s, a) differ in it; their mean is r(s, a). None: each
+            outcome pays r(s, a). Values need the mean alone; what a single step may pay is `outcome_reward_SAK`.
 
     Raises:
         PgtsError: a row is not a distribution, a discount is outside [0, 1], a value is not finite, a child does not
@@ -44,6 +49,7 @@ class TabularMDP:
     start_S: Float[Tensor, "S"]
     action_names: tuple[str, ...] = ()
     shape: tuple[int, int] = (0, 0)
+    reward_SAK: Float[Tensor, "S A K"] | None = None
 
     def __post_init__(self) -> None:
         _check_outcomes(self.outcomes)
@@ -58,6 +64,8 @@ class TabularMDP:
             raise PgtsError(f"{len(self.action_names)} action names for {self.num_actions} actions")
         if self.shape[0] * self.shape[1] != self.num_states:
             raise PgtsError(f"shape {self.shape} does not hold {self.num_states} states")
+        if self.reward_SAK is not None:
+            _check_rewards(self.reward_SAK, self.outcomes)
 
     @property
     def num_states(self) -> int:
@@ -66,6 +74,14 @@ class TabularMDP:
     @property
     def num_actions(self) -> int:
         return self.outcomes.num_actions
+
+    @property
+    def outcome_reward_SAK(self) -> Float[Tensor, "S A K"]:
+        """What is paid where an outcome of positive probability happens; beside it the table of `outcomes` has the
+        outcome's probability, discount and next state."""
+        if self.reward_SAK is not None:
+            return self.reward_SAK
+        return self.outcomes.reward_NA.unsqueeze(-1).expand(self.outcomes.prob_NAK.shape)
 
     @classmethod
     def from_dense(
@@ -114,9 +130,9 @@ class TabularMDP:
     ) -> Self:
         """An MDP from lists of transitions, `P[s][a] = [(probability, next state, reward, terminated), ...]`.
 
-        A successor that is listed twice is counted twice. A terminated transition has discount 0. A state that, as far
-        as `start` reaches it at all, is entered only by terminated transitions is terminal: nothing is earned from it,
-        whatever its own rows say.
+        A successor that is listed twice is counted twice; with two rewards it is two outcomes. A terminated transition
+        has discount 0. A state that, as far as `start` reaches it at all, is entered only by terminated transitions is
+        terminal: nothing is earned from it, whatever its own rows say.
 
         Args:
             P: transitions for states 0..S-1 and actions 0..A-1.
@@ -131,20 +147,21 @@ class TabularMDP:
         rows = [[_merge_successors(P, s, a, S, A) for a in range(A)] for s in range(S)]
         start_S = start_distribution(start, S)
         for s in _terminal_states(rows, start_S):
-            rows[s] = [(0.0, {(s, True): 1.0}) for _ in range(A)]
+            rows[s] = [(0.0, {(s, True, 0.0): 1.0}) for _ in range(A)]
         K = max(len(successors) for row in rows for _, successors in row)
-        reward = np.zeros((S, A))
+        reward, outcome_reward = np.zeros((S, A)), np.zeros((S, A, K))
         prob, discount = np.zeros((S, A, K)), np.zeros((S, A, K))
         child = np.zeros((S, A, K), dtype=np.int64)
         for s, row in enumerate(rows):
             for a, (expected_reward, successors) in enumerate(row):
-                reward[s, a] = expected_reward
+                reward[s, a] = outcome_reward[s, a] = expected_reward
                 child[s, a] = s
-                for k, ((next_state, terminated), p) in enumerate(successors.items()):
-                    prob[s, a, k], child[s, a, k] = p, next_state
+                for k, ((next_state, terminated, paid), p) in enumerate(successors.items()):
+                    prob[s, a, k], child[s, a, k], outcome_reward[s, a, k] = p, next_state, paid
                     discount[s, a, k] = 0.0 if terminated else gamma
         reward_SA, prob_SAK, discount_SAK, child_SAK = map(torch.from_numpy, (reward, prob, discount, child))
-        return cls(Outcomes(reward_SA, prob_SAK, discount_SAK, child_SAK, S), start_S, action_names, shape)
+        reward_SAK = torch.from_numpy(outcome_reward) if (outcome_reward != reward[..., None]).any() else None
+        return cls(Outcomes(reward_SA, prob_SAK, discount_SAK, child_SAK, S), start_S, action_names, shape, reward_SAK)
 
     @classmethod
     def from_gymnasium(cls, env: gymnasium.Env, gamma: float, *, start: int | ArrayLike | None = None) -> Self:
@@ -313,11 +330,14 @@ def check_gamma(gamma: float) -> None:
         raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
 
 
-def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> tuple[float, dict[tuple[int, bool], float]]:
-    """Expected reward and the probability of each (next state, terminated) that (s, a) may lead to."""
+_Row = tuple[float, dict[tuple[int, bool, float], float]]
+"""Expected reward of (s, a), and the probability of each (next state, terminated, reward) that it may lead to."""
+
+
+def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> _Row:
     if len(P[s]) != A:
         raise PgtsError(f"P[{s}] has {len(P[s])} actions; P[0] has {A}")
-    successors = dict[tuple[int, bool], float]()
+    successors = dict[tuple[int, bool, float], float]()
     # Counted from the first reward, so that equal rewards have exactly this mean.
     first_reward = float(P[s][a][0][2]) if len(P[s][a]) else 0.0
     expected_reward = first_reward
@@ -329,7 +349,7 @@ def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> tuple[float, di
         if not np.isfinite(reward):
             raise PgtsError(f"P[{s}][{a}] has reward {reward}; rewards must be finite")
         if p > 0:
-            key = (int(next_state), bool(terminated))
+            key = (int(next_state), bool(terminated), float(reward))
             successors[key] = successors.get(key, 0.0) + float(p)
             expected_reward += float(p) * (float(reward) - first_reward)
     if not successors:
@@ -337,14 +357,14 @@ def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> tuple[float, di
     return expected_reward, successors
 
 
-def _terminal_states(rows: list[list[tuple[float, dict[tuple[int, bool], float]]]], start_S: Tensor) -> set[int]:
+def _terminal_states(rows: list[list[_Row]], start_S: Tensor) -> set[int]:
     """States entered by terminated transitions only, as far as the start distribution reaches them."""
     frontier = torch.nonzero(start_S).flatten().tolist()
     alive, ended = set(frontier), set[int]()
     while frontier:
         s = frontier.pop()
         for _, successors in rows[s]:
-            for next_state, terminated in successors:
+            for next_state, terminated, _ in successors:
                 if terminated:
                     ended.add(next_state)
                 elif next_state not in alive:
@@ -361,6 +381,25 @@ def _check_start(start_S: Tensor, num_states: int) -> None:
         raise PgtsError(f"start_S[{off[0]}] is {start_S[off[0]]}; probabilities are finite and at least 0")
     if abs(float(start_S.sum()) - 1) > ROW_SUM_TOLERANCE:
         raise PgtsError(f"start_S is not a distribution: it sums to {float(start_S.sum())}")
+
+
+def _check_rewards(reward_SAK: Tensor, outcomes: Outcomes) -> None:
+    """Raise PgtsError with the first offending (s, a) unless these are rewards of the outcomes, with their means."""
+    if reward_SAK.shape != outcomes.prob_NAK.shape or reward_SAK.dtype != torch.float64:
+        raise PgtsError(
+            f"reward_SAK is {reward_SAK.dtype} with shape {tuple(reward_SAK.shape)}; it must be torch.float64 with "
+            f"shape {tuple(outcomes.prob_NAK.shape)}"
+        )
+    finite_SA = torch.isfinite(reward_SAK).all(-1)
+    _refuse(~finite_SA, lambda s, a: f"reward_SAK[{s}, {a}] is {reward_SAK[s, a].tolist()}; rewards must be finite")
+    mean_SA, largest_SA = (outcomes.prob_NAK * reward_SAK).sum(-1), reward_SAK.abs().amax(-1)
+    _refuse(
+        (mean_SA - outcomes.reward_NA).abs() > MEAN_TOLERANCE * largest_SA,
+        lambda s, a: (
+            f"reward_SAK[{s}, {a}] has the mean {mean_SA[s, a]}; reward_NA is {outcomes.reward_NA[s, a]}: give both, "
+            "or reward_SAK=None where each outcome pays the mean"
+        ),
+    )
 
 
 def _check_outcomes(outcomes: Outcomes) -> None:

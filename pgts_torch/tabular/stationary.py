@@ -110,7 +110,7 @@ def worst_case_bound(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -
 def worst_policy(mdp: TabularMDP) -> Float[Tensor, "S A"]:
     """A deterministic policy with the least value in every state: the optimum of the negated rewards."""
     negated = replace(mdp.outcomes, reward_NA=-mdp.outcomes.reward_NA)
-    return exact.optimal(replace(mdp, outcomes=negated)).pi_SA
+    return exact.optimal(replace(mdp, outcomes=negated, reward_SAK=None)).pi_SA
 
 
 # What a lookahead proves without knowing v*
@@ -154,7 +154,7 @@ def certificate(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -> flo
         reward_NA=torch.where(expanded_S[:, None], outcomes.reward_NA, w),
         discount_NAK=torch.where(expanded_S[:, None, None], outcomes.discount_NAK, 0.0),
     )
-    hopeful = replace(mdp, outcomes=granted)
+    hopeful = replace(mdp, outcomes=granted, reward_SAK=None)
     v_S = exact.optimal(hopeful).v_S
     if _largest_discount(granted) < UNDISCOUNTED:
         v_S = residual_bound(hopeful, v_S)  # policy iteration ends a rounding error below the optimum

@@ -1,5 +1,7 @@
 """How tabular MDPs are made, and what is refused."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -99,6 +101,51 @@ def test_a_successor_that_is_listed_twice_is_counted_twice():
     mdp = TabularMDP.from_transitions(P, 0.9, start=0)
     assert outcomes_of(mdp, 0, 0) == pytest.approx({(0, 0.9): 2 / 3, (1, 0.9): 1 / 3})
     assert mdp.outcomes.reward_NA[0, 0] == pytest.approx(3.0)
+
+
+def test_outcomes_that_pay_differently_are_kept_apart_and_have_the_expected_reward_as_their_mean():
+    P = [
+        [[(0.5, 1, 1.0, False), (0.25, 1, 3.0, False), (0.125, 1, 1.0, False), (0.125, 0, 8.0, True)]],
+        [[(1, 1, 2.0, False)]],
+    ]
+    mdp = TabularMDP.from_transitions(P, 0.9, start=0)
+    paid = zip(mdp.outcomes.prob_NAK[0, 0].tolist(), mdp.outcome_reward_SAK[0, 0].tolist(), strict=True)
+    assert list(paid) == [(0.625, 1.0), (0.25, 3.0), (0.125, 8.0)]
+    assert mdp.outcomes.reward_NA[0, 0] == 0.625 + 0.75 + 1.0
+    assert mdp.outcome_reward_SAK[1, 0, 0] == 2.0
+
+
+def test_where_every_outcome_pays_the_same_no_rewards_of_outcomes_are_kept():
+    mdp = zoo("Taxi")
+    assert mdp.reward_SAK is None
+    assert (mdp.outcome_reward_SAK == mdp.outcomes.reward_NA[..., None]).all()
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_rewards_of_outcomes_with_another_mean_are_refused():
+    mdp = zoo("FrozenLake")
+    with pytest.raises(PgtsError, match=r"reward_SAK\[14, 1\] has the mean 0\.33.*reward_NA is -0\.33"):
+        replace(mdp, outcomes=replace(mdp.outcomes, reward_NA=-mdp.outcomes.reward_NA))
+    with pytest.raises(PgtsError, match=r"must be torch.float64 with shape \(16, 4, 3\)"):
+        replace(mdp, reward_SAK=mdp.outcomes.reward_NA)
+
+
+def test_the_transitions_of_slippery_cliff_walking_are_those_of_its_table_with_their_rewards():
+    env = gymnasium.make("CliffWalking-v1", is_slippery=True)
+    mdp = TabularMDP.from_gymnasium(env, 0.9)
+    table = env.unwrapped.P
+    for s, a in [(36, 0), (24, 2), (30, 2)]:
+        listed: dict[tuple[int, float], float] = {}
+        for p, child, reward, _ in table[s][a]:
+            listed[child, reward] = listed.get((child, reward), 0) + p
+        prob, rewards = mdp.outcomes.prob_NAK[s, a], mdp.outcome_reward_SAK[s, a]
+        kept = {
+            (int(c), float(r)): float(p)
+            for p, c, r in zip(prob, mdp.outcomes.child_NAK[s, a], rewards, strict=True)
+            if p
+        }
+        assert kept == pytest.approx(listed)
+        assert len(kept) == 3
 
 
 def test_transitions_of_probability_0_are_left_out():
