@@ -99,8 +99,7 @@ class _Missing(Exception):
 def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, length: int = 20) -> Report:
     """Try out whether an environment can serve as a `SimulatorModel`.
 
-        answers     rewards and observations are finite and fit the spaces that the environment declares, and step goes
-                    on after it has truncated an episode
+        answers     rewards and observations are finite and fit the spaces that the environment declares
         restore     from a snapshot, the same actions and draws give the same observations, rewards and ends, bit for
                     bit, in another instance that has been elsewhere since
         merge       equal states have equal snapshots, so that a search can merge them
@@ -164,13 +163,8 @@ def _told(error: Exception) -> str:
 
 
 def _answers(setup: Setup, walks: Sequence[Walk], tried: _Tried) -> str:
-    """Ask a model for some actions in each state, and beyond those that time has ended."""
+    """Ask a model for some actions in each state."""
     model = setup.model()
-    cut_N = torch.tensor([model.number(walk.cut) for walk in walks if walk.cut is not None], dtype=torch.int64)
-    try:
-        model.is_random(cut_N, torch.zeros_like(cut_N))
-    except PgtsError as error:
-        raise _Missing(f"a lookahead goes on after truncation, and so must step: {error}") from error
     state_N = torch.tensor([model.number(walk.start) for walk in walks]).repeat_interleave(_ACTIONS_TRIED)
     action_N = torch.from_numpy(setup.random.integers(len(setup.actions), size=len(state_N)))
     random_N = model.is_random(state_N, action_N)

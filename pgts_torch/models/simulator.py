@@ -4,7 +4,7 @@ import itertools
 import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import gymnasium
@@ -47,14 +47,17 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
     """An instance of a Gymnasium environment that answers what may follow a state and an action.
 
     The instance belongs to the model alone, without wrappers: time limits end no episode here, and nothing that the
-    model is asked touches the environment that an agent acts in. Chance comes from the keys of the search, so a search
-    cannot foresee what that environment will draw. A transition that draws nothing is asked of the simulator once, and
+    model is asked touches the environment that an agent acts in. Where the environment itself truncates an episode the
+    model never steps on: such a state leads to itself with reward 0 and discount 1, under its first action alone, so
+    that T leaves it the value that stands at the leaves, which is the critic's, at any depth.
+
+    Chance comes from the keys of the search, so a search cannot foresee what that environment will draw. A transition that draws nothing is asked of the simulator once, and
     the answer outlives `clear`, for it is no matter of numbers; only where answers take much memory are they forgotten.
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
         gamma: discount in [0, 1] of an outcome that ends no episode and names none, `info["discount"]`; truncation does
-            not end it.
+            not end it, what follows it is worth what the critic says.
         actions: the actions, in the order of their numbers. Default: all of a discrete space; for a continuous one see
             `grid_actions` and `sampled_actions`.
         action_repeat: how often an action is taken in one outcome, as in `TensorModel`.
@@ -119,7 +122,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         self.num_states = 0
         self._snapshots: list[Snapshot] = []
         self._observations: list[Any] = []
-        self._number: dict[bytes, int] = {}
+        self._number: dict[tuple[bytes, bool], int] = {}
         if self._sure_bytes > _MOST_BYTES:
             self._sure, self._sure_bytes = {}, 0
         self._known_worlds: list[Any] = []
@@ -162,7 +165,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
 
     def _known(self, snapshot: Snapshot, shown: Any) -> int:
         """The number of a state that shows this."""
-        number = self._number.setdefault(snapshot.key, self.num_states)
+        number = self._number.setdefault(snapshot.name, self.num_states)
         if number == self.num_states:
             self.num_states += 1
             self._snapshots.append(snapshot)
@@ -256,29 +259,33 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         return (
             torch.tensor([step.reward for step in steps], dtype=self.dtype, device=self.device),
             torch.tensor([step.discount for step in steps], dtype=self.dtype, device=self.device),
-            torch.tensor([self._number[step.child.key] for step in steps], dtype=torch.int64, device=self.device),
+            torch.tensor([self._number[step.child.name] for step in steps], dtype=torch.int64, device=self.device),
         )
 
     def _step(self, state: int, action: int, key: int) -> _Step:
         """What follows; from memory where it is sure."""
         self._check("state", state, self.num_states)
         self._check("action", action, self.num_actions)
-        asked = self._snapshots[state].key, action
+        at = self._snapshots[state]
+        if at.cut:
+            return _Step(-math.inf if action else 0.0, 1.0, at, self._observations[state], random=False)
+        asked = at.key, action
         if asked in self._sure:
             step = self._sure[asked]
             self._known(step.child, step.shown)  # now, so that numbers do not depend on what is remembered
             return step
         taken = self.actions[action]
         try:
-            self.adapter.set_state(self.env, self._snapshots[state].data)
+            self.adapter.set_state(self.env, at.data)
             total, discount, random = 0.0, 1.0, False
             for _ in range(self.action_repeat):
-                observation, reward, weight, drew = self._stepped(taken, None if random else key)
+                observation, reward, weight, drew, truncated = self._stepped(taken, None if random else key)
                 total, random = total + discount * reward, random or drew
                 discount *= weight
-                if discount == 0:
+                if discount == 0 or truncated:
                     break
-            child = self._known(self.adapter.get_state(self.env), None)
+            reached = self.adapter.get_state(self.env)
+            child = self._known(replace(reached, cut=True) if truncated and discount else reached, None)
             if self._observations[child] is None:
                 self._see(child, observation if self._show is None else self._checked(self._show(), total))
         except Exception as error:
@@ -291,20 +298,21 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             self._sure_bytes += _bytes_of(step.shown)
         return step
 
-    def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, float, bool]:
-        """Observation, reward, discount, and whether chance decided, of one step. The generator is seeded by the key,
+    def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, float, bool, bool]:
+        """Observation, reward, discount, whether chance decided and whether the episode was truncated, of one step. The generator is seeded by the key,
         where there is one; later draws of the same outcome go on from it."""
         known = self.adapter.is_random(self.env, taken)
         if known is not False and key is not None:
             self.adapter.seed(self.env, key)
         before = generator_state(self.env) if known is None else None
-        observation, reward, terminated, _, info = self.env.step(taken)
+        observation, reward, terminated, truncated, info = self.env.step(taken)
         self.simulator_steps += 1
         drew = generator_state(self.env) != before if known is None else known
         reward = float(reward)
         if self._show is None:
             self._checked(observation, reward)
-        return observation, reward, 0.0 if terminated else float(info.get("discount", self.gamma)), drew
+        discount = 0.0 if terminated else float(info.get("discount", self.gamma))
+        return observation, reward, discount, drew, bool(truncated)
 
     def _checked(self, observation: Any, reward: float) -> Any:
         """The observation; PgtsError unless it and the reward are what the environment declares."""

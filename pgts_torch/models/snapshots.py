@@ -39,10 +39,17 @@ class Snapshot:
     """A state of a simulator.
 
     key: equal for equal states.   data: what `SnapshotAdapter.set_state` takes; often the key itself.
+    cut: whether the step that led here truncated the episode, so that no other step may follow.
     """
 
     key: bytes
     data: Any
+    cut: bool = False
+
+    @property
+    def name(self) -> tuple[bytes, bool]:
+        """What tells states apart: one in which an episode was cut off is not the one in which it would go on."""
+        return self.key, self.cut
 
 
 class SnapshotAdapter(ABC):

@@ -42,15 +42,13 @@ class Setup:
 
 @dataclass(frozen=True)
 class Walk:
-    """A continuation: where it began, the key of its draws, what was done, what was seen and which states were met; and
-    the state in which the environment truncated it, if it did."""
+    """A continuation: where it began, the key of its draws, what was done, what was seen and which states were met."""
 
     start: Snapshot
     key: int
     actions: tuple[Any, ...]
     seen: tuple[bytes, ...]
     states: tuple[bytes, ...]
-    cut: Snapshot | None
 
 
 def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
@@ -73,16 +71,14 @@ def walk_on(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
     """What these actions give from here on, up to an end."""
     start = setup.adapter.get_state(env)
     setup.adapter.seed(env, key)
-    seen, states, cut = [], [], None
+    seen, states = [], []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
-        state = setup.adapter.get_state(env)
         seen.append(bits((observation, float(reward), bool(terminated), bool(truncated))))
-        states.append(state.key)
+        states.append(setup.adapter.get_state(env).key)
         if terminated or truncated:
-            cut = None if terminated else state
             break
-    return Walk(start, key, actions, tuple(seen), tuple(states), cut)
+    return Walk(start, key, actions, tuple(seen), tuple(states))
 
 
 def again(setup: Setup, env: Any, walk: Walk) -> Walk:

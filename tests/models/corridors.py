@@ -173,16 +173,6 @@ class Siamese(Corridor):
         self.place[0] = value
 
 
-class Timed(Corridor):
-    """It ends its episodes after three steps, and does nothing afterwards."""
-
-    def step(self, action: int) -> Any:
-        if self.fuel <= 17:
-            raise RuntimeError("the episode is over")
-        observation, reward, terminated, _, info = super().step(action)
-        return observation, reward, terminated, self.fuel <= 17, info
-
-
 class Broken(Corridor):
     """Something goes wrong in cell 2."""
 

@@ -25,7 +25,6 @@ from tests.models.corridors import (
     Prophet,
     Siamese,
     Stuck,
-    Timed,
     Untidy,
 )
 
@@ -86,7 +85,6 @@ def test_a_faithful_simulator_is_usable(env, is_random):
         ],
         (Clairvoyant, {"chance"}, r"attribute box.0.dice is a generator of its own"),
         (Heedless, {"untouched"}, r"after reset with the same seed two instances go on differently"),
-        (Timed, {"answers", "untouched"}, r"a lookahead goes on after truncation.*the episode is over"),
         (Stuck, {"answers", "restore", "merge", "chance", "untouched"}, r"NotImplementedError: later"),
         (Siamese, {"untouched"}, r"a search changes the real environment"),
         (
