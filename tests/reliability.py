@@ -44,7 +44,7 @@ FAULTS: dict[str, dict[str, str]] = {
         "autoreset in the next step": "refused with the mode that works",
         "environment raises an error": "environment, step and seed are named, `failure.json`, exit code 2",
         "environment without a model": "the two methods that it lacks are named, exit code 2",
-        "environment that truncates its own episodes": "never stepped past it; a lookahead has the critic's value there",
+        "environment that truncates its own episodes": "never stepped past it; the critic's value stands there",
     },
     "MDP files": {
         "rows that do not sum to one": NAMED,

@@ -51,8 +51,9 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
     model never steps on: such a state leads to itself with reward 0 and discount 1, under its first action alone, so
     that T leaves it the value that stands at the leaves, which is the critic's, at any depth.
 
-    Chance comes from the keys of the search, so a search cannot foresee what that environment will draw. A transition that draws nothing is asked of the simulator once, and
-    the answer outlives `clear`, for it is no matter of numbers; only where answers take much memory are they forgotten.
+    Chance comes from the keys of the search, so a search cannot foresee what that environment will draw. A transition
+    that draws nothing is asked of the simulator once, and the answer outlives `clear`, for it is no matter of numbers;
+    only where answers take much memory are they forgotten.
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
@@ -299,8 +300,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         return step
 
     def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, float, bool, bool]:
-        """Observation, reward, discount, whether chance decided and whether the episode was truncated, of one step. The generator is seeded by the key,
-        where there is one; later draws of the same outcome go on from it."""
+        """Observation, reward, discount, whether chance decided and whether the episode was truncated, of one step.
+        The generator is seeded by the key, where there is one; later draws of the same outcome go on from it."""
         known = self.adapter.is_random(self.env, taken)
         if known is not False and key is not None:
             self.adapter.seed(self.env, key)
