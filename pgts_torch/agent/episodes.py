@@ -8,6 +8,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.environments import check_step
+from pgts_torch.models.steps import check_discounts, discount_of, names_discounts, number_of, rewards_of
 
 
 @final
@@ -21,13 +22,15 @@ class Episodes:
 
     Args:
         env: copies in `AutoresetMode.DISABLED`.
-        gamma: discount of a step that names none.
+        gamma: discount of a step that ends no episode; where an environment has `metadata["discounts"] = True`, only of
+            one that names none in `info["discount"]`.
         seeds: of each copy.
     """
 
     def __init__(self, env: VectorEnv, *, gamma: float, seeds: list[int]) -> None:
         self._env, self._gamma, self._seeds = env, gamma, seeds
         self._one_by_one = isinstance(env, SyncVectorEnv) and type(env).step is SyncVectorEnv.step
+        self._named_B = [names_discounts(one) for one in (env.envs if isinstance(env, SyncVectorEnv) else [env])]
         self._over_B = np.zeros(env.num_envs, dtype=bool)
         self._reward_B = np.zeros(env.num_envs)
         self._stepping: int | None = None
@@ -42,12 +45,12 @@ class Episodes:
 
         Raises:
             NotFinite: a reward or a discount is not.
+            PgtsError: a reward is not one number, or a discount is not in [0, 1].
         """
         step = self._step_alive if self._one_by_one else self._step_all
         reward_B, discount_B, truncated_B = step(action_B, alive_B)
-        for what, value_B in (("reward", reward_B), ("discount", discount_B)):
-            if not np.isfinite(value_B).all():
-                raise NotFinite(f"the {what}s are {value_B.tolist()}; they must be finite", what=what)
+        if not np.isfinite(reward_B).all():
+            raise NotFinite(f"the rewards are {reward_B.tolist()}; they must be finite", what="reward")
         return reward_B, discount_B, truncated_B
 
     def _step_all(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -55,9 +58,11 @@ class Episodes:
             self._env.reset(options={"reset_mask": self._over_B})
         self.observation, rewards, terminated_B, truncated_B, info = self._env.step(action_B)
         self._over_B = terminated_B | truncated_B
-        named_B = info.get("_discount", "discount" in info)  # which copies have named a discount
+        # Which copies have named a discount.
+        named_B = info.get("_discount", "discount" in info) if all(self._named_B) else False
         discount_B = np.where(terminated_B, 0.0, np.where(named_B, info.get("discount", 0.0), self._gamma))
-        return np.array(rewards, dtype=np.float64), discount_B, truncated_B
+        check_discounts(discount_B)
+        return rewards_of(rewards, self._env.num_envs), discount_B, truncated_B
 
     def _step_alive(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert isinstance(self._env, SyncVectorEnv)
@@ -67,8 +72,9 @@ class Episodes:
         truncated_B = np.zeros(len(copies), dtype=bool)
         for b in alive_B.nonzero()[0]:
             self._stepping = int(b)
-            self._each[b], reward_B[b], terminated, truncated_B[b], info = copies[b].step(action_B[b])
-            discount_B[b] = 0.0 if terminated else info.get("discount", self._gamma)
+            self._each[b], reward, terminated, truncated_B[b], info = copies[b].step(action_B[b])
+            reward_B[b] = number_of("reward", reward)
+            discount_B[b] = 0.0 if terminated else discount_of(info, self._gamma, named=self._named_B[b])
         self._stepping = None
         rows: Any = create_empty_array(space, n=len(copies))
         self.observation = concatenate(space, self._each, rows)

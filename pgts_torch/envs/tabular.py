@@ -33,7 +33,11 @@ class TabularEnv(gymnasium.Env):
         ResetNeeded: a step or a picture is asked for before the first reset, or a step after the end of the episode.
     """
 
-    metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012 (Gymnasium's type)
+    metadata = {  # noqa: RUF012 (Gymnasium's type)
+        "render_modes": ["ansi", "rgb_array"],
+        "render_fps": RENDER_FPS,
+        "discounts": True,  # info["discount"] is the discount of a step
+    }
 
     def __init__(self, mdp: TabularMDP, *, render_mode: str | None = None) -> None:
         check_render_mode(render_mode, self.metadata["render_modes"])

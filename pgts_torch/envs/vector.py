@@ -74,6 +74,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": RENDER_FPS,
+            "discounts": True,
             "autoreset_mode": self.autoreset_mode,
         }
         self.single_observation_space = gymnasium.spaces.Discrete(mdp.num_states)

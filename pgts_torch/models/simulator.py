@@ -19,6 +19,7 @@ from pgts_torch.errors import PgtsError, RandomOutcomes, failure
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.environments import EnvSource, all_actions, check_step, make_env
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, env_name, generator_state
+from pgts_torch.models.steps import discount_of, names_discounts, number_of
 
 _KEY_OF_CERTAINTY = 0
 """Outcomes that are listed draw nothing; this is what they would draw from."""
@@ -57,8 +58,9 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
-        gamma: discount in [0, 1] of an outcome that ends no episode and names none, `info["discount"]`; truncation does
-            not end it, what follows it is worth what the critic says.
+        gamma: discount in [0, 1] of an outcome that ends no episode; truncation does not end it, what follows it is worth
+            what the critic says. An environment with `metadata["discounts"] = True` may name another one in
+            `info["discount"]`.
         actions: the actions, in the order of their numbers. Default: all of a discrete space; for a continuous one see
             `grid_actions` and `sampled_actions`.
         action_repeat: how often an action is taken in one outcome, as in `TensorModel`.
@@ -112,6 +114,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         except Exception as error:
             raise failure(f"{self.name} failed in reset with seed 0", error) from error
         self._show = self.adapter.blindfold(self.env)
+        self._names_discounts = names_discounts(self.env)
         self._sure: dict[tuple[bytes, int], _Step] = {}
         self._sure_bytes = 0
         self.generation = -1
@@ -309,10 +312,10 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         observation, reward, terminated, truncated, info = self.env.step(taken)
         self.simulator_steps += 1
         drew = generator_state(self.env) != before if known is None else known
-        reward = float(reward)
+        reward = number_of("reward", reward)
         if self._show is None:
             self._checked(observation, reward)
-        discount = 0.0 if terminated else float(info.get("discount", self.gamma))
+        discount = 0.0 if terminated else discount_of(info, self.gamma, named=self._names_discounts)
         return observation, reward, discount, drew, bool(truncated)
 
     def _checked(self, observation: Any, reward: float) -> Any:

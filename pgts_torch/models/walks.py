@@ -9,6 +9,7 @@ import numpy as np
 
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter
+from pgts_torch.models.steps import number_of
 
 _LONGEST_WALK = 50
 """The most steps before a continuation begins."""
@@ -74,7 +75,7 @@ def walk_on(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
     seen, states = [], []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
-        seen.append(bits((observation, float(reward), bool(terminated), bool(truncated))))
+        seen.append(bits((observation, number_of("reward", reward), bool(terminated), bool(truncated))))
         states.append(setup.adapter.get_state(env).key)
         if terminated or truncated:
             break
@@ -108,7 +109,7 @@ def live(env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
     seen = []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
-        seen.append(bits((observation, float(reward), terminated, truncated)))
+        seen.append(bits((observation, number_of("reward", reward), terminated, truncated)))
         if terminated or truncated:
             seen.append(bits(env.reset()[0]))
     return seen

@@ -1,8 +1,5 @@
 """Finite Markov decision processes, validated when they are made."""
 
-import struct
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +14,9 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError
-
-ROW_SUM_TOLERANCE = 1e-9
-"""How far from 1 the probabilities of a row may sum before it is refused."""
+from pgts_torch.tabular import npz
+from pgts_torch.tabular.forms import EXACT as ROW_SUM_TOLERANCE
+from pgts_torch.tabular.forms import Order, normalised, outcomes_from
 
 MEAN_TOLERANCE = 1e-8
 """How far the mean of the rewards of outcomes may be from r(s, a), as a share of the largest of them."""
@@ -85,38 +82,26 @@ class TabularMDP:
 
     @classmethod
     def from_dense(
-        cls, P_SAS: ArrayLike, R_SA: ArrayLike, gamma: float, *, start: int | ArrayLike | None = None
+        cls, P: Any, R: Any, gamma: float, *, start: int | ArrayLike | None = None, order: Order | None = None
     ) -> Self:
-        """An MDP from the arrays of a textbook.
+        """An MDP from transitions and rewards as textbooks, pymdptoolbox and QuantEcon have them.
+
+        Rows that sum to 1 within 1e-5, as those of float32 or of six digits, are divided by their sums.
 
         Args:
-            P_SAS: P[s, a, s'], each P[s, a] a distribution.
-            R_SA: expected rewards.
+            P: probabilities of next states: an array [S, A, S] or [A, S, S]; or scipy.sparse matrices, a list of one
+                [S, S] for each action, or a single one [S A, S] (`tabular.forms`). Sparse ones are never made dense.
+            R: rewards: [S, A]; [S], where the action does not matter; or one of each entry of P, in the form of P.
             gamma: discount in [0, 1].
             start: a state, a distribution over states, or None for the uniform one.
+            order: "SAS" if P[s, a] is a distribution, "ASS" if P[a, s] is. Needed only where shapes do not tell.
+
+        Raises:
+            PgtsError: as the class; or no such forms, or an order that nothing tells.
         """
-        P = np.asarray(P_SAS, dtype=np.float64)
-        R = np.asarray(R_SA, dtype=np.float64)
-        if P.ndim != 3 or P.shape[0] != P.shape[2] or 0 in P.shape:
-            raise PgtsError(f"P_SAS has shape {P.shape}; it must be [S, A, S] with at least one state and one action")
-        if R.shape != P.shape[:2]:
-            raise PgtsError(f"R_SA has shape {R.shape}; P_SAS asks for {P.shape[:2]}")
         check_gamma(gamma)
-        off = (P < 0) | ~np.isfinite(P)
-        if off.any():
-            s, a, t = np.argwhere(off)[0]
-            raise PgtsError(f"P_SAS[{s}, {a}, {t}] is {P[s, a, t]}; probabilities are finite and at least 0")
-        K = max(1, int((P > 0).sum(-1).max()))
-        child = np.argsort(P == 0, axis=-1, kind="stable")[..., :K]
-        prob = torch.from_numpy(np.take_along_axis(P, child, axis=-1))
-        outcomes = Outcomes(
-            torch.from_numpy(R.copy()),
-            prob,
-            torch.tensor(float(gamma), dtype=torch.float64).expand(prob.shape),
-            torch.from_numpy(child),
-            len(P),
-        )
-        return cls(outcomes, start_distribution(start, len(P)))
+        outcomes = outcomes_from(P, R, gamma, order)
+        return cls(outcomes, start_distribution(start, outcomes.num_states))
 
     @classmethod
     def from_transitions(
@@ -205,13 +190,13 @@ class TabularMDP:
         )
         P_SAS = torch.zeros(self.num_states, self.num_actions, self.num_states, dtype=torch.float64)
         P_SAS.scatter_add_(-1, outcomes.child_NAK, outcomes.prob_NAK)
-        try:
-            with open(path, "wb") as file:  # numpy would append .npz to a path without it
-                np.savez_compressed(
-                    file, P=P_SAS.numpy(), R=outcomes.reward_NA.numpy(), gamma=gamma, start=self.start_S.numpy()
-                )
-        except OSError as error:
-            raise PgtsError(f"{path}: cannot be written: {error.strerror}") from error
+        arrays: dict[str, ArrayLike] = {
+            "P": P_SAS.numpy(),
+            "R": outcomes.reward_NA.numpy(),
+            "gamma": gamma,
+            "start": self.start_S.numpy(),
+        }
+        npz.write_arrays(path, arrays)
 
     @classmethod
     def load_npz(cls, path: str | Path) -> Self:
@@ -223,15 +208,17 @@ class TabularMDP:
         An end is written as a state that leads to itself and earns 0.
 
         Raises:
-            PgtsError: the file cannot be read, holds pickled objects, lacks an array or holds an unknown one, or the
-                arrays make no MDP; the message names the file, the array, the index and the value.
+            PgtsError: the file cannot be read, holds pickled objects, lacks an array or holds an unknown one, would
+                take more than 2 GiB of memory, or the arrays make no MDP; the message names the file, the array, the
+                index and the value.
         """
-        arrays = _read_npz(path)
+        arrays = npz.read_arrays(path)
         try:
-            gamma = _single_number("gamma", arrays["gamma"])
-            return cls.from_dense(arrays["P"], arrays["R"], gamma, start=_state_or_distribution(arrays.get("start")))
+            gamma = npz.single_number("gamma", arrays["gamma"])
+            start = npz.state_or_distribution(arrays.get("start"))
+            return cls.from_dense(arrays["P"], arrays["R"], gamma, start=start, order="SAS")
         except PgtsError as error:
-            raise PgtsError(f"{path}: {_in_words_of_the_file(str(error))}") from error
+            raise PgtsError(f"{path}: {npz.in_words_of_the_file(str(error))}") from error
 
 
 def start_distribution(start: int | ArrayLike | None, num_states: int) -> Float[Tensor, "S"]:
@@ -242,86 +229,7 @@ def start_distribution(start: int | ArrayLike | None, num_states: int) -> Float[
         if not 0 <= start < num_states:
             raise PgtsError(f"start state {start} does not exist; states are 0 to {num_states - 1}")
         return torch.nn.functional.one_hot(torch.tensor(int(start)), num_states).double()
-    return torch.from_numpy(np.array(start, dtype=np.float64))
-
-
-_NPZ_ARRAYS = ("P", "R", "gamma", "start")
-
-
-# How numpy, the zip and its compression report a file that is damaged or holds what no array is.
-_UNREADABLE = (
-    ValueError,
-    KeyError,
-    EOFError,
-    ArithmeticError,
-    RuntimeError,
-    MemoryError,
-    SyntaxError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-
-
-def _read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """The arrays of an MDP in a file; anything but plain numbers under the known names is refused."""
-    try:
-        with open(path, "rb") as file:
-            if not zipfile.is_zipfile(file):
-                raise PgtsError(f"{path}: is not an npz file (numpy.savez writes one)")
-            with np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
-                _check_names(path, archive.files)
-                return {name: _read_array(path, archive, name) for name in archive.files}
-    except PgtsError:
-        raise
-    except OSError as error:
-        raise PgtsError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except _UNREADABLE as error:
-        raise PgtsError(f"{path}: is damaged: {_first_line(error)}") from error
-
-
-def _check_names(path: str | Path, names: Sequence[str]) -> None:
-    for name in names:
-        if name not in _NPZ_ARRAYS:
-            raise PgtsError(f"{path}: array {name!r} is unknown; the arrays are P, R, gamma and start")
-    for name in _NPZ_ARRAYS[:3]:
-        if name not in names:
-            raise PgtsError(f"{path}: array {name!r} is missing; it holds {', '.join(names) or 'none'}")
-
-
-def _read_array(path: str | Path, archive: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    try:
-        array = np.asarray(archive[name])
-    except _UNREADABLE as error:
-        raise PgtsError(f"{path}: array {name!r} cannot be read: {_first_line(error)}") from error
-    if array.dtype.kind not in "biuf":
-        raise PgtsError(f"{path}: {name} is of type {array.dtype}; it must hold real numbers")
-    return array
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
-
-
-def _single_number(name: str, array: np.ndarray) -> float:
-    if array.ndim != 0:
-        raise PgtsError(f"{name} has shape {array.shape}; it must be a single number")
-    return float(array)
-
-
-def _state_or_distribution(array: np.ndarray | None) -> int | np.ndarray | None:
-    if array is None or array.ndim > 0:
-        return array
-    if array.dtype.kind not in "iu":
-        raise PgtsError(f"start is {array}; a single state must be a whole number")
-    return int(array)
-
-
-def _in_words_of_the_file(message: str) -> str:
-    """A message about an MDP with the names that the arrays have in a file."""
-    for name, in_file in [("P_SAS", "P"), ("R_SA", "R"), ("start_S", "start")]:
-        message = message.replace(name, in_file)
-    return message
+    return torch.from_numpy(normalised(np.array(start, dtype=np.float64, ndmin=1)))
 
 
 def check_gamma(gamma: float) -> None:

@@ -19,6 +19,7 @@ class Counted(gymnasium.Wrapper):
 
     def __init__(self, env, phase):
         super().__init__(env)
+        self.metadata = env.metadata | {"discounts": True}
         self.num_steps, self.phase = 0, phase
 
     def step(self, action):

@@ -69,6 +69,9 @@ def in_discounts(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
     def change(observation, reward, terminated, truncated, info):
         return observation, reward, terminated, truncated, info | {"discount": np.full(np.shape(reward), value)}
 
+    env = model.world.env
+    for one in env.envs if isinstance(env, SyncVectorEnv) else [env]:
+        patch.setitem(one.metadata, "discounts", True)
     in_steps(patch, model, change)
 
 

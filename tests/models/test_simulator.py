@@ -2,7 +2,7 @@
 
 import copy
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -252,6 +252,8 @@ def test_only_distinct_states_are_looked_at_and_what_others_make_of_a_step_is_ke
 
 class Hasty(Corridor):
     """Its steps name a discount while there is much fuel."""
+
+    metadata: ClassVar = {"discounts": True}
 
     def step(self, action):
         *told, info = super().step(action)

@@ -1,0 +1,86 @@
+"""What an environment says of one step, in the forms in which environments say it."""
+
+from decimal import Decimal
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from pgts_torch.errors import NotFinite, PgtsError
+
+
+def number_of(what: str, value: Any) -> float:
+    """A number, or an array, tensor or list of one number, as a float.
+
+    Args:
+        what: the word for it in a message: "reward", "discount".
+
+    Raises:
+        PgtsError: it is something else, as an array of several numbers; the message has its shape.
+    """
+    if isinstance(value, float | int | np.floating | np.integer):
+        return _as_float(what, value)
+    try:
+        array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    except (ValueError, TypeError):
+        array = np.array(None)
+    if array.size != 1:
+        raise PgtsError(f"the {what} has shape {array.shape}; it must be one number")
+    (single,) = array.reshape(-1).tolist()
+    if not isinstance(single, Real | Decimal):
+        raise PgtsError(f"the {what} is {value!r}; it must be one number")
+    return _as_float(what, single)
+
+
+def _as_float(what: str, number: Any) -> float:
+    try:
+        return float(number)
+    except OverflowError:
+        raise NotFinite(f"the {what} is a whole number that no float can hold", what=what) from None
+
+
+def rewards_of(values: Any, count: int) -> np.ndarray:
+    """The rewards of copies that step together, one number a copy, in float64.
+
+    Raises:
+        PgtsError: there is another count of them, or they are no numbers.
+    """
+    try:
+        reward_B = np.array(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise PgtsError(f"the rewards are {values!r}; they must be {count} numbers") from error
+    if reward_B.size != count or len(reward_B) != count:
+        raise PgtsError(f"the rewards have shape {reward_B.shape}; they must be {count} numbers, one for each copy")
+    return reward_B.reshape(count)
+
+
+def names_discounts(env: Any) -> bool:
+    """Whether `info["discount"]` of this environment is the discount of a step: where `metadata["discounts"]` is True.
+    Elsewhere the key has a meaning of the environment's own."""
+    return bool((env.metadata or {}).get("discounts", False))
+
+
+def discount_of(info: dict[str, Any], gamma: float, *, named: bool) -> float:
+    """The discount of a step that ends no episode: that which it names, or gamma.
+
+    Args:
+        named: whether the environment names discounts (`names_discounts`).
+
+    Raises:
+        PgtsError: it is outside [0, 1]; NotFinite where it is no finite number.
+    """
+    if not named or "discount" not in info:
+        return gamma
+    discount = number_of("discount", info["discount"])
+    check_discounts(np.array([discount]))
+    return discount
+
+
+def check_discounts(discount_B: np.ndarray) -> None:
+    """PgtsError unless these are in [0, 1]; NotFinite where one is no finite number."""
+    if not np.isfinite(discount_B).all():
+        raise NotFinite(f"the discounts are {discount_B.tolist()}; they must be finite", what="discount")
+    off_B = (discount_B < 0) | (discount_B > 1)
+    if off_B.any():
+        raise PgtsError(f"the discount is {discount_B[off_B][0]}; it must be in [0, 1]")
