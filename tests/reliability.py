@@ -45,6 +45,9 @@ FAULTS: dict[str, dict[str, str]] = {
         "environment raises an error": "environment, step and seed are named, `failure.json`, exit code 2",
         "environment without a model": "the two methods that it lacks are named, exit code 2",
         "environment that truncates its own episodes": "never stepped past it; the critic's value stands there",
+        "reward that is not one number": "environment, step, seed and its shape are named, `failure.json`, exit code 2",
+        "discount outside [0, 1]": "environment, step and seed are named at every depth, `failure.json`, exit code 2",
+        "discount of another meaning in info": "ignored unless the environment declares that it names discounts",
     },
     "MDP files": {
         "rows that do not sum to one": NAMED,
@@ -53,6 +56,9 @@ FAULTS: dict[str, dict[str, str]] = {
         "wrong shape": NAMED,
         "pickled payload in an MDP": "refused, not run",
         "damaged MDP file": "refused, or read as an MDP",
+        "npz file that unpacks to more than memory": "refused with its size before anything is unpacked",
+        "rows rounded when they were stored": "divided by their sums within 1e-5, refused beyond",
+        "an order of states and actions that nothing tells": "refused unless the order is said",
     },
     "Numbers": {
         "observation that is not finite": STOPPED,

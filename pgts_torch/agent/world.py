@@ -22,7 +22,7 @@ from pgts_torch.models.environments import EnvSource, base_actions, changing_wra
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import adapter_for
 from pgts_torch.models.tabular import TabularModel, tabular_truth
-from pgts_torch.tabular.mdp import TabularMDP
+from pgts_torch.tabular.mdp import TabularMDP, check_gamma
 
 _NO_MODEL_NEEDED = "; or take depth 0 and the estimator 'sampled', which need no model"
 
@@ -345,6 +345,7 @@ def make_world(
         copies = make_vector_env(env, num_envs, gamma=gamma, actions_per_dimension=actions_per_dimension, **kwargs)
     check_vector_env(copies)
     discount = DEFAULT_GAMMA if gamma is None else gamma
+    check_gamma(discount)
     wrapper = changing_wrapper(copies.envs[0]) if isinstance(copies, SyncVectorEnv) else ""
     if wrapper and not plain:
         raise MissingModel(

@@ -21,8 +21,8 @@ class TabularEnv(gymnasium.Env):
     """A tabular MDP to act in: the observation is the state's number.
 
     The reward of a step is the expected r(s, a) of the table, whichever outcome is drawn. `info["discount"]` is the
-    discount of the drawn outcome, and `terminated` says that it is 0. There is no time limit inside; registration adds
-    one as a wrapper.
+    discount of the drawn outcome, as `metadata["discounts"]` declares, and `terminated` says that it is 0. There is no
+    time limit inside; registration adds one as a wrapper.
 
     Args:
         mdp: the MDP; kept as `mdp`.

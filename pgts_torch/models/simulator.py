@@ -58,7 +58,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
-        gamma: discount in [0, 1] of an outcome that ends no episode; truncation does not end it, what follows it is worth
+        gamma: discount in [0, 1] of an outcome that ends no episode; truncation does not end it, what follows is worth
             what the critic says. An environment with `metadata["discounts"] = True` may name another one in
             `info["discount"]`.
         actions: the actions, in the order of their numbers. Default: all of a discrete space; for a continuous one see

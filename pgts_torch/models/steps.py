@@ -5,7 +5,7 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
-from torch import Tensor
+from torch import Tensor, float64
 
 from pgts_torch.errors import NotFinite, PgtsError
 
@@ -22,7 +22,7 @@ def number_of(what: str, value: Any) -> float:
     if isinstance(value, float | int | np.floating | np.integer):
         return _as_float(what, value)
     try:
-        array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+        array = np.asarray(_plain(value))
     except (ValueError, TypeError):
         array = np.array(None)
     if array.size != 1:
@@ -40,6 +40,11 @@ def _as_float(what: str, number: Any) -> float:
         raise NotFinite(f"the {what} is a whole number that no float can hold", what=what) from None
 
 
+def _plain(value: Any) -> Any:
+    """A tensor as numpy knows it."""
+    return value.detach().to("cpu", float64).numpy() if isinstance(value, Tensor) else value
+
+
 def rewards_of(values: Any, count: int) -> np.ndarray:
     """The rewards of copies that step together, one number a copy, in float64.
 
@@ -47,7 +52,7 @@ def rewards_of(values: Any, count: int) -> np.ndarray:
         PgtsError: there is another count of them, or they are no numbers.
     """
     try:
-        reward_B = np.array(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
+        reward_B = np.array(_plain(values), dtype=np.float64, ndmin=1)
     except (ValueError, TypeError) as error:
         raise PgtsError(f"the rewards are {values!r}; they must be {count} numbers") from error
     if reward_B.size != count or len(reward_B) != count:

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse
 import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import PgtsError
@@ -29,7 +30,7 @@ rounded when they were stored (float32, six digits) and are divided by their sum
 _MOST_ENTRIES = 2**31
 
 
-class Table(NamedTuple):
+class _Table(NamedTuple):
     """What may follow each (state, action): K successors, padded with probability 0."""
 
     prob_SAK: Float[np.ndarray, "S A K"]
@@ -44,8 +45,9 @@ def normalised(prob: Float[np.ndarray, "... K"]) -> Float[np.ndarray, "... K"]:
     return prob / np.where(rounded, total, 1.0) if rounded.any() else prob
 
 
-def outcomes_from(P: Any, R: Any, gamma: float, order: Order | None) -> Outcomes:
-    """The outcomes of transitions and rewards in one of the forms above, in float64.
+def outcomes_from(P: Any, R: Any, gamma: float, order: Order | None) -> tuple[Outcomes, Float[Tensor, "S A K"] | None]:
+    """The outcomes of transitions and rewards in one of the forms above, in float64; and the reward of each outcome,
+    where those of one (s, a) differ.
 
     Args:
         order: which axis comes first; None: the one that the shape tells.
@@ -69,10 +71,11 @@ def outcomes_from(P: Any, R: Any, gamma: float, order: Order | None) -> Outcomes
         P, order = _state_first(P, order)
         table = _from_dense(P)
     table = table._replace(prob_SAK=normalised(table.prob_SAK))
-    reward_SA = _rewards(R, table, order)
-    prob = torch.from_numpy(table.prob_SAK)
+    reward_SA, reward_SAK = _rewards(R, table, order)
+    prob, child = torch.from_numpy(table.prob_SAK), torch.from_numpy(table.child_SAK)
     discount = torch.tensor(float(gamma), dtype=torch.float64).expand(prob.shape)
-    return Outcomes(torch.from_numpy(reward_SA), prob, discount, torch.from_numpy(table.child_SAK), len(prob))
+    outcomes = Outcomes(torch.from_numpy(reward_SA), prob, discount, child, len(prob))
+    return outcomes, None if reward_SAK is None else torch.from_numpy(reward_SAK)
 
 
 def _is_sparse_list(P: Any) -> bool:
@@ -117,17 +120,17 @@ def _check_told(name: str, array: Any, order: Order | None) -> None:
         )
 
 
-def _from_dense(P: Float[np.ndarray, "S A S"]) -> Table:
+def _from_dense(P: Float[np.ndarray, "S A S"]) -> _Table:
     off = (P < 0) | ~np.isfinite(P)
     if off.any():
         s, a, t = np.argwhere(off)[0]
         raise PgtsError(f"P_SAS[{s}, {a}, {t}] is {P[s, a, t]}; probabilities are finite and at least 0")
     K = max(1, int((P > 0).sum(-1).max()))
     child = np.argsort(P == 0, axis=-1, kind="stable")[..., :K]
-    return Table(np.take_along_axis(P, child, axis=-1), child)
+    return _Table(np.take_along_axis(P, child, axis=-1), child)
 
 
-def _from_sparse(matrices: Sequence[Any]) -> Table:
+def _from_sparse(matrices: Sequence[Any]) -> _Table:
     S = matrices[0].shape[0]
     rows = [_csr(f"P[{a}]", matrix, S) for a, matrix in enumerate(matrices)]
     for a, matrix in enumerate(rows):
@@ -151,7 +154,7 @@ def _from_sparse(matrices: Sequence[Any]) -> Table:
         state = np.repeat(np.arange(S), count_AS[a])  # of each stored entry, and its place k in its row
         k = np.arange(matrix.nnz) - np.repeat(matrix.indptr[:-1], count_AS[a])
         prob[state, a, k], child[state, a, k] = matrix.data, matrix.indices
-    return Table(prob, child)
+    return _Table(prob, child)
 
 
 def _csr(name: str, matrix: Any, num_states: int) -> Any:
@@ -163,21 +166,20 @@ def _csr(name: str, matrix: Any, num_states: int) -> Any:
     return copy
 
 
-def _rewards(R: Any, table: Table, order: Order) -> Float[np.ndarray, "S A"]:
-    """Expected rewards."""
+def _rewards(R: Any, table: _Table, order: Order) -> tuple[Float[np.ndarray, "S A"], Float[np.ndarray, "S A K"] | None]:
+    """Expected rewards; and those of outcomes, where they differ."""
     S, A, _ = table.prob_SAK.shape
     if _is_sparse_list(R):
         if order != "ASS" or len(R) != A:
             raise PgtsError(f"R is a list of {len(R)} matrices; that needs P in the order 'ASS' with {len(R)} actions")
-        return _expected(
-            np.stack([_entries(_csr(f"R[{a}]", R[a], S), table.child_SAK[:, a]) for a in range(A)], 1), table
-        )
+        matrices = [_csr(f"R[{a}]", matrix, S) for a, matrix in enumerate(R)]
+        return _expected(np.stack([_entries(R, table.child_SAK[:, a]) for a, R in enumerate(matrices)], 1), table)
     R = np.asarray(R, dtype=np.float64)
     if R.shape == (S, A):
-        return R.copy()
+        return R.copy(), None
     if R.shape == (S,):
-        return np.repeat(R[:, None], A, axis=1)
-    if R.ndim == 3 and R.shape == ((S, A, S) if order == "SAS" else (A, S, S)):
+        return np.repeat(R[:, None], A, axis=1), None
+    if R.shape == ((S, A, S) if order == "SAS" else (A, S, S)):
         by_state = R if order == "SAS" else R.swapaxes(0, 1)
         return _expected(np.take_along_axis(by_state, table.child_SAK, axis=-1), table)
     raise PgtsError(
@@ -197,9 +199,15 @@ def _entries(matrix: Any, child_SK: Int[np.ndarray, "S K"]) -> Float[np.ndarray,
     return np.where(stored[place] == wanted, matrix.data[place], 0.0)
 
 
-def _expected(reward_SAK: Float[np.ndarray, "S A K"], table: Table) -> Float[np.ndarray, "S A"]:
-    """The mean over outcomes, counted from the first, so that equal rewards have exactly this mean."""
+def _expected(
+    reward_SAK: Float[np.ndarray, "S A K"], table: _Table
+) -> tuple[Float[np.ndarray, "S A"], Float[np.ndarray, "S A K"] | None]:
+    """The means over outcomes, and the rewards themselves where outcomes differ in them."""
     possible = table.prob_SAK > 0
     first = np.take_along_axis(reward_SAK, possible.argmax(-1)[..., None], axis=-1)
-    with np.errstate(invalid="ignore"):  # what is not finite is refused by the MDP
-        return first[..., 0] + np.where(possible, table.prob_SAK * (reward_SAK - first), 0.0).sum(-1)
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused by the MDP
+        # Counted from the first reward, so that equal rewards have exactly this mean.
+        above = np.where(possible, table.prob_SAK * (reward_SAK - first), 0.0).sum(-1, keepdims=True)
+        reward_SAK = np.where(possible, reward_SAK, first + above)
+    differ = (possible & (reward_SAK != first)).any()
+    return (first + above)[..., 0], reward_SAK if differ else None

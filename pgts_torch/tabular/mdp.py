@@ -15,8 +15,7 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.tabular import npz
-from pgts_torch.tabular.forms import EXACT as ROW_SUM_TOLERANCE
-from pgts_torch.tabular.forms import Order, normalised, outcomes_from
+from pgts_torch.tabular.forms import EXACT, STORED, Order, normalised, outcomes_from
 
 MEAN_TOLERANCE = 1e-8
 """How far the mean of the rewards of outcomes may be from r(s, a), as a share of the largest of them."""
@@ -100,8 +99,8 @@ class TabularMDP:
             PgtsError: as the class; or no such forms, or an order that nothing tells.
         """
         check_gamma(gamma)
-        outcomes = outcomes_from(P, R, gamma, order)
-        return cls(outcomes, start_distribution(start, outcomes.num_states))
+        outcomes, reward_SAK = outcomes_from(P, R, gamma, order)
+        return cls(outcomes, start_distribution(start, outcomes.num_states), reward_SAK=reward_SAK)
 
     @classmethod
     def from_transitions(
@@ -117,7 +116,8 @@ class TabularMDP:
 
         A successor that is listed twice is counted twice; with two rewards it is two outcomes. A terminated transition
         has discount 0. A state that, as far as `start` reaches it at all, is entered only by terminated transitions is
-        terminal: nothing is earned from it, whatever its own rows say.
+        terminal: nothing is earned from it, whatever its own rows say. Rounded rows are divided by their sums, as in
+        `from_dense`.
 
         Args:
             P: transitions for states 0..S-1 and actions 0..A-1.
@@ -262,6 +262,10 @@ def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> _Row:
             expected_reward += float(p) * (float(reward) - first_reward)
     if not successors:
         raise PgtsError(f"P[{s}][{a}] has no outcome with positive probability")
+    total = sum(successors.values())
+    if EXACT < abs(total - 1) <= STORED:  # as `normalised` does
+        expected_reward = first_reward + (expected_reward - first_reward) / total
+        successors = {key: p / total for key, p in successors.items()}
     return expected_reward, successors
 
 
@@ -287,7 +291,7 @@ def _check_start(start_S: Tensor, num_states: int) -> None:
     off = torch.nonzero(~torch.isfinite(start_S) | (start_S < 0)).flatten()
     if len(off):
         raise PgtsError(f"start_S[{off[0]}] is {start_S[off[0]]}; probabilities are finite and at least 0")
-    if abs(float(start_S.sum()) - 1) > ROW_SUM_TOLERANCE:
+    if abs(float(start_S.sum()) - 1) > EXACT:
         raise PgtsError(f"start_S is not a distribution: it sums to {float(start_S.sum())}")
 
 
@@ -329,12 +333,12 @@ def _check_outcomes(outcomes: Outcomes) -> None:
             raise PgtsError(f"{name} is {tensor.dtype}; the exact world is float64")
     _refuse(~torch.isfinite(reward), lambda s, a: f"R_SA[{s}, {a}] is {reward[s, a]}; rewards must be finite")
     _refuse(
-        ~((prob >= 0) & (prob <= 1 + ROW_SUM_TOLERANCE)).all(-1),
+        ~((prob >= 0) & (prob <= 1 + EXACT)).all(-1),
         lambda s, a: f"P_SAS[{s}, {a}] has probabilities {prob[s, a].tolist()}; each must be in [0, 1]",
     )
     total = prob.sum(-1)
     _refuse(
-        (total - 1).abs() > ROW_SUM_TOLERANCE,
+        (total - 1).abs() > EXACT,
         lambda s, a: f"P_SAS[{s}, {a}] is not a distribution: it sums to {float(total[s, a]):.10g}",
     )
     discount = outcomes.discount_NAK
