@@ -3,10 +3,12 @@
 import os
 import signal
 import socket
+import subprocess
 import tempfile
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -14,27 +16,55 @@ from typing import Any
 import torch
 from torch import distributed
 
-PATIENCE = timedelta(seconds=180)
+PATIENCE = 120
+"""Seconds that a child may take: more than it needs on a busy machine, and less than the time limit of a test."""
+
+AS_IN_A_TERMINAL = {
+    signal.SIGHUP: signal.SIG_DFL,  # nohup ignores it
+    signal.SIGINT: signal.default_int_handler,  # a shell without job control ignores it in what it starts with `&`
+    signal.SIGALRM: signal.SIG_DFL,  # pytest-timeout has it
+}
 
 
 def forked(works: list[Callable[[], int]]) -> list[int]:
     """The exit codes of processes that do these things at the same time; minus the signal that killed one."""
-    children = []
-    for work in works:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads: it needs none of them
-            pid = os.fork()
-        if pid == 0:
-            code = 70
-            signal.alarm(int(PATIENCE.total_seconds()))  # ends a process that waits for another one in vain
-            try:
-                code = work()
-            except BaseException:
-                traceback.print_exc()
-            finally:
-                os._exit(code)
-        children.append(pid)
-    return [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in children]
+    children = [_forked(work) for work in works]
+    try:
+        return [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in children]
+    except BaseException:  # the test has run out of time
+        for pid in children:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        raise
+
+
+def _forked(work: Callable[[], int]) -> int:
+    """The id of a process that does this, and hears signals as one that was started in a terminal."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads: it needs none of them
+        pid = os.fork()
+    if pid == 0:
+        code = 70
+        for number, handler in AS_IN_A_TERMINAL.items():
+            signal.signal(number, handler)
+        signal.alarm(PATIENCE)  # ends a process that waits for another one in vain
+        try:
+            code = work()
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    return pid
+
+
+@contextmanager
+def started(command: list[str], **options: Any) -> Iterator["subprocess.Popen[str]"]:
+    """A command whose stderr is read; it does not outlive the context, however that is left."""
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()  # nothing where it has ended
 
 
 def in_child(work: Callable[[], int]) -> int:
@@ -47,9 +77,9 @@ def on_ranks(size: int, work: Callable[[], Any]) -> list[Any]:
     with tempfile.TemporaryDirectory() as folder:
 
         def joined(rank: int) -> int:
-            distributed.init_process_group(
-                "gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=size, timeout=PATIENCE
-            )
+            patience, meeting = timedelta(seconds=PATIENCE), f"file://{folder}/meeting"
+            distributed.init_process_group("gloo", meeting, patience, world_size=size, rank=rank)
+            distributed.barrier()  # nobody leaves while another one still connects
             torch.save(work(), Path(folder) / str(rank))
             distributed.destroy_process_group()
             return 0

@@ -101,6 +101,7 @@ FAULTS: dict[str, dict[str, str]] = {
         "SIGTERM": "the iteration is finished and saved, exit code 143",
         "Ctrl-C": "the iteration is finished and saved, exit code 130",
         "second Ctrl-C": "the process ends at once, exit code 130; the last checkpoint leads to the same bits",
+        "closed terminal": "as after SIGTERM, exit code 129; under `nohup` the run goes on",
         "second process in a run folder": "told the id of the first, exit code 2",
         "finished run": "says so, exit code 2; `--run.overwrite` starts anew",
         "folder that holds something else": "left as it is, exit code 2",

@@ -120,8 +120,8 @@ def joined_ranks(device: str) -> Iterator[Ranks]:
     distributed.init_process_group("gloo")
     try:
         ranks = present_ranks()
-        if device == "cuda":
-            ranks.gather("a GPU", _take_gpu)
+        # They meet here: who leaves while another one still connects breaks that connection.
+        ranks.gather("a device", _take_gpu if device == "cuda" else lambda: None)
         yield ranks
     finally:
         distributed.destroy_process_group()

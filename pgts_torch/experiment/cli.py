@@ -52,7 +52,7 @@ def main(arguments: Arguments | None = None) -> int:
     Returns:
         The exit code: 0; 1 if `check-model` found something missing, a run of a sweep failed or a number in training
         was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C, 143
-        after SIGTERM.
+        after SIGTERM, 129 after SIGHUP.
     """
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by whoever started us: what is said goes nowhere

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import final
 
 from pgts_torch.errors import Stopped
-from pgts_torch.experiment.signals import SIGNALS, StopFlag
+from pgts_torch.experiment.signals import StopFlag
 
 _POLL = 0.05
 """Seconds from one look at the processes to the next."""
@@ -35,9 +35,7 @@ def train_all(trainings: Mapping[str, Sequence[str]], *, jobs: int) -> dict[str,
     """
     failures: dict[str, str] = {}
     waiting, running, finished = deque(trainings.items()), list[_Training](), 0
-    # A shell lets commands that are to outlive it ignore SIGHUP.
-    signals = SIGNALS if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (*SIGNALS, signal.SIGHUP)
-    with StopFlag(signals, at_once=lambda: _kill(running)) as stop:
+    with StopFlag(at_once=lambda: _kill(running)) as stop:
         try:
             while running or (waiting and stop.signal is None):
                 while waiting and len(running) < jobs and stop.signal is None:
@@ -69,11 +67,11 @@ class _Training:
     def __init__(self, name: str, arguments: Sequence[str]) -> None:
         self.name = name
         self._started, self._asked = time.perf_counter(), False
-        self._complaints = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 (outlives this)
+        self.complaints = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 (outlives this)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "pgts_torch.experiment.cli", "train", *arguments],
             stdout=subprocess.DEVNULL,
-            stderr=self._complaints,
+            stderr=self.complaints,
             env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
             process_group=0,
         )
@@ -89,9 +87,9 @@ class _Training:
 
     def outcome(self) -> tuple[int, float, str]:
         """The exit code, seconds, and the last line that it wrote to stderr."""
-        self._complaints.seek(0)
-        code, lines = self.process.returncode, self._complaints.read().strip().splitlines()
-        self._complaints.close()
+        self.complaints.seek(0)
+        code, lines = self.process.returncode, self.complaints.read().strip().splitlines()
+        self.complaints.close()
         last = f"killed by the signal {-code}" if code < 0 else (lines or [f"exit code {code}"])[-1]
         return code, time.perf_counter() - self._started, last.removeprefix("error: ")
 
@@ -102,3 +100,4 @@ def _kill(trainings: Sequence[_Training]) -> None:
         each.process.kill()
     for each in trainings:
         each.process.wait()
+        each.complaints.close()

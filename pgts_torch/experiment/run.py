@@ -99,7 +99,7 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
         Failed: the environment failed in training; where stands in failure.json.
         NotFinite: training met a number that is not finite; which and where stands in failure.json, too.
         ModelMismatch: the environment contradicted its model; what happened stands in failure.json.
-        Stopped: SIGTERM or SIGINT came; the iteration was finished and saved.
+        Stopped: SIGTERM, SIGINT or SIGHUP came; the iteration was finished and saved.
         RankLost: another process is gone; the last checkpoint is what remains.
     """
     torch.set_num_threads(config.threads)

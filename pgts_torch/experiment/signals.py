@@ -3,38 +3,42 @@
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any, Self, final
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT)
+_HANG_UP = getattr(signal, "SIGHUP", None)
+"""The terminal is gone; None where the platform has no such signal."""
 
 
 @final
 class StopFlag:
     """Remembers the first signal; a second one ends the process at once, with exit code 128 + signal.
 
+    Heard are SIGTERM, SIGINT and, unless it is ignored (as under nohup), SIGHUP. A second SIGHUP changes nothing: a
+    terminal that closes may send two.
+
     Use it as a context: leaving it restores what the signals did before. Outside the main thread, where Python hears
     no signals, it remembers nothing.
 
     Args:
-        signals: which are heard.
         at_once: called before a second one ends the process.
 
     Attributes:
         signal: the number of the first one; None: there was none.
     """
 
-    def __init__(
-        self, signals: Iterable[signal.Signals] = SIGNALS, *, at_once: Callable[[], object] = lambda: None
-    ) -> None:
+    def __init__(self, *, at_once: Callable[[], object] = lambda: None) -> None:
         self.signal: int | None = None
-        self._signals, self._at_once = tuple(signals), at_once
+        self._at_once = at_once
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
-            self._before = {each: signal.signal(each, self._hear) for each in self._signals}
+            heard = [signal.SIGTERM, signal.SIGINT]
+            if _HANG_UP is not None and signal.getsignal(_HANG_UP) is not signal.SIG_IGN:
+                heard.append(_HANG_UP)
+            self._before = {each: signal.signal(each, self._hear) for each in heard}
         return self
 
     def __exit__(
@@ -44,7 +48,8 @@ class StopFlag:
             signal.signal(each, handler)
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:
+        if self.signal is None:
+            self.signal = number
+        elif number != _HANG_UP:
             self._at_once()
             os._exit(128 + number)
-        self.signal = number

@@ -1,6 +1,7 @@
 """Processes that train together: what they exchange, and that their update is that of one with the whole batch."""
 
 import os
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -9,14 +10,15 @@ from typing import Any
 import pytest
 import torch
 from gymnasium import spaces
+from torch import distributed
 
 from pgts_torch import PGTS
 from pgts_torch.agent import pgts
 from pgts_torch.agent.callbacks import EvalCallback
-from pgts_torch.agent.ranks import Ranks, checksum, present_ranks
+from pgts_torch.agent.ranks import Ranks, checksum, joined_ranks, present_ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import NotFinite, PgtsError, RankLost
-from tests.forks import on_ranks
+from tests.forks import launched, on_ranks
 from tests.models.corridors import Corridor
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -277,3 +279,21 @@ def test_a_checksum_sees_every_bit():
     other = {"a": torch.zeros(3), "b": {"c": torch.tensor([1, 1 + 2**-52], dtype=torch.float64)}}
     assert checksum(state) != checksum(other)
     assert checksum(state) == checksum({"b": state["b"], "a": state["a"]})
+
+
+def test_a_process_leaves_the_group_only_when_all_have_connected(tmp_path, monkeypatch):
+    connect = distributed.init_process_group
+
+    def connect_slowly(*args: Any, **kwargs: Any) -> None:
+        connect(*args, **kwargs)
+        if os.environ["RANK"] == "1":
+            time.sleep(0.5)
+            (tmp_path / "connected").touch()
+
+    def work() -> int:
+        with joined_ranks("cpu"):
+            pass
+        return int(not (tmp_path / "connected").exists())
+
+    monkeypatch.setattr(distributed, "init_process_group", connect_slowly)
+    assert launched(2, work) == [0, 0]

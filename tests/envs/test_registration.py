@@ -15,6 +15,7 @@ import pgts_torch
 from pgts_torch import tabular
 from pgts_torch.envs import TabularEnv, TabularVectorEnv
 from pgts_torch.errors import PgtsError
+from tests.forks import PATIENCE
 
 TIME_LIMITS = {
     "pgts/Ladder-v0": 100,
@@ -28,7 +29,9 @@ IDS = list(TIME_LIMITS)
 
 def test_importing_the_package_registers_the_environments_without_torch():
     code = "import sys, gymnasium, pgts_torch; print('torch' in sys.modules, 'pgts/Ladder-v0' in gymnasium.registry)"
-    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    printed = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PATIENCE
+    ).stdout
     assert printed.split() == ["False", "True"]
 
 

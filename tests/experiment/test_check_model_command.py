@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from pgts_torch.experiment.cli import main
+from tests.forks import PATIENCE
 
 HELP = "(see pgts check-model --help)"
 
@@ -129,7 +130,9 @@ sys.exit(3 if "torch" in sys.modules else 0)
 
 
 def test_help_and_mistakes_do_not_wait_for_torch(tmp_path):
-    done = subprocess.run([sys.executable, "-c", TORCH_FREE], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", TORCH_FREE], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -19,6 +19,7 @@ from pgts_torch.experiment.cli import COMMANDS, main
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.schema import Schema
+from tests.forks import PATIENCE, started
 
 ROOT = Path(__file__).parents[2]
 
@@ -233,7 +234,7 @@ def _default_in(text: str, key: str, requirement: str) -> str:
 @pytest.fixture
 def shell(tmp_path: Path) -> Callable[..., "subprocess.CompletedProcess[str]"]:
     def call(*command: str) -> "subprocess.CompletedProcess[str]":
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
     return call
 
@@ -264,9 +265,9 @@ def test_train_py_is_pgts_train(shell: Callable[..., "subprocess.CompletedProces
 @pytest.mark.fault("reader that leaves early")
 def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pgts_torch.experiment.cli", "train", "--help"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with started(command, cwd=tmp_path, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stderr is not None
         process.stdout.close()
         assert process.stderr.read() == ""
-    assert process.returncode == 141
+        assert process.wait(PATIENCE) == 141

@@ -37,6 +37,7 @@ from pgts_torch.seeding import numpy_stream
 from pgts_torch.tabular import ascent, exact, mirage, stationary
 from pgts_torch.tabular import grid as make_grid
 from pgts_torch.tabular import ladder as make_ladder
+from tests.forks import PATIENCE
 from tests.support import ZOO, always, random_policy, right_with, zoo
 
 LEFT, RIGHT = 0, 1
@@ -525,7 +526,9 @@ def test_mistakes_and_help_do_not_wait_for_torch(tmp_path):
         "import sys; from pgts_torch.experiment.cli import main; main(['figures', '--help']); "
         "main(['figures', '--only', 'x']); sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", source], cwd=tmp_path, capture_output=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", source], cwd=tmp_path, capture_output=True, timeout=PATIENCE, check=False
+    )
     assert done.returncode == 0
     assert list(tmp_path.iterdir()) == []
 

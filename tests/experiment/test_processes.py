@@ -3,7 +3,6 @@
 import os
 import resource
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -17,7 +16,7 @@ from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.tracking import read_metrics
 from tests import reliability
 from tests.experiment.runs import arguments, left, train_under_fire
-from tests.forks import in_child
+from tests.forks import PATIENCE, in_child, started
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -112,17 +111,30 @@ def test_after_kills_while_a_checkpoint_is_written_the_one_before_is_intact(kill
         reliability.record("kills while a checkpoint is written", kills=kills, checkpoints_lost=0)
 
 
-@pytest.mark.fault("SIGTERM", "Ctrl-C")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_signal_finishes_the_iteration_saves_and_says_how_to_go_on(number, code, whole, tmp_path, capfd):
+@pytest.mark.fault("SIGTERM", "Ctrl-C", "closed terminal")
+@pytest.mark.parametrize(
+    ("numbers", "code"),
+    [((signal.SIGTERM,), 143), ((signal.SIGINT,), 130), ((signal.SIGHUP, signal.SIGHUP), 129)],
+)
+def test_a_signal_finishes_the_iteration_saves_and_says_how_to_go_on(numbers, code, whole, tmp_path, capfd):
     folder = tmp_path / "run"
-    assert signalled(folder, number) == code
+    assert signalled(folder, *numbers) == code
     _, notes, _ = checkpoint.newest(folder, strict=True)
     assert notes.iterations == 3
     assert read_metrics(folder)[-1]["step"] == notes.env_steps
     assert f"stopped at step {notes.env_steps}; `pgts train --resume {folder}` goes on\n" in capfd.readouterr().err
     assert training(folder) == 0
     assert left(folder) == whole[0]
+
+
+@pytest.mark.fault("closed terminal")
+def test_under_nohup_a_training_outlives_its_terminal(whole, tmp_path):
+    def work() -> int:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        return train_under_fire(tmp_path / "run", signal.SIGHUP)
+
+    assert in_child(work) == 0
+    assert left(tmp_path / "run") == whole[0]
 
 
 @pytest.mark.fault("second Ctrl-C")
@@ -161,11 +173,11 @@ def test_a_file_that_cannot_grow_is_one_line_and_with_more_room_the_run_goes_on(
 @pytest.mark.fault("SIGTERM")
 def test_the_command_stops_at_a_signal_and_goes_on(tmp_path):
     command = [sys.executable, "train.py", *arguments(tmp_path / "run")[1:], "--total_steps", "100000"]
-    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+    with started(command, cwd=ROOT) as process:
         while not checkpoint.listed(tmp_path / "run"):
             assert process.poll() is None
             time.sleep(0.05)
         process.terminate()
-        assert "goes on" in process.communicate()[1]
-    assert process.returncode == 143
+        assert "goes on" in process.communicate(timeout=PATIENCE)[1]
+        assert process.returncode == 143
     assert main(["train", "--resume", str(tmp_path / "run"), "--total_steps", "300"]) == 2  # another configuration

@@ -16,6 +16,7 @@ from pgts_torch.experiment import stationary
 from pgts_torch.experiment.cli import STATIONARY_OPTIONS, main
 from pgts_torch.tabular import deep_sea, exact, grid, ladder, random_mdp, tightrope
 from pgts_torch.tabular import stationary as theory
+from tests.forks import PATIENCE
 
 LADDER = """\
 5 states, 2 actions, 32 deterministic policies
@@ -198,7 +199,9 @@ sys.exit(3 if "torch" in sys.modules else 0)
 
 
 def test_help_and_mistakes_do_not_wait_for_torch(tmp_path):
-    done = subprocess.run([sys.executable, "-c", TORCH_FREE], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", TORCH_FREE], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -12,6 +12,7 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import progress, run
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.tracking import read_metrics, versions
+from tests.forks import PATIENCE
 
 FEW = ["--total_steps=400", "--rollout.num_envs=4", "--rollout.horizon.length=15", "--eval.episodes=1"]
 BARE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
@@ -27,7 +28,7 @@ def started(folder: Path, redirections: str, *arguments: str) -> "subprocess.Com
         stdin=subprocess.DEVNULL,
         capture_output=True,
         encoding="ascii",
-        timeout=60,
+        timeout=PATIENCE,
         start_new_session=True,
         check=False,
     )

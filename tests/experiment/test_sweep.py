@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import dump
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.tracking import RunLock
-from tests.forks import in_child
+from tests.forks import PATIENCE, in_child, started
 
 HELP = "(see pgts sweep --help)"
 SMALL = ["--total_steps", "60", "--rollout.num_envs", "3", "--rollout.horizon.length", "10", "--eval.episodes", "2"]
@@ -97,9 +97,9 @@ def test_a_folder_with_a_run_of_another_configuration_is_refused_also_where_it_i
 
 
 def until(done: Callable[[], bool]) -> None:
-    started = time.monotonic()
+    begun = time.monotonic()
     while not done():
-        assert time.monotonic() - started < 120
+        assert time.monotonic() - begun < PATIENCE
         time.sleep(0.02)
 
 
@@ -114,11 +114,11 @@ def test_a_sweep_that_is_stopped_saves_and_the_same_command_ends_with_the_table_
     arguments = ["sweep", "--out", "out", "--depths", "1", "--seeds", "2", "--jobs", "2", *SMALL, *long]
     folders = [Path("out/depth-1/seed-0"), Path("out/depth-1/seed-1")]
     command = [sys.executable, "-m", "pgts_torch.experiment.cli", *arguments]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    with started(command) as process:
         until(lambda: any(map(checkpoint.listed, folders)))
         process.terminate()
-        assert "stopped: 0 of 2 runs are done; the same command goes on\n" in process.communicate()[1]
-    assert process.returncode == 143
+        assert "stopped: 0 of 2 runs are done; the same command goes on\n" in process.communicate(timeout=PATIENCE)[1]
+        assert process.returncode == 143
     assert not any((folder / "summary.json").exists() for folder in folders)
     for folder in folders:
         RunLock(folder).__exit__(None, None, None)  # nobody has it any more
@@ -161,7 +161,16 @@ def lines(path: Path) -> list[str]:
     return path.read_text().split() if path.exists() else []
 
 
-@pytest.mark.fault("SIGTERM", "Ctrl-C")
+@pytest.fixture
+def hang_ups() -> Iterator[None]:
+    """SIGHUP is heard, also where pytest runs under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("hang_ups")
+@pytest.mark.fault("SIGTERM", "Ctrl-C", "closed terminal")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_to_a_sweep_asks_each_run_once_to_end_and_begins_no_other(number, trainer, capsys):
     pids = trainer("echo asked >> pids; sleep 0.3; exit 143")
@@ -283,6 +292,8 @@ sys.exit(3 if "torch" in sys.modules else 0)
 
 
 def test_help_and_mistakes_do_not_wait_for_torch(here):
-    done = subprocess.run([sys.executable, "-c", TORCH_FREE], cwd=here, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", TORCH_FREE], cwd=here, capture_output=True, text=True, timeout=PATIENCE
+    )
     assert done.returncode == 0, done.stderr
     assert max(map(len, done.stdout.splitlines())) < 80

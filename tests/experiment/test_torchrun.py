@@ -18,7 +18,7 @@ from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.search.lookahead import check_finite
 from tests.experiment.runs import SHORT, SMALL, arguments, left, train_under_fire
-from tests.forks import launched
+from tests.forks import PATIENCE, launched
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -132,7 +132,7 @@ def test_a_number_that_is_not_finite_in_the_second_process_stops_both_and_is_wri
 def test_torchrun_trains(tmp_path):
     folder = tmp_path / "run"
     command = ["-m", "torch.distributed.run", "--nproc-per-node=2", "train.py", *arguments(folder)[1:], "--json"]
-    made = subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True)
+    made = subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert made.returncode == 0, made.stderr
     assert json.loads(made.stdout)["env_steps"] == read_metrics(folder)[-1]["step"]
 
