@@ -11,7 +11,19 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "pgts_torch"
 
-ROOMS = ["errors", "bellman", "seeding", "tabular", "envs", "models", "search", "agent", "pgts_torch", "experiment"]
+ROOMS = [
+    "errors",
+    "files",
+    "bellman",
+    "seeding",
+    "tabular",
+    "envs",
+    "models",
+    "search",
+    "agent",
+    "pgts_torch",
+    "experiment",
+]
 """Each may import itself and what stands before it; "pgts_torch" is `__init__.py`, the public face of the rooms."""
 
 

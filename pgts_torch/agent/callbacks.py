@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
 
+from pgts_torch.agent import saving
 from pgts_torch.agent.evaluate import Evaluation, Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.optimisers import check_count
@@ -41,7 +42,7 @@ class EvalCallback:
         stop_at_return: the training ends once the mean return is at least this; None: it does not.
 
     Raises:
-        PgtsError: an option out of range.
+        PgtsError: an option out of range, or a file at `best_path` that is no saved model.
 
     Attributes:
         history: the evaluations so far.
@@ -62,6 +63,8 @@ class EvalCallback:
         check_count("episodes", episodes)
         if stop_at_return is not None and not math.isfinite(stop_at_return):
             raise PgtsError(f"stop_at_return is {stop_at_return}; it must be finite")
+        if best_path is not None:
+            saving.target(best_path)
         self.every, self.episodes, self.deterministic, self.seed = every, episodes, deterministic, seed
         self.best_path, self.stop_at_return = best_path, stop_at_return
         self.history: list[Evaluated] = []

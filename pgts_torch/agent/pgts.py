@@ -382,10 +382,11 @@ class PGTS:
         call it, and the first one writes.
 
         Raises:
-            PgtsError: a part was given as an object, so that no file can describe it, or an argument is no plain value.
+            PgtsError: a part was given as an object, so that no file can describe it, or an argument is no plain value;
+                or there is a file that is no saved model: that stays.
         """
         content = self.content()
-        self.ranks.first("a saved model", lambda: saving.write(path, content))
+        self.ranks.first("a saved model", lambda: saving.write(saving.target(path), content))
 
     def content(self) -> dict[str, Any]:
         """What `save` writes: the arguments and the state. Of several processes all must ask for it."""

@@ -1,21 +1,25 @@
 """One file that knows whether it is whole: a checksum, then tensors and plain values."""
 
-import contextlib
 import hashlib
 import io
-import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from pgts_torch import files
 from pgts_torch.errors import PgtsError
 
-PARTIAL = ".partial"
-"""The end of the name of a file, or a folder, that is being written."""
-
-_MAGIC = b"pgts_torch 3\n"
+_NAME = b"pgts_torch "
+_MAGIC = _NAME + b"3\n"
 _DIGEST = hashlib.sha256().digest_size
+
+
+def target(path: str | Path) -> Path:
+    """Where a model may be written; PgtsError where a file is that is no saved model."""
+    is_model: Callable[[bytes], bool] = lambda raw: raw == _NAME  # noqa: E731
+    return files.target(path, is_model, "a model that pgts_torch has saved", most=len(_NAME))
 
 
 def write(path: str | Path, content: dict[str, Any]) -> None:
@@ -28,28 +32,7 @@ def write(path: str | Path, content: dict[str, Any]) -> None:
     torch.save(content, buffer)
     payload = buffer.getvalue()
     _parse(payload, path)  # what could not be read again must not replace what can
-    replace(path, _MAGIC + hashlib.sha256(payload).digest() + payload)
-
-
-def replace(path: str | Path, raw: bytes) -> None:
-    """Write a file, to the disk; whoever reads `path` meanwhile finds the old file or the new one.
-
-    Raises:
-        PgtsError: it cannot be written; then nothing has changed.
-    """
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
-    try:
-        with partial.open("wb") as file:
-            file.write(raw)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError as error:
-        raise PgtsError(f"{path} cannot be written: {error.strerror}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+    files.replace(path, _MAGIC + hashlib.sha256(payload).digest() + payload)
 
 
 def read(path: str | Path) -> dict[str, Any]:
@@ -58,11 +41,7 @@ def read(path: str | Path) -> dict[str, Any]:
     Raises:
         PgtsError: no such file, not one of ours, or damaged.
     """
-    try:
-        raw = Path(path).read_bytes()
-    except OSError as error:
-        raise PgtsError(f"{path} cannot be read: {error.strerror}") from error
-    return decode(raw, path)
+    return decode(files.read(path), path)
 
 
 def decode(raw: bytes, path: str | Path) -> dict[str, Any]:

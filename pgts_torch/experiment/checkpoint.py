@@ -4,22 +4,31 @@
 puts the directory in its place. The manifest is sealed by a SHA-256 of its own.
 """
 
-import hashlib
-import json
 import os
-import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pgts_torch import files
 from pgts_torch.agent import saving
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.ownership import (
+    CHECKPOINTS,
+    MANIFEST_FILE,
+    MODEL_FILE,
+    digest,
+    read_mark,
+    remove_checkpoint,
+    remove_partial,
+    sealed,
+    unsealed,
+    write_mark,
+)
+from pgts_torch.experiment.ownership import checkpoints as listed
 
-CHECKPOINTS = "checkpoints"
-MODEL_FILE, MANIFEST_FILE = "model.pt", "manifest.json"
 _FORMAT = 2
 
 
@@ -62,28 +71,35 @@ def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
     def put() -> None:
         _put(path, content, notes)
         tidy(run, path, keep=keep)
+        if (mark := read_mark(run)) is not None and not mark.has_checkpoints:
+            write_mark(run, replace(mark, has_checkpoints=True))
 
     algorithm.ranks.first("a checkpoint", put)
     return path
 
 
 def _put(path: Path, content: dict[str, Any], notes: Notes) -> None:
-    partial = path.with_name(f".{path.name}{saving.PARTIAL}")
+    partial = path.with_name(f".{path.name}{files.PARTIAL}")
     try:
         path.parent.mkdir(exist_ok=True)
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_checkpoint(partial)
         partial.mkdir()
         saving.write(partial / MODEL_FILE, content)
-        files = {MODEL_FILE: hashlib.sha256((partial / MODEL_FILE).read_bytes()).hexdigest()}
-        saving.replace(partial / MANIFEST_FILE, _sealed({"format": _FORMAT, "files": files, "notes": asdict(notes)}))
+        digests = {MODEL_FILE: digest((partial / MODEL_FILE).read_bytes())}
+        files.replace(partial / MANIFEST_FILE, sealed({"format": _FORMAT, "files": digests, "notes": asdict(notes)}))
         _sync(partial)
-        shutil.rmtree(path, ignore_errors=True)
-        partial.rename(path)
+        remove_checkpoint(path)
+        if files.kind(path) is None:
+            partial.rename(path)
+        else:  # somebody else's things are in it; without its manifest a checkpoint is damaged, so that comes last
+            for name in (MODEL_FILE, MANIFEST_FILE):
+                (partial / name).rename(path / name)
+            _sync(path)
         _sync(path.parent)
     except OSError as error:
         raise PgtsError(f"the checkpoint {path} cannot be written: {error.strerror}") from error
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_checkpoint(partial)
 
 
 def read(path: Path) -> tuple[Notes, dict[str, Any]]:
@@ -94,15 +110,15 @@ def read(path: Path) -> tuple[Notes, dict[str, Any]]:
         PgtsError: it is of another format.
     """
     try:
-        manifest, model = (path / MANIFEST_FILE).read_bytes(), (path / MODEL_FILE).read_bytes()
-    except OSError as error:
-        raise Damaged(f"the checkpoint {path} is damaged: {error.filename}: {error.strerror}") from error
-    content = _unsealed(manifest)
+        manifest, model = files.read(path / MANIFEST_FILE), files.read(path / MODEL_FILE)
+    except PgtsError as error:
+        raise Damaged(f"the checkpoint {path} is damaged: {error}") from error
+    content = unsealed(manifest)
     if content is None:
         raise Damaged(f"the checkpoint {path} is damaged: the checksum of {MANIFEST_FILE} does not fit")
     if content["format"] != _FORMAT:
         raise PgtsError(f"the checkpoint {path} has the format {content['format']}; this version reads {_FORMAT}")
-    if content["files"] != {MODEL_FILE: hashlib.sha256(model).hexdigest()}:
+    if content["files"] != {MODEL_FILE: digest(model)}:
         raise Damaged(f"the checkpoint {path} is damaged: the checksum of {MODEL_FILE} does not fit")
     return Notes(**content["notes"]), saving.decode(model, path / MODEL_FILE)
 
@@ -129,44 +145,20 @@ def newest(run: Path, *, strict: bool = False) -> tuple[Path, Notes, dict[str, A
     return None
 
 
-def listed(run: Path) -> list[Path]:
-    """The checkpoints of a run folder, oldest first, intact or not."""
-    return sorted(path for path in (run / CHECKPOINTS).glob("*") if path.name.isdecimal())
-
-
 def tidy(run: Path, last: Path, *, keep: int) -> None:
     """Remove all checkpoints but `last` and the newest before it, `keep` in all; those ahead of it are damaged. And
     what a process that was killed has left half written: nobody else may be writing."""
     kept = [path for path in listed(run) if path.name <= last.name][-keep:]
     for path in listed(run):
         if path not in kept:
-            shutil.rmtree(path, ignore_errors=True)
-    for folder in (run, run / CHECKPOINTS):
-        for path in folder.glob(f".*{saving.PARTIAL}"):
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
-
-
-def _sealed(content: Mapping[str, Any]) -> bytes:
-    """JSON that holds its own checksum; each content has one such text, so that no bit of it may differ."""
-    plain = json.dumps(content, sort_keys=True)
-    seal = hashlib.sha256(plain.encode()).hexdigest()
-    return (json.dumps({"content": content, "sha256": seal}, sort_keys=True, indent=1) + "\n").encode()
-
-
-def _unsealed(raw: bytes) -> dict[str, Any] | None:
-    """What was sealed; None if this is not exactly what `_sealed` made."""
-    try:
-        content = json.loads(raw)["content"]
-        return content if _sealed(content) == raw else None
-    except (ValueError, TypeError, KeyError, RecursionError):
-        return None
+            remove_checkpoint(path)
+    remove_partial(run)
 
 
 def _sync(folder: Path) -> None:
-    """Have the names in a folder on the disk."""
+    """Have the names in a folder on the disk; Windows does so by itself."""
+    if os.name == "nt":
+        return
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -10,12 +10,14 @@ from typing import Any
 
 from torch import Tensor
 
+from pgts_torch import files
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.loading import load
-from pgts_torch.experiment.tracking import CONFIG_FILE, METRICS_FILE, SUMMARY_FILE, versions
+from pgts_torch.experiment.ownership import CONFIG_FILE, METRICS_FILE, SUMMARY_FILE, Mark, digest
+from pgts_torch.experiment.tracking import versions
 
 FREE_SECTIONS = ("run", "log")
 FREE_KEYS = ("name", "eval.every", "eval.episodes", "eval.keep_best")
@@ -89,6 +91,24 @@ def find(
             "give --any-world-size for other bits"
         )
     return Start(path, notes, content["state"])
+
+
+def is_kept(config: Config, run: Path, mark: Mark) -> bool:
+    """Whether config.yaml in a run folder stays as it is, because somebody has edited it and it means the same.
+
+    Raises:
+        PgtsError: it was edited, and to write the configuration of this run would undo that.
+    """
+    path = run / CONFIG_FILE
+    if files.kind(path) is None or digest(files.read(path)) in mark.configs:
+        return False
+    try:
+        is_same = load(path).model_copy(update={"run": config.run}) == config
+    except PgtsError:
+        is_same = False
+    if not is_same:
+        raise PgtsError(f"{path} is not as a run has written it, and says something else than this one: move it away")
+    return True
 
 
 def resuming(run: str | Path, world_size: int) -> str:

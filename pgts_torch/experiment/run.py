@@ -2,8 +2,6 @@
 
 import json
 import math
-import os
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -14,38 +12,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pgts_torch.agent import saving
 from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.evaluate import Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.ranks import joined_ranks
-from pgts_torch.errors import Failed, ModelMismatch, NotFinite, PgtsError, Stopped, failure
+from pgts_torch.errors import Failed, ModelMismatch, NotFinite, Stopped, failure
 from pgts_torch.experiment import checkpoint, diagnostics
 from pgts_torch.experiment.checkpoint import Notes
-from pgts_torch.experiment.config import Config, dump
+from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import KINDS
+from pgts_torch.experiment.locking import RunLock
+from pgts_torch.experiment.opening import check_dir, claimed, opened
+from pgts_torch.experiment.ownership import BEST_FILE, FAILURE_FILE, SUMMARY_FILE
 from pgts_torch.experiment.pictures import policy_picture
 from pgts_torch.experiment.progress import Reporter
 from pgts_torch.experiment.resume import Start, find, flat, resuming
 from pgts_torch.experiment.sections import EvalConfig
 from pgts_torch.experiment.signals import StopFlag
 from pgts_torch.experiment.summary import EndedBy, Summary
-from pgts_torch.experiment.tracking import (
-    BEST_FILE,
-    CONFIG_FILE,
-    FAILURE_FILE,
-    SUMMARY_FILE,
-    VERSIONS_FILE,
-    Folder,
-    NoFolder,
-    RunFolder,
-    RunLock,
-    check_folder,
-    clear_folder,
-    event_writer,
-    versions,
-)
+from pgts_torch.experiment.tracking import Folder, NoFolder, event_writer, versions
 from pgts_torch.tabular import exact, stationary
 
 MOST_SECONDS = 60
@@ -106,56 +92,33 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
     if config.run.tensorboard:
         event_writer()
     with joined_ranks(config.device) as ranks, StopFlag() as stop, ExitStack() as held:
-        path = ranks.first("the run folder", lambda: _folder_of(config))
+        ranks.first("the run folder", lambda: check_dir(config))
         algorithm = ranks.together("the algorithm", lambda: build(config))
-        folder: Folder = NoFolder(path)
+        locks: list[RunLock] = []
 
-        def claim() -> Start | None:
-            held.enter_context(RunLock(path))
+        def claim() -> tuple[Path, Start | None]:
+            locks.append(held.enter_context(claimed(config)))
+            path = locks[0].path
             if config.run.overwrite:
-                return None
+                return path, None
             found = find(config, path, strict=strict_resume, world_size=ranks.size, any_world_size=any_world_size)
             if found is not None:
                 found.check(algorithm)
-            return found
+            return path, found
+
+        path, start = ranks.first("where to begin", claim)
+        if start is not None:
+            algorithm.load_state_dict(dict(start.state))
+        folder: Folder = NoFolder(path)
 
         def open_folder() -> None:
             nonlocal folder
-            folder = held.enter_context(_opened(config, path, start))
+            folder = held.enter_context(opened(config, locks[0], start))
 
-        start = ranks.first("where to begin", claim)
-        if start is not None:
-            algorithm.load_state_dict(dict(start.state))
         ranks.first("an open folder", open_folder)
         summary = _loop(config, algorithm, folder, start, stop)
         folder.text(SUMMARY_FILE, json.dumps(asdict(summary), indent=2) + "\n")
     return summary
-
-
-def _folder_of(config: Config) -> Path:
-    """The run folder, a new one if none is named; PgtsError if it cannot be one."""
-    if not config.run.dir and int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")):
-        raise PgtsError("run.dir is not set; torchrun --max-restarts needs it, so that a restart finds the run")
-    path = Path(config.run.dir) if config.run.dir else _new_folder(config)
-    check_folder(path)
-    return path
-
-
-def _opened(config: Config, path: Path, start: Start | None) -> RunFolder:
-    """The run folder, with what a run leaves before it begins; it holds nothing else, or what it goes on from."""
-    if start is None:
-        clear_folder(path)
-        position = {}
-    else:
-        checkpoint.tidy(path, start.path, keep=config.log.keep)
-        print(f"going on from {start.path}", file=sys.stderr)
-        position = {"metrics_bytes": start.notes.metrics_bytes, "after_step": start.notes.env_steps}
-    if config.critic.type == "exact":
-        print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
-    saving.replace(path / CONFIG_FILE, dump(config).encode())  # before all else: it makes this the folder of a run
-    folder = RunFolder(path, tensorboard=config.run.tensorboard, **position)
-    folder.text(VERSIONS_FILE, json.dumps(versions() | {"threads": config.threads}, indent=2) + "\n")
-    return folder
 
 
 def _loop(config: Config, algorithm: PGTS, folder: Folder, start: Start | None, stop: StopFlag) -> Summary:
@@ -341,9 +304,3 @@ def _evaluations(config: EvalConfig, seed: int, folder: Folder) -> dict[str, Eva
     best_path = folder.path / BEST_FILE if config.keep_best else None
     greedy = EvalCallback(**shared, best_path=best_path, stop_at_return=config.stop_at_return)
     return {"deterministic": greedy, "sampled": EvalCallback(**shared, deterministic=False)}
-
-
-def _new_folder(config: Config) -> Path:
-    stem = f"{config.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-    names = (stem, *(f"{stem}-{n}" for n in range(2, 1000)))
-    return next(path for path in (Path("runs") / name for name in names) if not path.exists())

@@ -1,14 +1,16 @@
 """One configuration at several depths and with several seeds: `pgts sweep`."""
 
+import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from pgts_torch import files
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.loading import load
@@ -96,8 +98,9 @@ def plan(
     Raises:
         ConfigError: a configuration is wrong.
         PgtsError: an override that the sweep sets itself, or a folder that holds a run, finished or not, of another
-            configuration.
+            configuration, or a table or a picture that no sweep has made.
     """
+    _targets(out)
     for key in (override.removeprefix("--").partition("=")[0] for override in overrides if override.startswith("--")):
         if key in SET_BY_SWEEP:
             raise PgtsError(f"--{key} is set by the sweep: {SET_BY_SWEEP[key]}")
@@ -132,10 +135,12 @@ def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
     failures = train_all({run.name: run.arguments for run in waiting}, jobs=jobs)
     finished = [run for run in runs if _summary(run) is not None]
     answer = Sweep(tuple(_rows(finished)), _score_is(finished), failures, str(out))
-    out.mkdir(parents=True, exist_ok=True)
-    (out / TABLE_FILE).write_text(json.dumps(asdict(answer), indent=2) + "\n", encoding="utf-8")
+    with files.named(f"--out {out} cannot be written to"):
+        out.mkdir(parents=True, exist_ok=True)
+    table, curves = _targets(out)
+    files.replace(table, (json.dumps(asdict(answer), indent=2) + "\n").encode())
     if finished:
-        _draw_curves(finished, out / CURVES_FILE)
+        files.replace(curves, _curves(finished))
     return answer
 
 
@@ -168,6 +173,22 @@ def describe(answer: Sweep) -> str:
         return "no run has finished"
     what = "return of the policy" if answer.score_is == "J" else "return of sampled episodes"
     return "\n".join([*lines, "", f"Interquartile means over seeds; {answer.score_is}: {what}.", f"in {answer.out}"])
+
+
+def _targets(out: Path) -> tuple[Path, Path]:
+    """Where the table and the picture of the curves may be written; a picture belongs to the table beside it."""
+    has_table = files.kind(out / TABLE_FILE) is not None
+    table = files.target(out / TABLE_FILE, _is_table, "the table of a sweep")
+    curves = files.target(out / CURVES_FILE, lambda raw: has_table, "the curves of a sweep: no table is beside it")
+    return table, curves
+
+
+def _is_table(raw: bytes) -> bool:
+    try:
+        content = json.loads(raw)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and {each.name for each in fields(Sweep)} <= content.keys()
 
 
 def _same(first: Config, second: Config) -> bool:
@@ -214,8 +235,8 @@ def _mean(scores: Sequence[float]) -> Mean:
     return Mean(float(interquartile_mean(score_R)), low, high)
 
 
-def _draw_curves(runs: Sequence[Run], path: Path) -> None:
-    """The interquartile mean over seeds against environment steps, a line with its interval for each depth."""
+def _curves(runs: Sequence[Run]) -> bytes:
+    """The interquartile mean over seeds against environment steps, a line with its interval for each depth, as PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")
@@ -235,7 +256,9 @@ def _draw_curves(runs: Sequence[Run], path: Path) -> None:
     axes.set(xlabel="environment steps", ylabel=tag, title=f"{runs[0].config.name}, {runs[0].config.env.id}")
     axes.legend()
     axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    png = io.BytesIO()
+    figure.savefig(png, dpi=120)
+    return png.getvalue()
 
 
 def _history(run: Run) -> tuple[str, np.ndarray, np.ndarray]:

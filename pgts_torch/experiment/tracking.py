@@ -1,11 +1,9 @@
-"""The folder that a run leaves: its configuration, metrics, TensorBoard events and checkpoints."""
+"""What a run writes while it trains: metrics, TensorBoard events, texts and pictures."""
 
-import fcntl
 import json
 import math
 import os
 import platform
-import shutil
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -17,19 +15,14 @@ from typing import TYPE_CHECKING, Any, Self, final
 
 from matplotlib.figure import Figure
 
-from pgts_torch.agent import saving
+from pgts_torch import files
 from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.locking import RunLock
+from pgts_torch.experiment.ownership import EVENTS_SUFFIX, FAILURE_FILE, METRICS_FILE
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
-CONFIG_FILE = "config.yaml"
-METRICS_FILE = "metrics.jsonl"
-SUMMARY_FILE = "summary.json"
-FAILURE_FILE = "failure.json"
-VERSIONS_FILE = "versions.json"
-BEST_FILE = "best.pt"
-LOCK_FILE = ".lock"
 _PACKAGES = ("pgts_torch", "torch", "numpy", "scipy", "gymnasium", "tensorboard")
 
 
@@ -83,6 +76,7 @@ class RunFolder(Folder):
     Args:
         path: the folder; made here, with all parents.
         tensorboard: write events beside metrics.jsonl.
+        lock: of the folder; it is looked at before each file, so that nothing gets into a folder that took its place.
         metrics_bytes: what is kept of metrics.jsonl; the rest is cut off.
         after_step: the last step whose events are kept; TensorBoard hides later ones of a process that was killed.
 
@@ -90,8 +84,16 @@ class RunFolder(Folder):
         PgtsError: from all that writes, if the disk is full.
     """
 
-    def __init__(self, path: Path, *, tensorboard: bool, metrics_bytes: int = 0, after_step: int | None = None) -> None:
-        self.path = path
+    def __init__(
+        self,
+        path: Path,
+        *,
+        tensorboard: bool,
+        lock: RunLock | None = None,
+        metrics_bytes: int = 0,
+        after_step: int | None = None,
+    ) -> None:
+        self.path, self._lock = path, lock
         path.mkdir(parents=True, exist_ok=True)
         (path / FAILURE_FILE).unlink(missing_ok=True)
         self._metrics = (path / METRICS_FILE).open("ab", buffering=0)
@@ -99,7 +101,9 @@ class RunFolder(Folder):
         purge_step = None if after_step is None else after_step + 1
         self._thread_hook = threading.excepthook
         with self._writing("events"):
-            self._events = event_writer()(str(path), purge_step=purge_step) if tensorboard else None
+            self._events = (
+                event_writer()(str(path), purge_step=purge_step, filename_suffix=EVENTS_SUFFIX) if tensorboard else None
+            )
 
     def __enter__(self) -> Self:
         threading.excepthook = self._hear
@@ -126,7 +130,9 @@ class RunFolder(Folder):
 
     @contextmanager
     def _writing(self, what: str) -> Iterator[None]:
-        """PgtsError where something cannot be written."""
+        """PgtsError where something cannot be written, or must not."""
+        if self._lock is not None:
+            self._lock.check()
         try:
             yield
         except OSError as error:
@@ -156,7 +162,8 @@ class RunFolder(Folder):
         return os.fstat(self._metrics.fileno()).st_size
 
     def text(self, name: str, content: str) -> None:
-        saving.replace(self.path / name, content.encode())
+        with self._writing(name):
+            files.replace(self.path / name, content.encode())
 
     def picture(self, name: str, figure: Figure, step: int) -> None:
         """`name`.png, and the same picture in TensorBoard."""
@@ -176,68 +183,6 @@ def event_writer() -> "type[SummaryWriter]":
             f"TensorBoard cannot be imported ({error}): pip install tensorboard, or set run.tensorboard to false"
         ) from error
     return SummaryWriter
-
-
-class RunLock:
-    """Keeps other processes from a run folder, as long as this one lives. Use it as a context.
-
-    Args:
-        path: the folder; made here, with all parents.
-
-    Raises:
-        PgtsError: it cannot be made or written to; or another process has it, naming its id.
-    """
-
-    def __init__(self, path: Path) -> None:
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            self._file = (path / LOCK_FILE).open("a+")
-        except OSError as error:
-            raise PgtsError(f"run.dir {path} cannot be written to: {error.strerror}") from error
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._file.seek(0)
-            holder = self._file.read().strip() or "unknown"
-            self._file.close()
-            raise PgtsError(f"run.dir {path} is in use by the process {holder}") from None
-        self._file.truncate(0)
-        self._file.write(f"{os.getpid()}\n")
-        self._file.flush()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
-
-
-def check_folder(path: Path) -> None:
-    """Make sure that `path` can be the folder of a run.
-
-    Raises:
-        PgtsError: it is a file, or holds something that no run has left.
-    """
-    if path.exists() and not path.is_dir():
-        raise PgtsError(f"run.dir {path} is a file; it must be a folder or not exist")
-    if path.is_dir() and not (path / CONFIG_FILE).is_file() and any(not _is_ours(each) for each in path.iterdir()):
-        raise PgtsError(f"run.dir {path} holds files that no run has left; choose another folder")
-
-
-def _is_ours(path: Path) -> bool:
-    """Whether a file comes from a run that was killed before it had written its configuration."""
-    return path.name == LOCK_FILE or path.name.endswith(saving.PARTIAL)
-
-
-def clear_folder(path: Path) -> None:
-    """Remove what a run has left, all but the lock; the configuration last, so that it remains the folder of a run."""
-    for each in sorted(path.iterdir(), key=lambda each: (each.name == CONFIG_FILE, each.name != SUMMARY_FILE)):
-        if each.is_dir() and not each.is_symlink():
-            shutil.rmtree(each)
-        elif each.name != LOCK_FILE:
-            each.unlink()
 
 
 def versions() -> dict[str, Any]:

@@ -17,6 +17,7 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.checkpoint import MANIFEST_FILE, MODEL_FILE, Damaged, Notes
+from pgts_torch.experiment.ownership import sealed
 from tests import reliability
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -95,7 +96,7 @@ def test_no_missing_end_no_longer_end_and_no_missing_file_is_accepted(cuts, tmp_
             with pytest.raises(Damaged):
                 checkpoint.read(path)
         (path / name).unlink()
-        with pytest.raises(Damaged, match=f"{name}: No such file"):
+        with pytest.raises(Damaged, match=f"{name} cannot be read: No such file"):
             checkpoint.read(path)
         (path / name).write_bytes(whole)
     checkpoint.read(path)
@@ -131,7 +132,7 @@ def test_a_pickle_is_not_executed_even_where_all_checksums_are_right(tmp_path):
         (path / MODEL_FILE).write_bytes(raw)
         content = json.loads((path / MANIFEST_FILE).read_text())["content"]
         content["files"] = {MODEL_FILE: hashlib.sha256(raw).hexdigest()}
-        (path / MANIFEST_FILE).write_bytes(checkpoint._sealed(content))
+        (path / MANIFEST_FILE).write_bytes(sealed(content))
         with pytest.raises(PgtsError, match="holds something other than tensors and plain values"):
             checkpoint.read(path)
     assert not trace.exists()
@@ -143,7 +144,7 @@ def test_a_pickle_is_not_executed_even_where_all_checksums_are_right(tmp_path):
 def test_another_format_is_named(tmp_path):
     [path] = written(tmp_path, 10)
     content = json.loads((path / MANIFEST_FILE).read_text())["content"] | {"format": 7}
-    (path / MANIFEST_FILE).write_bytes(checkpoint._sealed(content))
+    (path / MANIFEST_FILE).write_bytes(sealed(content))
     with pytest.raises(PgtsError, match="has the format 7; this version reads 2") as raised:
         checkpoint.read(path)
     assert not isinstance(raised.value, Damaged)

@@ -16,6 +16,7 @@ from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import last_checkpoint
 from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
 
@@ -335,7 +336,7 @@ def test_slow_iterations_are_saved_more_often(tmp_path, monkeypatch):
 @pytest.mark.fault("second process in a run folder")
 def test_a_second_process_is_told_who_has_the_folder(cut, capsys):
     before = content(cut)
-    with tracking.RunLock(cut):
+    with RunLock(cut):
         for more in ([], ["--run.overwrite"]):
             assert main(arguments(*more)) == 2
             assert f"error: run.dir cut is in use by the process {os.getpid()}\n" in capsys.readouterr().err

@@ -19,8 +19,8 @@ from pgts_torch.errors import PgtsError, Stopped
 from pgts_torch.experiment import checkpoint, run, sweep
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import dump
+from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.processes import train_all
-from pgts_torch.experiment.tracking import RunLock
 from tests.forks import PATIENCE, in_child, started
 
 HELP = "(see pgts sweep --help)"

@@ -1,5 +1,6 @@
 """What `pgts figures` does: compute parts, keep their data, draw the pictures, write the document."""
 
+import io
 import json
 import sys
 import textwrap
@@ -10,9 +11,10 @@ from typing import Any
 
 import torch
 
+from pgts_torch import files
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.figures import PARTS, depth, figure, grid, ladder, random_mdp, sets, tightrope
-from pgts_torch.experiment.figures.document import claim_rows, document
+from pgts_torch.experiment.figures.document import claim_rows, document, is_document
 from pgts_torch.experiment.figures.drawing import pictures
 from pgts_torch.experiment.figures.figure import Effort, Report
 from pgts_torch.experiment.figures.sampled import WORKERS, executor
@@ -23,6 +25,8 @@ DOTS_PER_INCH = 110
 WIDTH = 79
 
 CURVES = {one.FIGURE.name: one.FIGURE for one in (ladder, random_mdp, tightrope, grid)}
+_PICTURES = {"depth": ("depth", "mirage")}
+"""By part, where they are not named as the part is."""
 OTHERS = {"stationary": sets.compute, "depth": depth.compute}
 
 
@@ -30,15 +34,18 @@ def run(*, only: str | None, effort: Effort, out: Path) -> dict[str, Any]:
     """Compute one part or all, write everything to `out`, and return the data of what was computed.
 
     Raises:
-        PgtsError: `out` cannot be written to, or data of an earlier run there cannot be read.
+        PgtsError: `out` cannot be written to, or holds data that cannot be read, or files that this has not made under
+            names of those that it makes.
     """
     torch.set_num_threads(1)
     folder = out / "figures"
-    try:
+    with files.named(f"--out {out}"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise PgtsError(f"--out {out}: {error.strerror}") from error
-    stored(folder)  # what cannot be read is better known now than after all the work
+    before = stored(folder)  # what cannot be read is better known now than after all the work
+    page = files.target(out / "reproduction.md", is_document, "a document of pgts figures")
+    for name in PARTS if only is None else (only,):
+        for picture in _PICTURES.get(name, (name,)):
+            files.target(folder / f"{picture}.png", lambda _: name in before, f"a picture of figures/{name}.json")  # noqa: B023
     started = time.perf_counter()
 
     def report(message: str) -> None:
@@ -49,10 +56,12 @@ def run(*, only: str | None, effort: Effort, out: Path) -> dict[str, Any]:
         # By way of JSON, so that what is drawn now is what would be drawn from the file.
         text = json.dumps(data, separators=(",", ":"))
         made[name] = json.loads(text)
-        (folder / f"{name}.json").write_text(text + "\n")
+        files.replace(folder / f"{name}.json", f"{text}\n".encode())
         for picture, drawn in pictures(made[name]).items():
-            drawn.savefig(folder / f"{picture}.png", dpi=DOTS_PER_INCH)
-        (out / "reproduction.md").write_text(document(stored(folder)))
+            png = io.BytesIO()
+            drawn.savefig(png, dpi=DOTS_PER_INCH)
+            files.replace(folder / f"{picture}.png", png.getvalue())
+        files.replace(page, document(stored(folder)).encode())
     report(f"wrote {out / 'reproduction.md'}")
     return {name: made[name] for name in PARTS if name in made}
 
@@ -76,10 +85,12 @@ def stored(folder: Path) -> dict[str, Any]:
     parts = {}
     for name in PARTS:
         path = folder / f"{name}.json"
-        if path.exists():
+        if files.kind(path) is not None:
             try:
-                parts[name] = json.loads(path.read_text())
-            except (OSError, ValueError) as error:
+                parts[name] = json.loads(files.read(path))
+                if not isinstance(parts[name], dict) or parts[name].get("part") != name:
+                    raise PgtsError("it is not the data of this part")
+            except (ValueError, RecursionError) as error:
                 raise PgtsError(
                     f"{path} cannot be read: {error}; remove it or run pgts figures --only {name}"
                 ) from error

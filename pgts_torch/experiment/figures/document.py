@@ -31,6 +31,11 @@ def claim_rows(parts: Mapping[str, Data]) -> list[tuple[str, Data]]:
     return [(name, claim) for name in PARTS if name in parts for claim in parts[name]["claims"]]
 
 
+def is_document(raw: bytes) -> bool:
+    """Whether the content of a file is a document that was made here."""
+    return raw.startswith(b"# The paper, reproduced and checked\n\nWritten by `pgts figures`;")
+
+
 def _lines(parts: Mapping[str, Data]) -> Iterator[str]:
     yield "# The paper, reproduced and checked"
     yield ""

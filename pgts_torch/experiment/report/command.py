@@ -6,10 +6,10 @@ from typing import Any
 
 import torch
 
-from pgts_torch.agent import saving
+from pgts_torch import files
+from pgts_torch.experiment.ownership import REPORT_FILE
 from pgts_torch.experiment.report.facts import gather
-from pgts_torch.experiment.report.page import page
-from pgts_torch.experiment.report.reading import REPORT_FILE
+from pgts_torch.experiment.report.page import is_page, page
 
 
 def write(run: Path, out: Path | None) -> dict[str, Any]:
@@ -19,10 +19,11 @@ def write(run: Path, out: Path | None) -> dict[str, Any]:
         What the page shows, but for the pictures of the policy, as plain values; and where it is, as "page".
 
     Raises:
-        PgtsError: the configuration of the run cannot be read, or the page cannot be written.
+        PgtsError: the configuration of the run cannot be read, or the page cannot be written, as where a file is that
+            is no such page.
     """
     torch.set_num_threads(1)
-    out = run / REPORT_FILE if out is None else out
+    out = files.target(run / REPORT_FILE if out is None else out, is_page, "a page of pgts report")
     facts, trained = gather(run)
-    saving.replace(out, page(facts, trained).encode())
+    files.replace(out, page(facts, trained).encode())
     return {"page": str(out), **asdict(facts)}

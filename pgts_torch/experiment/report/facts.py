@@ -13,11 +13,11 @@ from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.ownership import CONFIG_FILE, VERSIONS_FILE
 from pgts_torch.experiment.report import reading
 from pgts_torch.experiment.report.curves import Panel, panels
 from pgts_torch.experiment.report.settings import Setting, settings
 from pgts_torch.experiment.summary import Summary, rows
-from pgts_torch.experiment.tracking import CONFIG_FILE, VERSIONS_FILE
 from pgts_torch.tabular.mdp import TabularMDP
 
 

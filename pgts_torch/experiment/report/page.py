@@ -27,6 +27,7 @@ PAGE = Template("""\
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
+<meta name="generator" content="pgts report">
 <title>$title</title>
 <style>
 $style</style>
@@ -37,9 +38,17 @@ $body
 </html>
 """)
 
+_SIGNS = ('<meta name="generator" content="pgts report">', f"</title>\n<style>\n{STYLE[:200]}")
+"""What is in each page, and in those of version 0.1."""
+
 PROVED = ("proved", "The critic is exact, so it is a proof.")
 FOLDER = "run folder"
 ESTIMATED = ("an estimate", "The critic is learned, so it is off by what the critic is off at the start states.")
+
+
+def is_page(raw: bytes) -> bool:
+    """Whether the content of a file is a page that was made here."""
+    return any(sign.encode() in raw for sign in _SIGNS)
 
 
 def page(facts: Facts, trained: Trained | None) -> str:

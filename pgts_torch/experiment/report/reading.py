@@ -6,16 +6,23 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pgts_torch.agent import saving
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.checkpoint import Notes
+from pgts_torch.experiment.ownership import (
+    CHECKPOINTS,
+    FAILURE_FILE,
+    LOCK_FILE,
+    MARK_FILE,
+    METRICS_FILE,
+    REPORT_FILE,
+    SUMMARY_FILE,
+)
 from pgts_torch.experiment.summary import Summary, from_json, rows
-from pgts_torch.experiment.tracking import FAILURE_FILE, LOCK_FILE, METRICS_FILE, SUMMARY_FILE
+from pgts_torch.files import PARTIAL
 
 Line = dict[str, Any]
 
-REPORT_FILE = "report.html"
 _LARGEST = 1e300
 
 
@@ -99,11 +106,11 @@ def last_checkpoint(run: Path, notes: list[str]) -> tuple[Path, Notes] | None:
 def files(run: Path) -> Iterator[tuple[str, int]]:
     """Names and bytes of what a run has left; each checkpoint counts as one."""
     for path in sorted(run.iterdir()):
-        others = (checkpoint.CHECKPOINTS, LOCK_FILE, REPORT_FILE)
-        if path.name not in others and not path.name.endswith(saving.PARTIAL):
+        others = (CHECKPOINTS, LOCK_FILE, MARK_FILE, REPORT_FILE)
+        if path.name not in others and not path.name.endswith(PARTIAL):
             yield path.name, _bytes(path)
     for path in checkpoint.listed(run):
-        yield f"{checkpoint.CHECKPOINTS}/{path.name}", sum(map(_bytes, path.glob("*")))
+        yield f"{CHECKPOINTS}/{path.name}", sum(map(_bytes, path.glob("*")))
 
 
 def _bytes(path: Path) -> int:

@@ -1,0 +1,263 @@
+"""Which files in a folder a run has made: only those are ever replaced or removed.
+
+A run leaves a mark in its folder before anything else. In a folder with a mark the files of a run are known by their
+names; folders without one are left alone, but for runs of version 0.1, which are known by what they say.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pgts_torch import files
+from pgts_torch.errors import PgtsError
+
+MARK_FILE = ".pgts_run"
+LOCK_FILE = ".lock"
+CONFIG_FILE = "config.yaml"
+METRICS_FILE = "metrics.jsonl"
+SUMMARY_FILE = "summary.json"
+FAILURE_FILE = "failure.json"
+VERSIONS_FILE = "versions.json"
+BEST_FILE = "best.pt"
+PICTURE_FILE = "policy.png"
+REPORT_FILE = "report.html"
+CHECKPOINTS = "checkpoints"
+MODEL_FILE, MANIFEST_FILE = "model.pt", "manifest.json"
+EVENTS_SUFFIX = ".pgts"
+
+_OWN_FILES = (
+    SUMMARY_FILE,
+    METRICS_FILE,
+    FAILURE_FILE,
+    VERSIONS_FILE,
+    BEST_FILE,
+    PICTURE_FILE,
+    REPORT_FILE,
+    MARK_FILE,
+    CONFIG_FILE,
+)
+_EVENTS = re.compile(r"events\.out\.tfevents\.\d+\..+")
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What a run says of itself in its folder.
+
+    configs: the SHA-256 of each config.yaml that it has written.
+    events: event files by name, of a run that version 0.1 began.
+    has_checkpoints: whether it has ever written one.
+    """
+
+    configs: tuple[str, ...] = ()
+    events: tuple[str, ...] = ()
+    has_checkpoints: bool = False
+
+    def of(self, config: bytes) -> "Mark":
+        """With one more configuration."""
+        return replace(self, configs=tuple(dict.fromkeys((*self.configs, digest(config)))))
+
+
+def digest(raw: bytes) -> str:
+    return hashlib.sha256(raw).hexdigest()
+
+
+def write_mark(run: Path, mark: Mark) -> None:
+    files.replace(run / MARK_FILE, sealed({"pgts_torch run": _FORMAT, **asdict(mark)}))
+
+
+def read_mark(run: Path) -> Mark | None:
+    """The mark of a run's folder, or what stands for it in one of version 0.1; None: no run has made it.
+
+    Raises:
+        PgtsError: the mark is damaged, or of a later version.
+    """
+    path = run / MARK_FILE
+    if files.kind(path) != "file":
+        return _earlier_mark(run)
+    content = unsealed(files.read(path))
+    if content is None or "pgts_torch run" not in content:
+        raise PgtsError(f"{path} is damaged, so it cannot be told which files here are a run's; choose another folder")
+    if content.pop("pgts_torch run") != _FORMAT:
+        raise PgtsError(f"{run} is the folder of a run of a later version of pgts_torch")
+    return Mark(tuple(content["configs"]), tuple(content["events"]), content["has_checkpoints"])
+
+
+def _earlier_mark(run: Path) -> Mark | None:
+    """Of a run of version 0.1: a sealed manifest, its metrics or its versions say that it is one."""
+    proofs = [_is_manifest(path / MANIFEST_FILE) for path in checkpoints(run)]
+    if not (any(proofs) or _are_metrics(run / METRICS_FILE) or _are_versions(run / VERSIONS_FILE)):
+        return None
+    config, has_checkpoints = _content(run / CONFIG_FILE), files.kind(run / CHECKPOINTS) == "folder"
+    own = () if config is None or b"#" in config else (digest(config),)  # a comment is somebody else's
+    return Mark(own, tuple(name for name in _names(run) if _EVENTS.fullmatch(name)), has_checkpoints)
+
+
+def _content(path: Path) -> bytes | None:
+    return files.read(path) if files.kind(path) == "file" else None
+
+
+def _is_manifest(path: Path) -> bool:
+    content = unsealed(_content(path) or b"")
+    return content is not None and "notes" in content
+
+
+def _are_metrics(path: Path) -> bool:
+    first = _object((_content(path) or b"").partition(b"\n")[0])
+    return type(first.get("step")) is int and not {"charts/SPS", "eval/deterministic_return"}.isdisjoint(first)
+
+
+def _are_versions(path: Path) -> bool:
+    return {"python", "pgts_torch", "torch", "threads"} <= _object(_content(path) or b"").keys()
+
+
+def _object(raw: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(raw)
+    except (ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def check_folder(path: Path) -> Mark:
+    """Make sure that `path` can be the folder of a run, without touching it.
+
+    Returns:
+        The mark in it; an empty one where there is none.
+
+    Raises:
+        PgtsError: it is no folder, or holds something that no run has left.
+    """
+    found = files.kind(path, follow=True)
+    if found is None and files.kind(path) is None:
+        return Mark()
+    if found != "folder":
+        raise PgtsError(f"run.dir {path} is a {found or 'link to nowhere'}; it must be a folder or not exist")
+    mark, names = read_mark(path), _names(path)
+    if mark is None:
+        foreign = [name for name in names if not _is_left_over(path / name)]
+        if foreign:
+            raise PgtsError(
+                f"run.dir {path} holds files that no run has left ({listing(foreign)}); choose another folder"
+            )
+        return Mark()
+    for name in names:
+        right = "folder" if name == CHECKPOINTS else "file"
+        if (name in (*_OWN_FILES, CHECKPOINTS, LOCK_FILE)) and (kind := files.kind(path / name)) != right:
+            raise PgtsError(f"{path / name} is a {kind}; a run keeps a {right} of its own there: move it away")
+    return mark
+
+
+def listing(names: list[str], most: int = 5) -> str:
+    """A few names in one line."""
+    shown = [ascii(name)[1:-1] for name in names[:most]]
+    return ", ".join([*shown, f"{len(names) - most} more"] if len(names) > most else shown)
+
+
+def _names(folder: Path) -> list[str]:
+    with files.named(f"{folder} cannot be read"):
+        return sorted(entry.name for entry in folder.iterdir())
+
+
+def _is_left_over(path: Path) -> bool:
+    """Whether a file comes from a run that was killed before it had left its mark."""
+    if files.kind(path) != "file":
+        return False
+    return is_lock(files.read(path)) if path.name == LOCK_FILE else _is_partial(path.name)
+
+
+def is_lock(raw: bytes) -> bool:
+    """Whether this is the content of a lock: the id of a process."""
+    return re.fullmatch(rb"(\d+\r?\n)?", raw) is not None
+
+
+def _is_partial(name: str) -> bool:
+    """Whether a name is that of a file of ours that is being written."""
+    own = re.fullmatch(rf"\.(.+)\.\d+{re.escape(files.PARTIAL)}", name)
+    return own is not None and own[1] in (*_OWN_FILES, MODEL_FILE, MANIFEST_FILE)
+
+
+def is_events(name: str, mark: Mark) -> bool:
+    """Whether a name is that of an event file of the run."""
+    return name in mark.events or (name.endswith(EVENTS_SUFFIX) and _EVENTS.fullmatch(name) is not None)
+
+
+def clear(run: Path, mark: Mark) -> list[str]:
+    """Remove what a run has left, all but its lock and its mark; the names of what else lies there, and stays.
+
+    The summary goes first and the configuration last: a run that is half cleared is an unfinished one.
+    """
+    for path in checkpoints(run):
+        remove_checkpoint(path)
+    remove_partial(run)
+    with suppress(OSError):  # missing, or somebody else's things are in it
+        (run / CHECKPOINTS).rmdir()
+    ours = [name for name in _names(run) if name != MARK_FILE and _is_removable(run / name, mark)]
+    for name in sorted(ours, key=lambda name: (name == CONFIG_FILE, name != SUMMARY_FILE)):
+        with files.named(f"{run / name} cannot be removed"):
+            (run / name).unlink()
+    return [name for name in _names(run) if name not in (MARK_FILE, LOCK_FILE)]
+
+
+def _is_removable(path: Path, mark: Mark) -> bool:
+    if files.kind(path) != "file":
+        return False
+    if path.name == CONFIG_FILE:
+        return digest(files.read(path)) in mark.configs
+    return path.name in _OWN_FILES or is_events(path.name, mark)
+
+
+def checkpoints(run: Path) -> list[Path]:
+    """The checkpoints of a run folder, oldest first, intact or not: folders with a file of a checkpoint in them."""
+    if files.kind(run / CHECKPOINTS) != "folder":
+        return []
+    named = [run / CHECKPOINTS / name for name in _names(run / CHECKPOINTS) if re.fullmatch(r"\d{12,}", name)]
+    return [path for path in named if files.kind(path) == "folder" and _has_model(path)]
+
+
+def _has_model(path: Path) -> bool:
+    return any(files.kind(path / name) is not None for name in (MODEL_FILE, MANIFEST_FILE))
+
+
+def remove_checkpoint(path: Path) -> None:
+    """Remove the files of a checkpoint, and its folder if nothing else is in it. What cannot be removed stays."""
+    if files.kind(path) != "folder":
+        return
+    with suppress(OSError):
+        for name in _names(path):
+            if name in (MODEL_FILE, MANIFEST_FILE) or _is_partial(name):
+                (path / name).unlink()
+        path.rmdir()
+
+
+def remove_partial(run: Path) -> None:
+    """Remove what a process that was killed has left half written: nobody else may be writing."""
+    for name in filter(_is_partial, _names(run)):
+        if files.kind(run / name) == "file":
+            with suppress(OSError):
+                (run / name).unlink()
+    if files.kind(run / CHECKPOINTS) == "folder":
+        for name in _names(run / CHECKPOINTS):
+            if re.fullmatch(rf"\.\d{{12,}}{re.escape(files.PARTIAL)}", name):
+                remove_checkpoint(run / CHECKPOINTS / name)
+
+
+def sealed(content: Mapping[str, Any]) -> bytes:
+    """JSON that holds its own checksum; each content has one such text, so that no bit of it may differ."""
+    plain = json.dumps(content, sort_keys=True)
+    seal = digest(plain.encode())
+    return (json.dumps({"content": content, "sha256": seal}, sort_keys=True, indent=1) + "\n").encode()
+
+
+def unsealed(raw: bytes) -> dict[str, Any] | None:
+    """What was sealed; None if this is not exactly what `sealed` made."""
+    try:
+        content = json.loads(raw)["content"]
+        return content if sealed(content) == raw else None
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None

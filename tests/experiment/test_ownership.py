@@ -1,0 +1,403 @@
+"""Only files that a run has made are ever replaced or removed, whatever else lies in its folder."""
+
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from pgts_torch import PGTS, EvalCallback
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment import checkpoint, opening, run
+from pgts_torch.experiment.checkpoint import MODEL_FILE
+from pgts_torch.experiment.cli import main
+from pgts_torch.experiment.config import Config, dump
+from pgts_torch.experiment.figures import command as figures
+from pgts_torch.experiment.figures.drawing import pictures
+from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.locking import RunLock
+from pgts_torch.experiment.ownership import MARK_FILE
+from pgts_torch.experiment.tracking import RunFolder, read_metrics
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+TINY = ["--rollout.num_envs=1", "--rollout.horizon.length=5", "--search.depth=0", "--eval.episodes=1"]
+SHORT = [*TINY, "--total_steps=15", "--log.checkpoint_every=1", "--run.tensorboard=false"]
+
+
+def tree(folder: Path) -> dict[str, bytes | str | None]:
+    """Every entry of a folder, with its bytes, or where a symbolic link leads; None: a folder."""
+    return {
+        str(path.relative_to(folder)): os.readlink(path)
+        if path.is_symlink()
+        else path.read_bytes()
+        if path.is_file()
+        else None
+        for path in folder.rglob("*")
+    }
+
+
+def put(folder: Path, **files: str) -> None:
+    for name, content in files.items():
+        path = folder / name.replace("__", "/").replace("_", ".")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def killed(folder: str, monkeypatch: pytest.MonkeyPatch, *arguments: str, after: int = 1) -> Path:
+    """The folder of a run that dies after so many lines of metrics."""
+    log, lines = RunFolder.log, 0
+
+    class Killed(BaseException):
+        """Stands for `kill -9`."""
+
+    def counted(*args):
+        nonlocal lines
+        log(*args)
+        lines += 1
+        if lines == after:
+            raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "log", counted)
+        with pytest.raises(Killed):
+            run.train(load(None, [*SHORT, f"--run.dir={folder}", *arguments]))
+    return Path(folder)
+
+
+@pytest.mark.fault("project folder as run folder")
+@pytest.mark.parametrize("more", [[], ["--run.overwrite"]])
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_project_folder_with_a_configuration_is_left_as_it_is(more, ours, here, capsys):
+    put(here, thesis_tex="mine", data__a_csv="1,2", _git__HEAD="ref", notes="mine")
+    (here / "config.yaml").write_text("total_steps: 15\n" if ours else "learning_rate: 1\n")
+    before = tree(here)
+    given = ["--config", "config.yaml"] if ours else []
+    assert main(["train", *given, *SHORT, "--run.dir=.", *more]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    mistake = "error: run.dir . holds files that no run has left (.git, config.yaml, data, notes, thesis.tex);"
+    assert said == f"{mistake} choose another folder"
+    assert tree(here) == before
+
+
+@pytest.mark.fault("files of the user in a run folder")
+@pytest.mark.parametrize("unfinished", [True, False])
+def test_a_run_that_starts_anew_leaves_and_names_what_it_has_not_made(unfinished, here, monkeypatch, capsys):
+    if unfinished:
+        folder = killed("run", monkeypatch, "--log.checkpoint_every=100")
+    else:
+        run.train(load(None, [*SHORT, "--run.dir=run"]))
+        folder = Path("run")
+        put(folder, checkpoints__000000000015__mine_txt="mine", checkpoints__best__model_pt="mine")
+    put(here, outside__model_pt="mine")
+    put(folder, notes_md="mine", data__model_pt="mine", events_out_tfevents_123_host="mine", x_partial="mine")
+    (folder / "link").symlink_to(here / "outside")
+    put(folder, _best_pt_mine_partial="mine")
+    theirs = {name: content for name, content in tree(folder).items() if content in ("mine", b"mine")}
+    more = [] if unfinished else ["--run.overwrite", "--seed=1"]
+    checkpointing = "--log.checkpoint_every=100" if unfinished else "--log.checkpoint_every=1"
+    assert main(["train", *SHORT, checkpointing, "--run.dir=run", *more]) == 0
+    assert {name: tree(folder)[name] for name in theirs} == theirs
+    assert (here / "outside" / "model.pt").read_text() == "mine"
+    [note] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note:")]
+    assert note.startswith("note: run.dir run also holds .best.pt.mine.partial, ")
+    assert note.endswith(", which no run has left; it stays")
+    assert [line["step"] for line in read_metrics(folder)] == [5, 10, 15]
+    assert len(checkpoint.listed(folder)) == (1 if unfinished else 3)
+    assert all(checkpoint.read(path) for path in checkpoint.listed(folder))
+
+
+def test_a_run_that_is_overwritten_leaves_nothing_of_the_one_before(here, capsys):
+    run.train(load(None, [*SHORT, "--run.dir=run", "--run.tensorboard=true", "--eval.every=5", "--eval.keep_best"]))
+    (here / "run" / ".metrics.jsonl.77.partial").write_text("{")
+    (here / "run" / "checkpoints" / ".000000000020.partial").mkdir()
+    assert main(["report", "run"]) == 0
+    before = tree(here / "run")
+    run.train(load(None, ["--run.dir=run", "--run.overwrite", *SHORT, "--total_steps=5", "--seed=3"]))
+    after = tree(here / "run")
+    new = {".lock", "checkpoints", "config.yaml", MARK_FILE, "metrics.jsonl", "policy.png", "summary.json"}
+    saved = {f"checkpoints/000000000005{name}" for name in ("", "/manifest.json", "/model.pt")}
+    assert after.keys() == new | saved | {"versions.json"}
+    assert {"best.pt", "report.html", "checkpoints/.000000000020.partial"} < before.keys()
+    assert "note" not in capsys.readouterr().err
+
+
+def age(folder: Path) -> None:
+    """Make of a run folder what version 0.1 would have left."""
+    (folder / MARK_FILE).unlink()
+    for path in folder.glob("events.*.pgts"):
+        path.rename(path.with_suffix(".0"))
+
+
+@pytest.mark.fault("run of version 0.1")
+@pytest.mark.parametrize("left", ["checkpoints", "metrics", "versions"])
+def test_a_run_of_an_earlier_version_is_known_by_what_it_has_left(left, here, monkeypatch, capsys):
+    often = "--log.checkpoint_every=1" if left == "checkpoints" else "--log.checkpoint_every=100"
+    arguments = ["--run.tensorboard=true", often]
+    folder = killed("run", monkeypatch, *arguments, after=2)
+    age(folder)
+    if left == "versions":
+        (folder / "metrics.jsonl").write_bytes(b"")
+    put(folder, notes_md="mine")
+    assert main(["train", *SHORT, *arguments, "--run.dir=run"]) == 0
+    assert [line["step"] for line in read_metrics(folder)] == [5, 10, 15]
+    assert ("going on from" in capsys.readouterr().err) == (left == "checkpoints")
+    assert (folder / "notes.md").read_text() == "mine"
+    assert main(["train", *SHORT, "--run.dir=run", "--run.overwrite"]) == 0
+    assert list(folder.glob("events*")) == []
+    assert (folder / "notes.md").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("metrics.jsonl", '{"step": 1, "loss": 0.5}\n'),
+        ("versions.json", '{"python": "3", "torch": "2"}'),
+        ("summary.json", "{}"),
+        ("checkpoints/000000000005/manifest.json", '{"content": {"notes": 1}, "sha256": "0"}'),
+        (".lock", "mine"),
+        (".pgts_run.bak", "{}"),
+    ],
+)
+def test_what_only_resembles_a_run_is_no_run(name, content, here):
+    put(here, config_yaml=dump(Config()))
+    (here / name).parent.mkdir(parents=True, exist_ok=True)
+    (here / name).write_text(content)
+    before = tree(here)
+    for more in ([], ["--run.overwrite"]):
+        with pytest.raises(PgtsError, match=r"^run.dir . holds files that no run has left"):
+            run.train(load(None, [*SHORT, "--run.dir=.", *more]))
+    assert tree(here) == before
+
+
+@pytest.mark.fault("something else under the name of a file of the run")
+@pytest.mark.parametrize("kind", ["symbolic link", "pipe", "folder"])
+@pytest.mark.parametrize("name", ["metrics.jsonl", ".lock", "best.pt", "checkpoints", "config.yaml"])
+def test_what_stands_under_the_name_of_a_file_of_ours_is_named_and_not_followed(name, kind, here, monkeypatch, capsys):
+    folder = killed("run", monkeypatch, after=2)
+    put(here, theirs__model_pt="mine", theirs_txt="mine")
+    path = folder / name
+    if path.exists():
+        path.rename(here / "away")
+    if kind == "symbolic link":
+        path.symlink_to(here / ("theirs" if name == "checkpoints" else "theirs.txt"))
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.mkdir()
+    if name == "checkpoints" and kind == "folder":
+        pytest.skip("that is what it is")
+    before = tree(here)
+    for more in ([], ["--run.overwrite"]):
+        assert main(["train", *SHORT, "--run.dir=run", *more]) == 2
+        what = "folder" if name == "checkpoints" else "file"
+        mistake = f"error: run/{name} is a {kind}; a run keeps a {what} of its own there: move it away"
+        assert capsys.readouterr().err.splitlines()[-1] == mistake
+    assert tree(here) == before
+
+
+@pytest.mark.fault("something else in place of a run folder")
+def test_what_is_no_folder_is_named(here, capsys):
+    (here / "file").write_text("mine")
+    os.mkfifo(here / "pipe")
+    (here / "lost").symlink_to("nowhere")
+    for name, mistake in {
+        "file": "is a file; it must be a folder or not exist",
+        "pipe": "is a pipe; it must be a folder or not exist",
+        "lost": "is a link to nowhere; it must be a folder or not exist",
+        "file/run": "cannot be written to: Not a directory",
+        "x" * 300: "File name too long",
+    }.items():
+        for more in ([], ["--run.overwrite"]):
+            assert main(["train", *SHORT, f"--run.dir={name}", *more]) == 2
+            [said] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
+            assert name in said
+            assert said.endswith(mistake)
+    assert sorted(tree(here)) == ["file", "lost", "pipe"]
+
+
+def test_a_link_to_a_folder_serves_as_that_folder(here):
+    put(here, thesis__thesis_tex="mine")
+    (here / "empty").mkdir()
+    for name in ("thesis", "empty"):
+        (here / f"to-{name}").symlink_to(name)
+    assert main(["train", *SHORT, "--run.dir=to-thesis", "--run.overwrite"]) == 2
+    assert main(["train", *SHORT, "--run.dir=to-empty"]) == 0
+    assert tree(here / "thesis") == {"thesis.tex": b"mine"}
+    assert len(read_metrics(here / "empty")) == 3
+
+
+@pytest.mark.fault("run folder replaced meanwhile")
+def test_nothing_is_written_into_a_folder_that_took_the_place_of_the_runs(here, monkeypatch, capsys):
+    log = RunFolder.log
+
+    def replaced(self, step, tags):
+        log(self, step, tags)
+        if step == 10:
+            Path("run").rename("moved")
+            put(here, run__thesis_tex="mine", run__checkpoints__000000000001__model_pt="mine")
+
+    monkeypatch.setattr(RunFolder, "log", replaced)
+    assert main(["train", *SHORT, "--run.dir=run"]) == 2
+    assert "error: run.dir run was moved or replaced while this run had it" in capsys.readouterr().err
+    files = {name: content for name, content in tree(here / "run").items() if content is not None}
+    assert files == {"thesis.tex": b"mine", "checkpoints/000000000001/model.pt": b"mine"}
+    assert [path.name for path in checkpoint.listed(here / "moved")] == ["000000000005"]
+
+
+@pytest.mark.fault("edited configuration of a run")
+def test_an_edited_configuration_is_kept_or_refused_and_never_overwritten(here, monkeypatch, capsys):
+    folder = killed("run", monkeypatch, after=2)
+    edited = (folder / "config.yaml").read_text() + "# what I found: it works\n"
+    (folder / "config.yaml").write_text(edited)
+    for more in (["--name=other"], ["--run.overwrite", "--seed=1"]):
+        assert main(["train", *SHORT, "--run.dir=run", *more]) == 2
+        mistake = "error: run/config.yaml is not as a run has written it, and says something else than this one: move"
+        assert mistake in capsys.readouterr().err
+    assert main(["train", "--resume", "run"]) == 0
+    assert main(["train", *SHORT, "--run.dir=run", "--run.overwrite"]) == 0
+    assert (folder / "config.yaml").read_text() == edited
+
+
+@pytest.mark.fault("damaged mark of a run folder")
+def test_a_damaged_mark_is_named_and_nothing_is_removed(here, monkeypatch, capsys):
+    folder = killed("run", monkeypatch)
+    (folder / MARK_FILE).write_bytes((folder / MARK_FILE).read_bytes()[:-9])
+    before = tree(folder)
+    for more in ([], ["--run.overwrite"]):
+        assert main(["train", *SHORT, "--run.dir=run", *more]) == 2
+        assert "error: run/.pgts_run is damaged, so it cannot be told" in capsys.readouterr().err
+    assert tree(folder) == before
+
+
+@pytest.mark.fault("two runs in the same second")
+def test_runs_that_start_in_the_same_second_have_folders_of_their_own(here, monkeypatch):
+    monkeypatch.setattr(time, "strftime", lambda form: "now")
+    config = Config()
+    with ThreadPoolExecutor(8) as pool:
+        paths = list(pool.map(lambda _: opening._new_folder(config), range(24)))
+    assert len(set(paths)) == 24
+    assert all(path.is_dir() for path in paths)
+    with opening.claimed(config) as first, opening.claimed(config) as second:
+        assert first.path != second.path
+
+
+@pytest.mark.fault("lock that is a symbolic link")
+@pytest.mark.parametrize("kind", ["link", "content"])
+def test_a_lock_is_not_followed_and_nothing_foreign_is_emptied(kind, here):
+    put(here, theirs_txt="mine", run__x="")
+    if kind == "link":
+        (here / "run" / ".lock").symlink_to(here / "theirs.txt")
+    else:
+        put(here / "run", _lock="mine")
+    with pytest.raises(PgtsError, match=r"run/\.lock is (a symbolic link|not the lock of a run)"):
+        RunLock(Path("run"))
+    assert (here / "theirs.txt").read_text() == (here / "run" / ".lock").read_text() == "mine"
+
+
+class FakeMsvcrt:
+    """What Windows has in place of fcntl: a byte is locked, for others also those of this process."""
+
+    LK_NBLCK = 1
+
+    def __init__(self) -> None:
+        self.locked = set[tuple[int, int]]()
+
+    def locking(self, handle: int, mode: int, count: int) -> None:
+        place = (os.fstat(handle).st_ino, os.lseek(handle, 0, os.SEEK_CUR))
+        if place in self.locked:
+            raise PermissionError(13, "Permission denied")
+        self.locked.add(place)
+
+
+def test_a_lock_works_where_there_is_no_fcntl(here, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "msvcrt", FakeMsvcrt())
+    monkeypatch.setattr("pgts_torch.experiment.locking.fcntl", None)
+    with RunLock(Path("run")) as lock:
+        lock.check()
+        with pytest.raises(PgtsError, match=f"^run.dir run is in use by the process {os.getpid()}$"):
+            RunLock(Path("run"))
+
+
+# Outputs with names of the user's choice
+
+
+@pytest.fixture(scope="module")
+def model() -> PGTS:
+    return PGTS("pgts/Ladder-v0", depth=0, num_envs=1)
+
+
+@pytest.mark.fault("file of the user under the name of an output")
+def test_a_model_replaces_a_model_and_nothing_else(model, here):
+    put(here, thesis_tex="mine")
+    (here / "link.pt").symlink_to("thesis.tex")
+    for name in ("thesis.tex", "link.pt"):
+        with pytest.raises(PgtsError, match=f"^{name} exists and is not a model that pgts_torch has saved: move it"):
+            model.save(name)
+        with pytest.raises(PgtsError, match=f"^{name} exists and is not a model"):
+            EvalCallback(every=1, best_path=name)
+    assert (here / "thesis.tex").read_text() == "mine"
+    os.mkfifo(here / "pipe.pt")
+    for name, kind in {"pipe.pt": "pipe", ".": "folder", "/dev/null": "device"}.items():
+        with pytest.raises(PgtsError, match=rf"^{name} is a {kind}; it must be a file, or not exist$"):
+            model.save(name)
+    (here / "empty.pt").touch()
+    (here / "to-new.pt").symlink_to("new.pt")
+    for name in ("empty.pt", "empty.pt", "to-new.pt"):
+        model.save(name)
+    assert (here / "to-new.pt").is_symlink()
+    assert PGTS.load("new.pt").num_env_steps == 0
+
+
+@pytest.mark.fault("file of the user under the name of an output")
+def test_a_page_replaces_a_page_and_nothing_else(here, capsys):
+    run.train(load(None, [*SHORT, "--run.dir=run"]))
+    put(here, thesis_html="<!DOCTYPE html>mine", run__report_html="mine")
+    for arguments, name in ((["--out=thesis.html"], "thesis.html"), ([], "run/report.html")):
+        assert main(["report", "run", *arguments]) == 2
+        assert f"error: {name} exists and is not a page of pgts report: move it away" in capsys.readouterr().err
+    assert (here / "run" / "report.html").read_text() == "mine"
+    for _ in range(2):
+        assert main(["report", "run", "--out=new.html"]) == 0
+
+
+@pytest.mark.fault("file of the user under the name of an output")
+@pytest.mark.parametrize("name", ["table.json", "curves.png"])
+def test_a_sweep_replaces_its_own_table_and_picture_and_nothing_else(name, here, capsys):
+    put(here, out__x="mine")
+    (here / "out" / name).write_text('{"rows": []}')
+    before = tree(here)
+    small = ["--depths=0", *(each for each in TINY if "depth" not in each), "--total_steps=5"]
+    sweep = ["sweep", "--out=out", "--seeds=1", *small, "--run.tensorboard=false"]
+    assert main(sweep) == 2
+    assert f"error: out/{name} exists and is not the " in capsys.readouterr().err
+    assert tree(here) == before
+    (here / "out" / name).unlink()
+    for _ in range(2):
+        assert main(sweep) == 0
+
+
+@pytest.mark.fault("file of the user under the name of an output")
+@pytest.mark.parametrize("name", ["reproduction.md", "figures/depth.png", "figures/mirage.png", "figures/depth.json"])
+def test_figures_replace_their_own_files_and_nothing_else(name, here, capsys):
+    (here / "figures").mkdir()
+    (here / name).write_text('{"mine": true}')
+    before = tree(here)
+    assert main(["figures", "--quick", "--only=depth", "--out=."]) == 2
+    assert name in capsys.readouterr().err
+    assert tree(here) == before
+
+
+def test_the_names_of_the_pictures_are_those_that_are_drawn():
+    parts = figures.stored(Path(__file__).parents[2] / "docs" / "figures")
+    assert set(figures._PICTURES) <= parts.keys()
+    for name, data in parts.items():
+        assert tuple(pictures(data)) == figures._PICTURES.get(name, (name,))
+    assert MODEL_FILE == "model.pt"
