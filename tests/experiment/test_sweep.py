@@ -220,7 +220,7 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(here, capsys):
     arguments = ["sweep", "--out", "out", "--depths", "0,1,2", "--seeds", "1", "--jobs", "2", *SMALL]
     assert main(arguments) == 1
     out, err = capsys.readouterr()
-    mistake = "run.dir out/depth-1/seed-0 holds files that no run has left; choose another folder"
+    mistake = "run.dir out/depth-1/seed-0 holds files that no run has left (thesis.txt); choose another folder"
     assert err.splitlines()[-1] == f"error: depth 1, seed 0: {mistake}"
     assert sum(line.endswith(f"depth 1, seed 0: FAILED: {mistake}") for line in err.splitlines()) == 1
     assert "depth 0, seed 0" not in err
