@@ -47,6 +47,7 @@ FAULTS: dict[str, dict[str, str]] = {
         "environment that truncates its own episodes": "never stepped past it; the critic's value stands there",
         "reward that is not one number": "environment, step, seed and its shape are named, `failure.json`, exit code 2",
         "discount outside [0, 1]": "environment, step and seed are named at every depth, `failure.json`, exit code 2",
+        "torch.set_default_dtype(torch.float64)": "trains with the same bits",
         "discount of another meaning in info": "ignored unless the environment declares that it names discounts",
     },
     "MDP files": {

@@ -268,7 +268,7 @@ def lambda_returns(
         discount_TB: gamma_t; 0 after a terminated step, so that nothing is bootstrapped there.
         lambda_: in [0, 1]; 1 gives Monte-Carlo returns.
     """
-    lambda_TB = lambda_ * rollout.follows_TB
+    lambda_TB = lambda_ * rollout.follows_TB.float()
     returns_TB = rollout.reward_TB + discount_TB * (1 - lambda_TB) * bootstrap_TB
     # Row by row on the CPU, where a few numbers cost least.
     row_TB, later_TB = returns_TB.cpu().numpy(), (discount_TB * lambda_TB).cpu().numpy()

@@ -108,7 +108,9 @@ class Encoder(nn.Module):
     def _scaled(self, observation_N: Tensor) -> Tensor:
         if observation_N.shape[1:] != self.shape:
             raise PgtsError(f"an observation has shape {tuple(observation_N.shape[1:])}; it must be {self.shape}")
-        return observation_N if self.scale == 1 else observation_N / self.scale
+        if self.scale == 1:
+            return observation_N
+        return (observation_N if observation_N.is_floating_point() else observation_N.float()) / self.scale
 
     def absorb(self, observation_N: Tensor) -> None:
         """Let the running statistics see these observations, where there are any."""
@@ -202,7 +204,7 @@ class CNN:
             height, width = ((side - self.kernel_size) // self.stride + 1 for side in (height, width))
             if min(height, width) < 1:
                 raise PgtsError(f"images of shape {encoder.shape} are too small for {self}")
-            conv = skip_init(nn.Conv2d, inputs, outputs, self.kernel_size, self.stride)
+            conv = skip_init(nn.Conv2d, inputs, outputs, self.kernel_size, self.stride, dtype=torch.float32)
             layers += [_orthogonal(conv, math.sqrt(2), generator), _ACTIVATIONS[self.activation]()]
             inputs = outputs
         flat = height * width * inputs
@@ -226,7 +228,7 @@ class Network(nn.Module):
     def __init__(self, trunk: Trunk, num_outputs: int, *, gain: float, generator: torch.Generator) -> None:
         super().__init__()
         self.trunk = trunk
-        head = skip_init(nn.Linear, trunk.num_features, num_outputs)
+        head = skip_init(nn.Linear, trunk.num_features, num_outputs, dtype=torch.float32)
         self.head: nn.Linear = _orthogonal(head, gain, generator)
         self._most_rows = max(1, _MOST_INPUTS // max(trunk.encoder.num_inputs, trunk.num_features))
 
@@ -285,7 +287,7 @@ class Network(nn.Module):
 def _dense(inputs: int, hidden: tuple[int, ...], activation: Activation, generator: torch.Generator) -> list[nn.Module]:
     layers: list[nn.Module] = []
     for outputs in hidden:
-        linear = skip_init(nn.Linear, inputs, outputs)
+        linear = skip_init(nn.Linear, inputs, outputs, dtype=torch.float32)
         layers += [_orthogonal(linear, math.sqrt(2), generator), _ACTIVATIONS[activation]()]
         inputs = outputs
     return layers
