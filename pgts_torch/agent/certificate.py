@@ -1,57 +1,169 @@
 """What a lookahead proves: an upper bound on what is missing to the optimum."""
 
 import math
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, final
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.models.base import Model
+from pgts_torch.agent.world import World
 from pgts_torch.search.engine import Search
+from pgts_torch.search.upper import UpperBound
+
+Trust = Literal["proved", "critic", "drawn starts"]
+"""How far a certificate can be trusted: it is a proof; it is off by what the critic is off at the start states; the
+same, and with a confidence of 95 % only, because the starts are known from episodes."""
+
+CONFIDENCE = 0.95
+"""Of all certificates of a run together, where starts are drawn."""
 
 
-def certificate(
-    search: Search,
-    model: Model,
-    experience: Rollout,
-    state_N: Int[Tensor, "N"],
-    v_N: Float[Tensor, "N"],
-    *,
-    expansions: int,
-    generator: torch.Generator,
-    ranks: Ranks,
-) -> float:
-    """An upper bound on J* - J^pi, true as far as v is right at the start states.        [docs/theory.md, Prop. 5]
+class Bound(NamedTuple):
+    """certificate: an upper bound on J* - J^pi; infinite where there is none.
 
-        J* - J^pi <= mean over starts of (T^n w)(s) - v(s),        w the highest value that there can be
+    estimate: what is likely to be missing, by which an adaptive depth is chosen: the certificate where all starts are
+        known, else the mean over those that were drawn; infinite where no largest value is known.
+    """
+
+    certificate: float
+    estimate: float
+
+
+class _Starts(NamedTuple):
+    """Start states, the share of each, and v there; None: v is unknown at some of them."""
+
+    state_N: Int[Tensor, "N"]
+    share_N: Float[Tensor, "N"]
+    v_N: Float[Tensor, "N"] | None
+
+
+@final
+class Certificates:
+    """Bounds on what is missing to the optimum, from what a search has asked of its model. They ask it nothing.
+
+    Where the start distribution mu is known, with v_hat that of `UpperBound`,
+
+        J* - J^pi <= sum_s mu(s) [ v_hat(s) - v(s) ]        [docs/theory.md, Prop. 6]
+
+    over all start states, whether an episode has begun there or not. It is true as far as v is v^pi there, and a proof
+    if the critic is exact and the model is the environment. All sums are rounded outward: by the critic's own `error`,
+    and by (N + 2) eps sum_s mu(s) (|v_hat(s)| + |v(s)|) for the sum over N starts. Where a critic says more than v_hat
+    it is off by at least the difference, which then counts in place of what is missing.
+
+    Where mu is not known the starts of the n episodes are fresh draws from it, made after pi was fixed. f = T^n w -
+    v^pi is a function of the start that no draw has changed, with values in [0, w - l], l the model's `lowest_value`.
+    So with a probability of 95 % for all iterations k = 1, 2, ... and all D depths that each may try (Hoeffding 1963)
+
+        J* - J^pi <= mean f + (w - l) sqrt( ln(1 / alpha_k) / 2n ),        alpha_k = 0.05 (6 / pi^2 k^2) / D
+
+    The certificate has v in place of v^pi, which the critic has fitted to these very episodes: it is off by the mean of
+    v - v^pi over the drawn starts. A bound of w - l or more says nothing and is infinite, as it is where the lookahead
+    has left out nodes: then T^n w would depend on what the other starts are. `estimate` is the mean of v_hat - v.
+
+    Several ranks have asked about different states. Each makes v_hat from its own, and the smallest counts.
 
     Args:
-        search, model: that can make T^n w, and what it asks.
-        experience: whose starts are meant.
-        state_N, v_N: the visited states, ascending, and v^pi there.
-        expansions: n. With as many as the lookahead of the iteration has, a process alone asks the model nothing new.
-        generator: of the search.
-        ranks: each of which looks from its part of the start states.
-
-    Returns:
-        The bound, at least 0, in reward units; infinite where the model knows no largest value, or the search proves
-        nothing.
+        world: says which starts there are.
+        search: what it has asked is what the bounds stand on.
+        critic: of v.
+        num_depths: D.
+        ranks: all of them get the same bounds.
     """
-    every_start, every_count = experience.state_TB[0].unique(return_counts=True)
-    starts, count_N = ranks.part(every_start), ranks.part(every_count)
-    highest = torch.tensor(model.highest_value, dtype=torch.float64, device=v_N.device)
 
-    def missing() -> float:
-        """Of the starts of this rank, their share of the mean."""
-        if not search.keeps_bounds:
-            return math.inf
-        upper_N = highest.expand(len(starts))
-        if expansions and len(starts) and bool(highest.isfinite()):
-            look = search(starts, depth=expansions - 1, generator=generator, v_leaf=lambda s: highest.expand(len(s)))
-            upper_N = look.q_BA.amax(-1)
-        missing_N = upper_N - v_N[torch.searchsorted(state_N, starts)]
-        return float(missing_N @ count_N.double() / experience.num_episodes)
+    def __init__(self, world: World, search: Search, critic: Critic, *, num_depths: int, ranks: Ranks) -> None:
+        self._world, self._search, self._critic = world, search, critic
+        self._num_depths, self._ranks = num_depths, ranks
+        self._upper: UpperBound | None = None
 
-    return max(0.0, sum(ranks.gather("certificate", missing)))
+    @property
+    def trust(self) -> Trust:
+        """How far the certificates can be trusted."""
+        if self._world.start_S is None:
+            return "drawn starts"
+        return "proved" if self._critic.is_exact and self._search.model.exact else "critic"
+
+    def starts(self, experience: Rollout, state_N: Int[Tensor, "N"], v_N: Float[Tensor, "N"]) -> _Starts:
+        """The start states of an iteration, and v there.
+
+        Args:
+            experience: whose starts count where no others are known.
+            state_N, v_N: the visited states, ascending, and v there by the lookahead of depth 0.
+        """
+        start_S = self._world.start_S
+        if start_S is None:
+            starts, count_N = experience.state_TB[0].unique(return_counts=True)
+            v_of_starts = v_N[torch.searchsorted(state_N, starts)]
+            return _Starts(starts, count_N.double() / experience.num_episodes, v_of_starts.double())
+        starts = torch.nonzero(start_S).flatten()
+        if not self._critic.draws_when_asked:
+            v_of_starts = self._critic.v(self._world.observe(starts))
+        elif bool(torch.isin(starts, state_N).all()):
+            v_of_starts = v_N[torch.searchsorted(state_N, starts)]
+        else:
+            return _Starts(starts, start_S[starts], None)
+        return _Starts(starts, start_S[starts], v_of_starts.double())
+
+    def bound(self, starts: _Starts, *, expansions: int, complete: bool, experience: Rollout, number: int) -> Bound:
+        """What is missing at most, after a lookahead.
+
+        Args:
+            expansions: n, how many levels it has expanded.
+            complete: whether it has left out no node of them.
+            number: of the iteration, from 1.
+        """
+        state_N, share_N, v_N = starts
+        if self._search.topology is None or v_N is None:
+            return Bound(math.inf, math.inf)
+        upper_N = self._together(lambda upper: upper.at(state_N), expansions)
+        estimate = float(share_N @ (upper_N - v_N).abs())
+        if self._world.start_S is not None:
+            rounding = (len(share_N) + 2) * torch.finfo(torch.float64).eps
+            size = float(share_N @ (upper_N.abs() + v_N.abs()))
+            certificate = estimate + rounding * size + (self._critic.error if self._critic.is_exact else 0.0)
+            return Bound(certificate, certificate) if math.isfinite(certificate) else Bound(math.inf, math.inf)
+        model = self._search.model
+        span = model.highest_value - model.lowest_value
+        alpha = (1 - CONFIDENCE) * 6 / (math.pi * number) ** 2 / self._num_depths
+        width = span * math.sqrt(-math.log(alpha) / (2 * experience.num_episodes))
+        if not (complete and width < span):
+            return Bound(math.inf, estimate)
+        swept_N = self._together(lambda upper: upper.swept(state_N, expansions), expansions)
+        certificate = float(share_N @ (swept_N - v_N).abs()) + width
+        return Bound(certificate if certificate < span else math.inf, estimate)
+
+    def state_dict(self, *, with_states: bool) -> dict[str, Any]:
+        """What later certificates depend on.
+
+        Args:
+            with_states: whether states keep their numbers; else nothing outlives an iteration.
+        """
+        return {} if self._upper is None or not with_states else self._upper.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave; the search has taken over what it asked about."""
+        self._upper = None
+        if state:
+            self._own().load_state_dict(state)
+
+    def _together(self, read: Callable[[UpperBound], Tensor], expansions: int) -> Float[Tensor, "N"]:
+        """The smallest of what is read from the bounds of all ranks."""
+
+        def tightened() -> Tensor:
+            upper = self._own()
+            upper.tighten(expansions)
+            return read(upper).cpu()
+
+        return torch.stack(self._ranks.gather("certificate", tightened)).amin(0).to(self._world.device)
+
+    def _own(self) -> UpperBound:
+        """The bound over what this rank has asked; anew where states are numbered anew."""
+        topology, model = self._search.topology, self._search.model
+        assert topology is not None
+        if self._upper is None or self._upper.topology is not topology:
+            self._upper = UpperBound(topology, model.highest_value, gamma=self._world.gamma)
+        return self._upper

@@ -25,10 +25,14 @@ class Critic(ABC):
 
     target: whether a lookahead stands on its v (one more level) or its Q.
     draws_when_asked: whether it draws when it is asked for values, not when it is fitted.
+    is_exact: whether its values are those of the policy, but for `error`.
+    error: by how much the mean of its v over the start distribution may miss J^pi; infinite where it is an estimate.
     """
 
     target: Target
     draws_when_asked: bool = False
+    is_exact: bool = False
+    error: float = math.inf
 
     @abstractmethod
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
@@ -63,7 +67,17 @@ class Critic(ABC):
 
 @final
 class ExactCritic(Critic):
-    """v^pi and Q^pi of the true MDP. For validation: what is trained with it has learned from the truth."""
+    """v^pi and Q^pi of the true MDP. For validation: what is trained with it has learned from the truth.
+
+    `error` is what rounding may have done to the solution v of its Bellman equation:
+
+        |mu^T v - J^pi| = |sum_s d^pi(s) (T^pi v - v)(s)| <= 2 sum_s d(s) ( |T^pi v - v|(s) + (A + K + 4) eps size )
+
+    T^pi v is computed, so eps size stands for each of its operations, size = max |r| + max |v|; the factor 2 is for the
+    rounding of d itself, which is far less.
+    """
+
+    is_exact = True
 
     def __init__(self, mdp: TabularMDP, *, target: Target = "v") -> None:
         self.mdp = mdp
@@ -73,7 +87,13 @@ class ExactCritic(Critic):
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
         """Solve the Bellman equation of the policy; the rollout only says what the policy sees of the states."""
         states = torch.arange(self.mdp.num_states, device=rollout.state_TB.device)
-        self._evaluation = exact.evaluate(self.mdp, listed(policy, rollout.observe(states)))
+        pi_SA = exact.check_policy(self.mdp, listed(policy, rollout.observe(states)))
+        self._evaluation = evaluation = exact.evaluate(self.mdp, pi_SA)
+        rewards_SA, allowed_SA = self.mdp.outcomes.reward_NA, pi_SA > 0
+        size = float(rewards_SA[allowed_SA].abs().max() + evaluation.v_S.abs().max())
+        steps = self.mdp.num_actions + self.mdp.outcomes.num_outcomes + 4
+        residual_S = (torch.where(allowed_SA, pi_SA * evaluation.q_SA, 0.0).sum(-1) - evaluation.v_S).abs()
+        self.error = 2 * float(evaluation.d_S @ (residual_S + steps * torch.finfo(torch.float64).eps * size))
         return {}
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:

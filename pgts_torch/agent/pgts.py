@@ -29,7 +29,7 @@ from pgts_torch.agent.build import (
     make_search,
     make_update,
 )
-from pgts_torch.agent.certificate import certificate
+from pgts_torch.agent.certificate import Certificates
 from pgts_torch.agent.copies import make_vector_env, more_copies, own_actions, registered_limit
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.iteration import Iteration, Seen
@@ -164,6 +164,11 @@ class PGTS:
         self.search: Search | None = None
         if isinstance(self.estimator, LookaheadAdvantages):
             self.search = make_search(search, self.world)
+        self.certificates: Certificates | None = None
+        if self.search is not None:
+            self.certificates = Certificates(
+                self.world, self.search, self.critic, num_depths=len(self.depths), ranks=self.ranks
+            )
         check_parts(self._arguments, self.world, self.policy, self.critic, self.update, self.estimator)
         self._own_actions = None if isinstance(env, VectorEnv) else own_actions(self.world.env)
         self._predicting = stream(seed, "predict", device=self.device)
@@ -189,7 +194,7 @@ class PGTS:
         seen = taken or self._look(experience)
 
         # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is proved good enough.
-        if not self._proved(seen.certificate):
+        if not self._is_enough(seen.certificate):
             observation_N = self.world.observe(seen.state_N)
             losses |= self.update(self.policy, observation_N, seen.advantage_NA, seen.weight_N, generator=draws.common)
 
@@ -230,11 +235,19 @@ class PGTS:
         v_N = (pi_NA * shallow.q_BA).sum(-1)
         check_finite("value", "the policy's value", v_N, states)
         _, occupancy_N = experience.visits("occupancy")
+        assert self.certificates is not None
+        starts = self.certificates.starts(experience, states, v_N)
         for depth in self.depths:
             look = self._look_together(states, depth) if depth else shallow
             gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
-            bound = self._certificate(experience, states, v_N, depth)
-            if float(gap_N @ occupancy_N) > self.tolerance * bound or self._proved(bound):
+            bound, estimate = self.certificates.bound(
+                starts,
+                expansions=depth + (self.critic.target == "v"),
+                complete=float(look.pruned_BA.max()) == 0,
+                experience=experience,
+                number=self.num_iterations + 1,
+            )
+            if float(gap_N @ occupancy_N) > self.tolerance * estimate or self._is_enough(bound):
                 break
         return Seen(states, weight_N, pi_NA, centred(look.q_BA, pi_NA), depth, look, gap_N, bound)
 
@@ -312,22 +325,8 @@ class PGTS:
         """All searches of an iteration see the same samples, so that their differences are not noise."""
         return self._stream("search")
 
-    def _certificate(self, experience: Rollout, state_N: Tensor, v_N: Tensor, depth: int) -> float:
-        assert self.search is not None
-        assert self.world.model is not None
-        expansions = depth + (self.critic.target == "v")
-        return certificate(
-            self.search,
-            self.world.model,
-            experience,
-            state_N,
-            v_N,
-            expansions=expansions,
-            generator=self._search_stream(),
-            ranks=self.ranks,
-        )
-
-    def _proved(self, bound: float) -> bool:
+    def _is_enough(self, bound: float) -> bool:
+        """Whether the certificate lets training end."""
         return self.stop_at is not None and bound <= self.stop_at
 
     def learn(self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool = False) -> Self:
@@ -351,7 +350,7 @@ class PGTS:
                 bar.update(iteration.experience.num_steps)
                 answers = [call(self, iteration) for call in callbacks]
                 going = self.ranks.gather("whether to go on", lambda: False not in answers)  # noqa: B023
-                if not all(going) or self._proved(iteration.certificate):
+                if not all(going) or self._is_enough(iteration.certificate):
                     break
         return self
 
@@ -431,8 +430,17 @@ class PGTS:
         """Policy, critic, update, what the search of each rank remembers, and counters: tensors on the CPU and plain
         values. Of several processes all must ask for it."""
         search, with_states = self.search, self.world.mdp is not None
+        certificates = self.certificates
         searches = self.ranks.gather(
-            "searches", lambda: {} if search is None else search.state_dict(with_states=with_states)
+            "searches",
+            lambda: (
+                {}
+                if search is None or certificates is None
+                else {
+                    **search.state_dict(with_states=with_states),
+                    "upper": certificates.state_dict(with_states=with_states),
+                }
+            ),
         )
         return {
             "searches": dict(enumerate(searches)),
@@ -449,8 +457,10 @@ class PGTS:
         self.policy.load_state_dict(state["policy"])
         self.critic.load_state_dict(state["critic"])
         self.update.load_state_dict(state["update"])
-        if self.search is not None:
-            self.search.load_state_dict(state["searches"][self.ranks.rank % len(state["searches"])])
+        if self.search is not None and self.certificates is not None:
+            own = state["searches"][self.ranks.rank % len(state["searches"])]
+            self.search.load_state_dict(own)
+            self.certificates.load_state_dict(own["upper"])
         self.num_iterations = state["num_iterations"]
         self.num_env_steps = state["num_env_steps"]
         self.num_model_calls = state["num_model_calls"]

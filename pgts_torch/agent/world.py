@@ -40,6 +40,7 @@ class World(ABC):
     device: where observations and states live.
     model: what a lookahead may ask; None: nothing.
     mdp: the exact truth, where there is one.
+    start_S: the start distribution mu over all states; None where it is known from episodes only.
     """
 
     env: VectorEnv
@@ -49,6 +50,7 @@ class World(ABC):
     device: torch.device
     model: Model | None = None
     mdp: TabularMDP | None = None
+    start_S: Float[Tensor, "S"] | None = None
 
     @abstractmethod
     def encode(self, observation: Any) -> Tensor:
@@ -95,15 +97,20 @@ class TabularWorld(World):
     Args:
         env: copies of it.
         mdp: the table.
+        starts_known: whether the start distribution of the table is that of the environment; False: it was
+            estimated from resets.
     """
 
-    def __init__(self, env: VectorEnv, mdp: TabularMDP, *, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, env: VectorEnv, mdp: TabularMDP, *, starts_known: bool = True, device: torch.device | str = "cpu"
+    ) -> None:
         self.env, self.mdp = env, mdp
         self.num_actions = mdp.num_actions
         self.observation_space = env.single_observation_space
         self.gamma = float(mdp.outcomes.discount_NAK.max())
         self.device = torch.device(device)
         self.model: TabularModel = TabularModel(mdp, device=device)
+        self.start_S = mdp.start_S.to(self.device) if starts_known else None
 
     @property
     def mdp_shape(self) -> tuple[int, int]:

@@ -33,6 +33,7 @@ class Model(ABC):
     exact: whether it claims to be the environment, as a table, dynamics or a simulator do, and a learned model does
         not: what the environment does is held to it, and a bound that it proves is called proved.
     highest_value: an upper bound of v* in every state; infinite where none is known.
+    lowest_value: a lower bound of v^pi, of every policy in every state; -infinite where none is known.
     generation: how often the model has forgotten its states and begun to number them anew.
     """
 
@@ -40,6 +41,7 @@ class Model(ABC):
     num_actions: int
     exact: bool = False
     highest_value: float = math.inf
+    lowest_value: float = -math.inf
     generation: int = 0
     device: torch.device
     dtype: torch.dtype

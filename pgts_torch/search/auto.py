@@ -48,7 +48,6 @@ class AutoSearch(Search):
         self._samples = 0
         self._most_asked = 0, 0
         self._picked = "nothing yet"
-        self.keeps_bounds = self.topology is not None
 
     def _look(
         self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator
@@ -60,7 +59,7 @@ class AutoSearch(Search):
             except RandomOutcomes:
                 if not isinstance(self.model, SamplingModel):
                     raise
-                self.topology, self.keeps_bounds = None, False
+                self.topology = None
         return self._sampled(root_B, depth, expansions, q_leaf, v_leaf, generator)
 
     def _listed(

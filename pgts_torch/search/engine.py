@@ -26,12 +26,10 @@ class Search(ABC):
     """(T^m Q)(s, .) at the roots of one model.
 
     model_calls: how many (state, action) it has asked so far.
-    keeps_bounds: whether, with upper bounds of v* at the leaves, its values are upper bounds of q*.
     topology: what it has asked of a model that lists outcomes; None: it remembers no outcomes.
     choices: the names of the attributes by which earlier searches decide how later ones are made.
     """
 
-    keeps_bounds: bool
     topology: Topology | None = None
     choices: tuple[str, ...] = ()
 
@@ -88,7 +86,7 @@ class Search(ABC):
         for name in self.choices:
             setattr(self, name, state["choices"][name])
         if not state["lists"]:
-            self.topology, self.keeps_bounds = None, False
+            self.topology = None
         elif self.topology is not None:
             self.topology.recall(state["asked"].to(self.model.device))
 
@@ -107,8 +105,6 @@ class ExpectimaxSearch(Search):
         max_width: the most states of a level that are unfolded. Default: all.
         max_bytes: the most memory that the outcomes of one search may take.
     """
-
-    keeps_bounds = True
 
     def __init__(
         self,
@@ -154,8 +150,6 @@ class SampledSearch(Search):
         max_nodes: the most nodes of one search.
         max_bytes: the most memory that its outcomes may take.
     """
-
-    keeps_bounds = False
 
     def __init__(
         self,
@@ -223,7 +217,6 @@ class MCTSSearch(Search):
         if samples is not None and samples < 1:
             raise PgtsError(f"samples is {samples}; it must be at least 1")
         lists = samples is None and isinstance(model, EnumeratingModel)
-        self.keeps_bounds = lists
         self.topology = Topology(listing(model, "mcts"), max_bytes=max_bytes) if lists else None
         self.samples = samples or DEFAULT_SAMPLES
         if not lists:

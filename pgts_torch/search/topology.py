@@ -2,7 +2,7 @@
 
 import math
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import torch
@@ -68,7 +68,7 @@ class _Rows:
 
     def __init__(self) -> None:
         self._table: Outcomes | None = None
-        self._count = 0
+        self.count = 0
 
     @property
     def num_outcomes(self) -> int:
@@ -80,9 +80,17 @@ class _Rows:
         assert self._table is not None
         return self._table.rows(row_N)
 
+    def all(self) -> Outcomes:
+        """All rows, in the memory where they lie."""
+        assert self._table is not None
+        table, n = self._table, self.count
+        return Outcomes(
+            table.reward_NA[:n], table.prob_NAK[:n], table.discount_NAK[:n], table.child_NAK[:n], table.num_children
+        )
+
     def append(self, more: Outcomes) -> Int[Tensor, "N"]:
         """Add copies of these rows, padded to the largest K so far, and say where they are."""
-        first, last = self._count, self._count + more.num_states
+        first, last = self.count, self.count + more.num_states
         row_N = torch.arange(first, last, device=more.device)
         table = self._table or more.rows(row_N[:0])
         K = max(table.num_outcomes, more.num_outcomes)
@@ -92,7 +100,7 @@ class _Rows:
             table = _padded(table, table.num_states, K)
         for mine, given in zip(_tensors(table), _tensors(more), strict=True):
             mine[first:last, ..., : given.shape[-1]] = given
-        self._table, self._count = table, last
+        self._table, self.count = table, last
         return row_N
 
 
@@ -192,6 +200,19 @@ class Topology:
     def asked(self) -> Int[Tensor, "N"]:
         """The states that the model has been asked about, ascending."""
         return torch.nonzero(self._row_S >= 0).flatten()
+
+    @property
+    def num_expanded(self) -> int:
+        """How many states these are."""
+        return self._known.count
+
+    def expanded(self) -> tuple[Int[Tensor, "X"], Outcomes]:
+        """The states that the model has been asked about, in the order of asking, and what follows them, in terms of
+        states and in the memory where it lies."""
+        asked = self.asked
+        state_X = torch.empty_like(asked)
+        state_X[self._row_S[asked]] = asked
+        return state_X, replace(self._known.all(), num_children=self.model.num_states)
 
     @torch.inference_mode(False)
     @torch.no_grad()

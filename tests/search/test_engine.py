@@ -80,7 +80,6 @@ def test_where_all_paths_fit_the_automatic_search_looks_at_all_of_them_and_says_
     assert str(search) == "nothing yet"
     nodes = look(search).nodes
     assert str(search) == f"expectimax: the model lists its outcomes, and {nodes} nodes hold all paths"
-    assert search.keeps_bounds
 
 
 def test_where_they_do_not_fit_it_keeps_to_the_budget_and_asks_nothing_twice():
@@ -110,7 +109,6 @@ def test_a_model_that_only_draws_is_sampled_and_more_often_where_paths_met():
     assert samples[0] == 2
     assert samples == sorted(samples)
     assert samples[-1] > 2
-    assert not search.keeps_bounds
 
 
 def test_the_samples_of_a_model_in_which_paths_rarely_meet_stay_within_the_budget():
@@ -185,7 +183,6 @@ def test_a_tree_search_of_a_model_that_only_draws_is_one_of_what_was_drawn():
     torch.testing.assert_close(seen.q_BA, expected.q_BA)
     assert seen.model_calls <= expected.model_calls
     assert not torch.equal(look(search, seed=1).q_BA, seen.q_BA)
-    assert not search.keeps_bounds
     assert str(search) == "mcts, 100000 simulations, merged, 2 drawn outcomes of each action"
     assert torch.equal(look(MCTSSearch(TabularModel(GARNET), simulations=100_000, samples=2)).q_BA, seen.q_BA)
     with pytest.raises(PgtsError, match="samples is 0"):
@@ -226,4 +223,4 @@ def test_a_simulator_that_turns_out_to_be_random_is_sampled():
         search = AutoSearch(model, max_nodes=10_000)
         search(model.roots([made], [observation]), depth=2, v_leaf=torch.zeros_like, generator=stream(0, "search"))
         assert str(search).startswith(picked)
-        assert search.keeps_bounds is not slippery
+        assert (search.topology is None) is slippery

@@ -1,0 +1,173 @@
+"""Upper bounds of v* from what has been asked of a model so far. They ask it nothing."""
+
+import math
+from typing import Any, final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.search.topology import Topology
+from pgts_torch.tabular.exact import UNDISCOUNTED
+
+_WORK, _MOST_SWEEPS = 2**20, 256
+"""About how many outcomes are swept in one call, and the most sweeps."""
+
+_EVERY = 8
+"""Sweeps from one look at whether they have converged to the next."""
+
+_EPS = torch.finfo(torch.float64).eps
+
+_CONVERGED = 1e-12
+"""In units of the largest value: a sweep that changes less ends the sweeping."""
+
+
+@final
+class UpperBound:
+    """v_hat >= v*, over the states X that a topology has expanded.        [docs/theory.md, Prop. 6]
+
+        v_hat = T v_hat  on X,        v_hat = w >= v*  elsewhere
+
+    Two functions are swept at once, and go on where the last call left them as long as X is the same:
+
+    - one from above, from w: every sweep of an upper bound of v* is one;
+    - one from below, which comes to v_hat in about as many sweeps as the best plan has steps, however close the
+      discount is to 1. As it is swept it proves v_hat <= T u + beta delta / (1 - beta), with delta = max over X of
+      T u - u, not below 0, and beta the largest sum_k p_k gamma_k in X (MacQueen 1966; Prop. 5).
+
+    A state that may stay where it is for ever, undiscounted and for nothing, counts as one outside X: there T says
+    nothing. Such is one in which an episode was truncated.
+
+    The bound is the smaller of the two and never rises. A call has a budget of sweeps, so it may take several calls
+    to come down to v_hat; at any time it is an upper bound.
+
+    Rounding is outward. A computed backup of u misses the exact one by at most (K + 4) eps (max |r| + max |u|): K
+    products p gamma u with p gamma rounded, their sum and the reward, eps that of float64. This is added to every sweep
+    from above, and twice to delta. w is enlarged by the share 1,024 eps / (1 - gamma), for the sums of probabilities
+    and the division that it came from.
+
+    Args:
+        topology: what is known of the model.
+        highest: w, the model's `highest_value`.
+        gamma: the largest discount of the model.
+    """
+
+    def __init__(self, topology: Topology, highest: float, *, gamma: float) -> None:
+        self.topology = topology
+        self.w = (
+            highest + abs(highest) * 1024 * _EPS / (1 - min(gamma, UNDISCOUNTED)) if highest < math.inf else highest
+        )
+        self._taken, self._settled = 0, True
+        self._state_X = torch.empty(0, dtype=torch.int64, device=topology.model.device)
+        self._bound_S = torch.empty(0, dtype=torch.float64, device=topology.model.device)
+        self._below_S = self._bound_S
+
+    def tighten(self, least: int) -> None:
+        """Sweep at least so often, unless nothing changes any more, and as far as the budget goes.
+
+        With as many sweeps as a lookahead of full width has levels, the bound at its roots is no larger than T^n w.
+        """
+        if self.w < math.inf:
+            self._take_in()
+            if not self._settled and len(self._state_X):
+                entries = len(self._reward) * self._num_outcomes
+                self._sweep(max(least, min(_MOST_SWEEPS, _WORK // entries)))
+
+    def at(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+        """The bound; w at states that no search has expanded."""
+        return self._grown(self._bound_S)[state_N]
+
+    def swept(self, state_N: Int[Tensor, "N"], times: int) -> Float[Tensor, "N"]:
+        """T^n w, n = `times`, at states from which everything within n - 1 steps is in X: whatever else is in X."""
+        u_S1 = torch.full_like(self._grown(self._bound_S), self.w).unsqueeze(-1)
+        if self.w < math.inf:
+            self._take_in()
+            for _ in range(times if len(self._state_X) else 0):
+                u_S1[self._state_X] = self._backed_up(u_S1)
+        return u_S1[state_N, 0]
+
+    def state_dict(self) -> dict[str, Any]:
+        """What later bounds depend on, in the order of `topology.asked`, on the CPU."""
+        asked = self.topology.asked
+        return {
+            "bound": self._grown(self._bound_S)[asked].cpu(),
+            "below": self._grown(self._below_S)[asked].cpu(),
+            "settled": self._settled,
+            "current": self._taken == self.topology.num_expanded,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave; the topology has recalled what was asked."""
+        if self.w < math.inf:
+            self._take_in()
+            asked = self.topology.asked
+            self._bound_S[asked] = state["bound"].to(asked.device)
+            self._below_S[asked] = state["below"].to(asked.device)
+            self._settled = state["settled"]
+            if not state["current"]:  # states were expanded since: to be taken in once more
+                self._taken = -1
+
+    def _take_in(self) -> None:
+        """The states that were expanded since. What was swept from below begins anew: it need not be below any more."""
+        if self._taken == self.topology.num_expanded:
+            return
+        self._taken, self._settled = self.topology.num_expanded, False
+        self._state_X, outcomes = _without_ends(*self.topology.expanded())
+        self._num_outcomes, self._rounding = outcomes.num_outcomes, (outcomes.num_outcomes + 4) * _EPS
+        self._reward, self._weight = outcomes.reward_NA.double().reshape(-1, 1), outcomes.to(dtype=torch.float64).weight
+        allowed = self._reward.isfinite()
+        reward, every_S1 = self._reward[allowed], torch.ones_like(self._grown(self._bound_S)).unsqueeze(-1)
+        self._largest_reward = float(reward.abs().max()) if len(reward) else 0.0
+        beta = (self._weight @ every_S1)[allowed]
+        self._beta = (float(beta.max()) if len(beta) else 0.0) * (1 + self._rounding)
+        self._bound_S, self._below_S = self._grown(self._bound_S), self._grown(self._below_S)
+        if self._beta < UNDISCOUNTED and len(reward):
+            self._below_S[self._state_X] = min(0.0, float(reward.min())) / (1 - self._beta)
+
+    def _sweep(self, times: int) -> None:
+        """So many sweeps of both, or until they have converged."""
+        u_S2 = torch.stack([self._bound_S, self._below_S], -1)
+        old_X2, error = u_S2[self._state_X], 0.0
+        for n in range(times):
+            new_X2 = self._backed_up(u_S2)
+            # From above a sweep never rises, but for rounding.
+            new_X2[:, 0] = torch.minimum(new_X2[:, 0], old_X2[:, 0])
+            u_S2[self._state_X] = new_X2
+            if (n + 1) % _EVERY == 0 or n == times - 1:
+                size = self._largest_reward + float(u_S2.abs().max())
+                fall, rise = (old_X2[:, 0] - new_X2[:, 0]).max(), (new_X2[:, 1] - old_X2[:, 1]).max()
+                self._settled = float(fall) <= _CONVERGED * size
+                error = self._rounding * size
+                delta = max(0.0, float(rise)) + 2 * error
+                if self._beta < UNDISCOUNTED:
+                    above_X = new_X2[:, 1] + error + self._beta * delta / (1 - self._beta)
+                    self._settled = self._settled or float(rise) <= _CONVERGED * size
+                if self._settled:
+                    break
+            old_X2 = new_X2
+        self._bound_S, self._below_S = u_S2.unbind(-1)
+        if self._beta < UNDISCOUNTED:
+            self._bound_S[self._state_X] = torch.minimum(new_X2[:, 0], above_X)
+
+    def _backed_up(self, u_SC: Float[Tensor, "S C"]) -> Float[Tensor, "X C"]:
+        """T u on X, for each of C functions; the first rounded up."""
+        q_XAC = torch.addmm(self._reward, self._weight, u_SC).view(len(self._state_X), -1, u_SC.shape[1])
+        new_XC = q_XAC.amax(1)
+        new_XC[:, 0] += self._rounding * (self._largest_reward + u_SC[:, 0].abs().max())
+        return new_XC
+
+    def _grown(self, value_S: Float[Tensor, "S"]) -> Float[Tensor, "more"]:
+        """With w for the states that the model has numbered since."""
+        return torch.nn.functional.pad(value_S, (0, self.topology.model.num_states - len(value_S)), value=self.w)
+
+
+def _without_ends(state_X: Int[Tensor, "X"], outcomes: Outcomes) -> tuple[Int[Tensor, "kept"], Outcomes]:
+    """Without the states that may stay where they are for ever, undiscounted and for nothing."""
+    stays_XAK = (outcomes.child_NAK == state_X[:, None, None]) & (outcomes.discount_NAK >= UNDISCOUNTED)
+    stays_XA = torch.where(stays_XAK, outcomes.prob_NAK, 0.0).sum(-1) >= UNDISCOUNTED
+    ends_X = (stays_XA & (outcomes.reward_NA == 0)).any(-1)
+    if not bool(ends_X.any()):
+        return state_X, outcomes
+    kept = torch.nonzero(~ends_X).flatten()
+    return state_X[kept], outcomes.rows(kept)
