@@ -47,6 +47,17 @@ class Model(ABC):
     dtype: torch.dtype
 
 
+def value_range(reward_range: tuple[float, float], gamma: float) -> tuple[float, float]:
+    """What a state can be worth if all rewards are in [low, high] and nothing is earned after an end:
+
+    min(0, low) / (1 - gamma)  to  max(0, high) / (1 - gamma),        infinite where gamma is 1, 0 where it is 0 / 0
+    """
+    low, high = min(0.0, reward_range[0]), max(0.0, reward_range[1])
+    if gamma >= 1:
+        return -math.inf if low < 0 else 0.0, math.inf if high > 0 else 0.0
+    return low / (1 - gamma), high / (1 - gamma)
+
+
 class EnumeratingModel(Model):
     """A model that lists all outcomes of a state."""
 

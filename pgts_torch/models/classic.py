@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.base import value_range
 from pgts_torch.models.environments import base_actions, changing_wrapper
 from pgts_torch.models.numbering import Merge
 from pgts_torch.models.snapshots import env_name
@@ -80,8 +81,7 @@ class ClassicModel(TensorModel):
         self._c = SimpleNamespace(**self._read)
         self._effect_AE = torch.tensor([self._effect(action) for action in actions], dtype=dtype, device=self.device)
         if action_repeat == 1:  # an operator of repeated actions gives no upper bound of v*
-            best = self._highest_reward()
-            self.highest_value = 0.0 if best == 0 else best / (1 - gamma) if gamma < 1 else math.inf
+            self.lowest_value, self.highest_value = value_range(self._reward_range(), gamma)
         self._same: list[Any] = []
 
     @classmethod
@@ -149,8 +149,8 @@ class ClassicModel(TensorModel):
         """What the dynamics need to know of an action of the environment."""
 
     @abstractmethod
-    def _highest_reward(self) -> float:
-        """No reward is higher."""
+    def _reward_range(self) -> tuple[float, float]:
+        """No reward is lower or higher."""
 
     @abstractmethod
     def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
@@ -178,8 +178,8 @@ class CartPole(ClassicModel):
     def _effect(self, action: Any) -> tuple[float, ...]:
         return (self._c.force_mag if action == 1 else -self._c.force_mag,)
 
-    def _highest_reward(self) -> float:
-        return 0.0 if self._c._sutton_barto_reward else 1.0
+    def _reward_range(self) -> tuple[float, float]:
+        return (-1.0, 0.0) if self._c._sutton_barto_reward else (0.0, 1.0)
 
     def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
         (x, x_dot, theta, theta_dot), (force,), c = state, effect, self._c
@@ -224,8 +224,8 @@ class Acrobot(ClassicModel):
     def _effect(self, action: Any) -> tuple[float, ...]:
         return (self._c.AVAIL_TORQUE[action],)
 
-    def _highest_reward(self) -> float:
-        return 0.0
+    def _reward_range(self) -> tuple[float, float]:
+        return -1.0, 0.0
 
     def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
         start_4N, (torque,), dt = torch.stack(list(state)), effect, self._c.dt
@@ -277,8 +277,8 @@ class MountainCar(ClassicModel):
     def _effect(self, action: Any) -> tuple[float, ...]:
         return ((action - 1) * self._c.force,)
 
-    def _highest_reward(self) -> float:
-        return 0.0
+    def _reward_range(self) -> tuple[float, float]:
+        return -1.0, 0.0
 
     def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
         (position, velocity), (push,), c = state, effect, self._c
@@ -307,8 +307,9 @@ class Pendulum(ClassicModel):
         torque = np.clip(action, -c.max_torque, c.max_torque)[0]
         return float(3.0 / (c.m * c.l**2) * torque), float(0.001 * (torque**2))
 
-    def _highest_reward(self) -> float:
-        return 0.0
+    def _reward_range(self) -> tuple[float, float]:
+        dearest = float(self._effect_AE[:, 1].max())
+        return -(math.pi**2 + 0.1 * self._c.max_speed**2 + dearest), 0.0
 
     def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
         (angle, speed), (push, price), c = state, effect, self._c

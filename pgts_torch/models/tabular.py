@@ -1,6 +1,5 @@
 """A tabular MDP as a model: it enumerates and it samples."""
 
-import math
 from dataclasses import replace
 from typing import Any, final
 
@@ -13,6 +12,7 @@ from pgts_torch.bellman import Outcomes
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.seeding import uniform
 from pgts_torch.tabular.mdp import TabularMDP
+from pgts_torch.tabular.stationary import highest_value, lowest_value
 
 
 @final
@@ -35,7 +35,7 @@ class TabularModel(EnumeratingModel, SamplingModel):
         self.num_actions = mdp.num_actions
         self.device = self.table.device
         self.dtype = dtype
-        self.highest_value = _highest_value(mdp.outcomes)
+        self.highest_value, self.lowest_value = highest_value(mdp.outcomes), lowest_value(mdp.outcomes)
         self._cumulative_NAK = self.table.prob_NAK.cumsum(-1)
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
@@ -71,12 +71,3 @@ def tabular_truth(env: gymnasium.Env | gymnasium.vector.VectorEnv, *, gamma: flo
         return TabularMDP.from_gymnasium(single, gamma)
     # Ours pay r(s, a), whichever outcome is drawn.
     return mdp if mdp.reward_SAK is None else replace(mdp, reward_SAK=None)
-
-
-def _highest_value(outcomes: Outcomes) -> float:
-    """The largest reward for ever, r_max / (1 - gamma_max); nothing at all if that is less and episodes may end."""
-    gamma = float(outcomes.discount_NAK.max())
-    highest_reward = float(outcomes.reward_NA.max())
-    if gamma == 1:
-        return math.inf if highest_reward > 0 else 0.0
-    return max(0.0, highest_reward) / (1 - gamma)

@@ -145,7 +145,7 @@ def certificate(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -> flo
     """
     expanded_S = _reached_within(mdp, mdp.start_S > 0, exact.check_depth(depth))
     beyond_S = _followers(mdp, expanded_S) & ~expanded_S
-    w = _highest_value(mdp) if beyond_S.any() else 0.0
+    w = highest_value(mdp.outcomes) if beyond_S.any() else 0.0
     if math.isinf(w):
         return math.inf
     outcomes = mdp.outcomes
@@ -377,16 +377,23 @@ def _reward_bound(mdp: TabularMDP, depth: int, states_S: Bool[Tensor, "S"]) -> f
     return math.inf if gamma >= UNDISCOUNTED else gamma ** (depth + 1) * (high - low) / (1 - gamma)
 
 
-def _highest_value(mdp: TabularMDP) -> float:
+def highest_value(outcomes: Outcomes) -> float:
     """The most that a state can be worth if only gamma, r_max and whether something ends are known.
 
-    r_max / (1 - gamma), from earning r_max for ever; but r_max, from ending at once, if that is more.
+    r_max / (1 - gamma), from earning r_max for ever; but r_max, from ending at once, if that is more. Where gamma is 1
+    it is infinite, unless no reward is positive: then it is r_max.
     """
-    outcomes, gamma = mdp.outcomes, _largest_discount(mdp.outcomes)
-    highest = float(outcomes.reward_NA.max())
-    if highest <= 0 and _has_ends(outcomes, gamma):
+    gamma, highest = _largest_discount(outcomes), float(outcomes.reward_NA.max())
+    if highest <= 0 and (gamma >= UNDISCOUNTED or _has_ends(outcomes, gamma)):
         return highest
     return math.inf if gamma >= UNDISCOUNTED else highest / (1 - gamma)
+
+
+def lowest_value(outcomes: Outcomes) -> float:
+    """The least that a policy can be worth in a state, if only as much is known as in `highest_value`. Actions that
+    are not allowed, with rewards of -inf, do not count."""
+    negated_NA = -outcomes.reward_NA
+    return -highest_value(replace(outcomes, reward_NA=torch.where(negated_NA < math.inf, negated_NA, -math.inf)))
 
 
 def _has_ends(outcomes: Outcomes, gamma: float) -> bool:

@@ -494,7 +494,7 @@ def test_the_certificate_is_no_looser_than_the_bound_from_rewards():
     sharper = 0
     for seed, case in enumerate(family()[1::4]):
         pi_SA = random_policy(case.mdp, seed)
-        J, w = exact.evaluate(case.mdp, pi_SA).J, stationary._highest_value(case.mdp)
+        J, w = exact.evaluate(case.mdp, pi_SA).J, stationary.highest_value(case.mdp.outcomes)
         for depth in (0, 2):
             w_S = torch.full((case.mdp.num_states,), w, dtype=torch.float64)
             simple = float(case.mdp.start_S @ sweep(case.mdp.outcomes, w_S, depth + 1)) - J
@@ -520,7 +520,7 @@ def test_where_everything_costs_hope_is_to_pay_once_and_end(gamma):
     lack = exact.optimal(costs).J - exact.evaluate(costs, pi_SA).J
     first = stationary.certificate(costs, pi_SA, 0)
     assert lack < first < -exact.evaluate(costs, pi_SA).J
-    assert stationary._highest_value(end_or_stay(gamma, reward=-1.0)) == -1
+    assert stationary.highest_value(end_or_stay(gamma, reward=-1.0).outcomes) == -1
 
 
 @given(mdps(), st.integers(0, 10**6))
