@@ -72,6 +72,9 @@ FAULTS: dict[str, dict[str, str]] = {
         "gradient that is not finite": STOPPED,
         "step that overflows": "taken back: policy and optimiser as before",
     },
+    "Proofs": {
+        "an episode that begins in one of several states": "a proof is over all start states, not over those drawn",
+    },
     "Memory": {
         "lookahead of too many nodes": "refused before the model is asked, with the number and what to set",
         "lookahead larger than memory": "refused before the model is asked, with the number and what to set",

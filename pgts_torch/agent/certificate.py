@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.critics import Critic, ExactCritic
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import World
@@ -120,12 +120,10 @@ class Certificates:
         if self._search.topology is None or v_N is None:
             return Bound(math.inf, math.inf)
         upper_N = self._together(lambda upper: upper.at(state_N), expansions)
-        estimate = float(share_N @ (upper_N - v_N).abs())
         if self._world.start_S is not None:
-            rounding = (len(share_N) + 2) * torch.finfo(torch.float64).eps
-            size = float(share_N @ (upper_N.abs() + v_N.abs()))
-            certificate = estimate + rounding * size + (self._critic.error if self._critic.is_exact else 0.0)
-            return Bound(certificate, certificate) if math.isfinite(certificate) else Bound(math.inf, math.inf)
+            certificate = self._over_all(share_N, upper_N, v_N)
+            return Bound(certificate, certificate)
+        estimate = float(share_N @ (upper_N - v_N).abs())
         model = self._search.model
         span = model.highest_value - model.lowest_value
         alpha = (1 - CONFIDENCE) * 6 / (math.pi * number) ** 2 / self._num_depths
@@ -135,6 +133,24 @@ class Certificates:
         swept_N = self._together(lambda upper: upper.swept(state_N, expansions), expansions)
         certificate = float(share_N @ (swept_N - v_N).abs()) + width
         return Bound(certificate if certificate < span else math.inf, estimate)
+
+    def of(self, pi_SA: Float[Tensor, "S A"]) -> float:
+        """The certificate of a policy, from all that this rank has asked so far; infinite unless it is a proof."""
+        start_S, critic = self._world.start_S, self._critic
+        if self.trust != "proved" or self._search.topology is None:
+            return math.inf
+        assert isinstance(critic, ExactCritic)
+        assert start_S is not None
+        critic.solve(pi_SA)
+        starts = torch.nonzero(start_S).flatten()
+        return self._over_all(start_S[starts], self._own().at(starts), critic.v(starts))
+
+    def _over_all(self, share_N: Tensor, upper_N: Tensor, v_N: Tensor) -> float:
+        """sum_s mu(s) [ v_hat(s) - v(s) ], rounded up; infinite where one of them is."""
+        rounding = (len(share_N) + 2) * torch.finfo(torch.float64).eps
+        size = float(share_N @ (upper_N.abs() + v_N.abs()))
+        error = self._critic.error if self._critic.is_exact else 0.0
+        return float(share_N @ (upper_N - v_N).abs()) + rounding * size + error
 
     def state_dict(self, *, with_states: bool) -> dict[str, Any]:
         """What later certificates depend on.
@@ -151,7 +167,7 @@ class Certificates:
             self._own().load_state_dict(state)
 
     def _together(self, read: Callable[[UpperBound], Tensor], expansions: int) -> Float[Tensor, "N"]:
-        """The smallest of what is read from the bounds of all ranks."""
+        """The smallest of what is read from the bounds of all ranks, after some sweeps."""
 
         def tightened() -> Tensor:
             upper = self._own()

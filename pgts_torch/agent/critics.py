@@ -87,14 +87,18 @@ class ExactCritic(Critic):
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
         """Solve the Bellman equation of the policy; the rollout only says what the policy sees of the states."""
         states = torch.arange(self.mdp.num_states, device=rollout.state_TB.device)
-        pi_SA = exact.check_policy(self.mdp, listed(policy, rollout.observe(states)))
+        self.solve(listed(policy, rollout.observe(states)))
+        return {}
+
+    def solve(self, pi_SA: Float[Tensor, "S A"]) -> None:
+        """The values of this policy, from now on."""
+        pi_SA = exact.check_policy(self.mdp, pi_SA)
         self._evaluation = evaluation = exact.evaluate(self.mdp, pi_SA)
         rewards_SA, allowed_SA = self.mdp.outcomes.reward_NA, pi_SA > 0
         size = float(rewards_SA[allowed_SA].abs().max() + evaluation.v_S.abs().max())
         steps = self.mdp.num_actions + self.mdp.outcomes.num_outcomes + 4
         residual_S = (torch.where(allowed_SA, pi_SA * evaluation.q_SA, 0.0).sum(-1) - evaluation.v_S).abs()
         self.error = 2 * float(evaluation.d_S @ (residual_S + steps * torch.finfo(torch.float64).eps * size))
-        return {}
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         return _fitted(self._evaluation).v_S.to(state_N.device)[state_N]

@@ -21,8 +21,10 @@ class Seen:
     depth: m.
     look: (T^m Q)(s, .) at these states; None with sampled advantages.
     gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, with v(s) = <pi(.|s), Q(s, .)> of the same critic.
-    certificate: an upper bound on J* - J^pi; true if the critic is exact, else as far as its v is right at the start
-        states. Infinite where the model knows no largest value, and for sampled searches, which prove nothing.
+    certificate: an upper bound on J* - J^{pi_k}. `PGTS.certificates.trust` says how far it can be trusted: it is a
+        proof only if the start distribution is known, the critic exact and the model the environment; else it holds as
+        far as the critic is right at the start states, and with 95 % where these are drawn. Infinite where nothing can
+        be said: no largest value is known, the search is a sampled one, or too few starts were drawn.
     """
 
     state_N: Int[Tensor, "N"]

@@ -79,8 +79,8 @@ class PGTS:
             from stationary, because then it deserves no deeper look: sum_s d(s) g_m(s) > tolerance * certificate.
         max_depth: the largest m of an adaptive depth (default 64).
         tolerance: which share of what may be missing to J* a lookahead must see to be deep enough (default 0.1).
-        stop_at: `learn` ends, with the policy in question, once the certificate proves J* - J^pi <= stop_at.
-            Default: never.
+        stop_at: `learn` ends, with the policy in question, once the certificate says J* - J^pi <= stop_at. That is a
+            proof only where `certificates.trust` says so. Default: never.
         search: how the lookahead is made (`search.engine`): "auto", {"type": "sampled", "samples": 8}, ...
         estimator: "lookahead", or {"type": "sampled", "lambda": 0.95}: advantages of the actions taken, as in PPO and
             A2C, which need depth 0, a network and no model.
@@ -193,7 +193,7 @@ class PGTS:
         # Look m steps ahead from the states with d(s) > 0.
         seen = taken or self._look(experience)
 
-        # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is proved good enough.
+        # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is good enough.
         if not self._is_enough(seen.certificate):
             observation_N = self.world.observe(seen.state_N)
             losses |= self.update(self.policy, observation_N, seen.advantage_NA, seen.weight_N, generator=draws.common)

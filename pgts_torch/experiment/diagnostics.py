@@ -30,6 +30,7 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
             "search/pruned": float(iteration.look.pruned_BA.max()),
             "search/stationarity_gap": float(iteration.gap_N.max()),
             "search/certificate": iteration.certificate,
+            "search/proved": float(algorithm.certificates is not None and algorithm.certificates.trust == "proved"),
         }
     return tags
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from pgts_torch.agent.callbacks import EvalCallback
+from pgts_torch.agent.certificate import CONFIDENCE
 from pgts_torch.agent.evaluate import Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
@@ -254,6 +255,20 @@ class _Recorder:
             if score.half_width is not None:
                 yield f"eval/{kind}_{short}_half_width", score.half_width
 
+    def _certified(self) -> dict[str, Any]:
+        """What the summary says of the certificate: a proof is made for the policy as it is after its last update."""
+        certificates, bound = self.algorithm.certificates, self._certificate
+        trust = None if certificates is None else certificates.trust
+        if certificates is not None and trust == "proved":
+            bound = certificates.of(self.algorithm.policy_table())
+            if self.ended_by == "certificate":  # its policy was kept, and all ranks know of it
+                bound = min(bound, self._certificate)
+        return {
+            "certificate": bound if math.isfinite(bound) else None,
+            "certificate_is_proved": trust == "proved",
+            "certificate_confidence": CONFIDENCE if trust == "drawn starts" else 1.0,
+        }
+
     def _table(self) -> Tensor | None:
         """The policy in all states, where they can be listed."""
         return None if self.truth is None else self.algorithm.policy_table()
@@ -284,8 +299,7 @@ class _Recorder:
             J=exactly.get("J"),
             J_optimal=exactly.get("J_optimal"),
             stationarity_gap=exactly.get("stationarity_gap"),
-            certificate=self._certificate if math.isfinite(self._certificate) else None,
-            certificate_is_proved=config.critic.type == "exact",
+            **self._certified(),
             ended_by=self.ended_by,
             iterations=algorithm.num_iterations,
             env_steps=algorithm.num_env_steps,

@@ -313,7 +313,8 @@ class SearchConfig(Section):
     certificate; null: 0.1. Only with search.depth adaptive."""
 
     stop_at: NonNegative | None = None
-    """Training ends once the certificate proves that the policy is this close to the optimal return; null: never."""
+    """Training ends once the certificate says that the policy is this close to the optimal return; null: never. It is a
+    proof if the start distribution is known, the critic exact and the model the environment; else an estimate."""
 
     action_repeat: Count = 1
     """How often the lookahead takes an action before it takes the next, so that it sees as many times further. Not in

@@ -24,8 +24,12 @@ class Summary:
     depth: m, the largest if it was adaptive.
     search: how the lookahead was made, and why where it chose that itself.
     stationarity_gap: max over visited states of the exact g_m; None likewise.
-    certificate: what the last iteration bounds J* - J^pi by; None: it knows no bound.
-    certificate_is_proved: whether that is a proof, because the critic is exact, or an estimate.
+    certificate: an upper bound on J* - J^pi; None: there is none. A proof is one of the trained policy, an estimate
+        is that of the last iteration, before its update.
+    certificate_is_proved: whether it is a proof: the start distribution is known, the critic exact and the model the
+        environment. If not, it is as far right as the critic is at the start states.
+    certificate_confidence: 1 where all start states are known, else the probability with which all certificates of the
+        run hold over the starts that were drawn, as far as the critic is right.
     ended_by: what ended the training: the certificate came down to `search.stop_at`, greedy episodes reached
         `eval.stop_at_return`, or neither before `total_steps`.
     """
@@ -46,6 +50,7 @@ class Summary:
     seconds: float
     deterministic: Evaluation
     sampled: Evaluation
+    certificate_confidence: float = 1.0
 
 
 def from_json(content: Mapping[str, Any]) -> Summary:
@@ -65,7 +70,8 @@ def describe(summary: Summary) -> str:
 
 
 def _folded(name: str, value: str) -> str:
-    return textwrap.fill(value, 50).replace("\n", "\n" + 28 * " ") if name == "search" else value
+    """Long values on several lines; a path stays whole."""
+    return value if name == "run folder" else textwrap.fill(value, 50).replace("\n", "\n" + 28 * " ")
 
 
 def rows(summary: Summary) -> dict[str, str]:
@@ -79,13 +85,18 @@ def rows(summary: Summary) -> dict[str, str]:
             f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
         }
     if summary.certificate is not None:
-        kind = "proved" if summary.certificate_is_proved else "an estimate: the critic is learned"
-        rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({kind})"
+        confidence = summary.certificate_confidence
+        drawn = "" if confidence == 1 else f" with {confidence:.0%} over the starts,"
+        told = "proved" if summary.certificate_is_proved else f"an estimate:{drawn} as far as the critic is right"
+        rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({told})"
+    ended = _ENDINGS[summary.ended_by]
+    if summary.ended_by == "certificate" and not summary.certificate_is_proved:
+        ended = "an estimated certificate: it is at search.stop_at"
     rows |= {
         "greedy episodes, return": _score_text(summary.deterministic),
         "sampled episodes, return": _score_text(summary.sampled),
         "search": summary.search,
-        "training ended by": _ENDINGS[summary.ended_by],
+        "training ended by": ended,
         "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",
         "model calls": str(summary.model_calls),
         "seconds": f"{summary.seconds:.1f}",

@@ -11,7 +11,6 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.checkpoint import Notes
-from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.ownership import CONFIG_FILE, VERSIONS_FILE
 from pgts_torch.experiment.report import reading
@@ -23,9 +22,9 @@ from pgts_torch.tabular.mdp import TabularMDP
 
 @dataclass(frozen=True)
 class Certificate:
-    """What the last iteration bounds J* - J^pi by; None: it knows no bound.
+    """An upper bound on J* - J^pi; None: there is none.
 
-    is_proved: whether that is a proof, because the critic is exact.
+    is_proved: whether that is a proof.
     missing: J* - J^pi itself, where it is known.
     is_known: whether there was an iteration that could say.
     """
@@ -104,7 +103,7 @@ def gather(run: Path) -> tuple[Facts, Trained | None]:
         total_steps=config.total_steps,
         world_size=1 if last is None else last.world_size,
         rows=dict(_progress(last, latest)) if summary is None else rows(summary),
-        certificate=_certificate(config, summary, latest),
+        certificate=_certificate(summary, latest),
         curves=curves.groups,
         constant=curves.constant,
         never_finite=curves.never_finite,
@@ -127,15 +126,16 @@ def _trained(path: Path, last: Notes, notes: list[str]) -> Trained | None:
     return Trained(algorithm.mdp, algorithm.policy_table().cpu(), last.env_steps)
 
 
-def _certificate(config: Config, summary: Summary | None, latest: Mapping[str, Any]) -> Certificate:
+def _certificate(summary: Summary | None, latest: Mapping[str, Any]) -> Certificate:
     if summary is None:
         bound, missing = latest.get("search/certificate"), latest.get("exact/optimality_gap")
+        is_proved = latest.get("search/proved") == 1
     else:
-        bound, missing = summary.certificate, None
+        bound, missing, is_proved = summary.certificate, None, summary.certificate_is_proved
         if summary.J is not None and summary.J_optimal is not None:
             missing = max(summary.J_optimal - summary.J, 0.0)
     is_known = summary is not None or "search/certificate" in latest
-    return Certificate(bound, config.critic.type == "exact", missing, is_known)
+    return Certificate(bound, is_proved, missing, is_known)
 
 
 def _progress(last: Notes | None, latest: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
