@@ -19,6 +19,8 @@ NAMED = "refused by name, exit code 2"
 DAMAGED = "noticed; the checkpoint before leads to the same bits, with a warning; `--strict-resume` refuses"
 STOPPED = "stops before the policy moves; checkpoints stay, `failure.json`, exit code 1"
 
+CONTRADICTED = "stops before the policy moves; state, action, both answers named, `failure.json`, exit code 2"
+
 FAULTS: dict[str, dict[str, str]] = {
     "Configuration": {
         "unknown key": ONE_LINE,
@@ -44,6 +46,8 @@ FAULTS: dict[str, dict[str, str]] = {
         "autoreset in the next step": "refused with the mode that works",
         "environment raises an error": "environment, step and seed are named, `failure.json`, exit code 2",
         "environment without a model": "the two methods that it lacks are named, exit code 2",
+        "environment that contradicts its model": CONTRADICTED,
+        "probabilities that are not the environment's": f"off by more than 2 %: {CONTRADICTED}; else a warning",
         "environment that truncates its own episodes": "never stepped past it; the critic's value stands there",
         "reward that is not one number": "environment, step, seed and its shape are named, `failure.json`, exit code 2",
         "discount outside [0, 1]": "environment, step and seed are named at every depth, `failure.json`, exit code 2",

@@ -33,6 +33,7 @@ from pgts_torch.agent.certificate import Certificates
 from pgts_torch.agent.copies import make_vector_env, more_copies, own_actions, registered_limit
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.iteration import Iteration, Seen
+from pgts_torch.agent.model_check import Mode, ModelCheck
 from pgts_torch.agent.policies import Policy, listed
 from pgts_torch.agent.ranks import checksum, present_ranks
 from pgts_torch.agent.rollout import Horizon, Rollout, rollout
@@ -89,6 +90,9 @@ class PGTS:
         num_envs: episodes in each iteration, of all processes together; copies that are given belong to this one alone.
         actions_per_dimension: into how many evenly spaced values, from the lowest to the highest, each dimension of
             continuous actions is divided; None: actions are discrete, of MultiDiscrete each combination of them.
+        model_check: each step of the environment is held to its model (`ModelCheck`). "error": the first contradiction
+            stops the training before the policy is moved by it. "warn": it is said, once for each kind, and counted.
+            "off": nobody looks.
         action_repeat: how often the lookahead takes an action before it takes the next, so that it sees as many times
             further at the same depth (`TensorModel` says what T^m Q is then); not in tables. Experience, and the
             policy, take single actions.
@@ -120,6 +124,7 @@ class PGTS:
         num_envs: int = 32,
         actions_per_dimension: int | None = None,
         action_repeat: int = 1,
+        model_check: Mode = "error",
         observation_key: str | None = None,
         gamma: float | None = None,
         seed: int = 0,
@@ -169,6 +174,8 @@ class PGTS:
             self.certificates = Certificates(
                 self.world, self.search, self.critic, num_depths=len(self.depths), ranks=self.ranks
             )
+        is_asked = self.search is not None
+        self.model_check = ModelCheck(self.world, mode=model_check, is_asked=is_asked, seed=seed, ranks=self.ranks)
         check_parts(self._arguments, self.world, self.policy, self.critic, self.update, self.estimator)
         self._own_actions = None if isinstance(env, VectorEnv) else own_actions(self.world.env)
         self._predicting = stream(seed, "predict", device=self.device)
@@ -192,6 +199,9 @@ class PGTS:
 
         # Look m steps ahead from the states with d(s) > 0.
         seen = taken or self._look(experience)
+
+        # What happened is held to what the model says, before pi learns from either.
+        self.model_check(experience, self.num_iterations)
 
         # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is good enough.
         if not self._is_enough(seen.certificate):
@@ -450,6 +460,7 @@ class PGTS:
             "num_iterations": self.num_iterations,
             "num_env_steps": self.num_env_steps,
             "num_model_calls": self.num_model_calls,
+            "model_check": self.model_check.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -464,3 +475,4 @@ class PGTS:
         self.num_iterations = state["num_iterations"]
         self.num_env_steps = state["num_env_steps"]
         self.num_model_calls = state["num_model_calls"]
+        self.model_check.load_state_dict(state["model_check"])

@@ -105,6 +105,7 @@ class TabularWorld(World):
         self, env: VectorEnv, mdp: TabularMDP, *, starts_known: bool = True, device: torch.device | str = "cpu"
     ) -> None:
         self.env, self.mdp = env, mdp
+        self.starts_known = starts_known
         self.num_actions = mdp.num_actions
         self.observation_space = env.single_observation_space
         self.gamma = float(mdp.outcomes.discount_NAK.max())

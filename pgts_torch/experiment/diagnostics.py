@@ -24,6 +24,8 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
         "search/depth": float(iteration.depth),
         "search/model_calls": float(algorithm.num_model_calls),
     }
+    if algorithm.model_check.is_held:
+        tags["model/contradictions"] = float(algorithm.model_check.contradictions)
     if iteration.look is not None:
         tags |= {
             "search/nodes": float(iteration.look.nodes),

@@ -62,6 +62,7 @@ def build(config: Config) -> PGTS:
         actions_per_dimension=config.env.actions_per_dimension,
         observation_key=config.env.observation_key,
         action_repeat=config.search.action_repeat,
+        model_check=config.search.model_check,
         gamma=config.env.gamma,
         seed=config.seed,
         device=config.device,

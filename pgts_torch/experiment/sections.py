@@ -320,6 +320,10 @@ class SearchConfig(Section):
     """How often the lookahead takes an action before it takes the next, so that it sees as many times further. Not in
     numbered environments."""
 
+    model_check: Literal["error", "warn", "off"] = "error"
+    """Each step of the environment is held to its model. error: the first contradiction stops the training; warn: it is
+    said and counted; off: nobody looks."""
+
     kind: Literal["auto", "expectimax", "sampled", "mcts"] = "auto"
     """How it is made. auto picks by what the model can do and by the budget; expectimax looks at all outcomes, sampled
     at drawn ones, mcts where it seems worth while."""

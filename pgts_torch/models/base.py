@@ -7,9 +7,11 @@ it meets them, equal states alike, so that a search can merge them.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
@@ -25,6 +27,32 @@ class Transitions:
     reward_N: Float[Tensor, "N"]
     discount_N: Float[Tensor, "N"]
     next_state_N: Int[Tensor, "N"]
+
+
+@dataclass(frozen=True, eq=False)
+class Happened:
+    """N steps of an environment, in the states of a model; in numpy, where few numbers cost a third of what they do in
+    torch.
+
+    reward_N: in reward units.   discount_N: in [0, 1], 0 where the episode ended.
+    follows_N: whether the episode went on with another step.
+    """
+
+    state_N: Int[np.ndarray, "N"]
+    action_N: Int[np.ndarray, "N"]
+    reward_N: Float[np.ndarray, "N"]
+    discount_N: Float[np.ndarray, "N"]
+    next_state_N: Int[np.ndarray, "N"]
+    follows_N: Bool[np.ndarray, "N"]
+
+    def part(self, at: Any) -> "Happened":
+        """Those at some positions, or under a mask."""
+        return Happened(*(column_N[at] for column_N in vars(self).values()))
+
+
+DENIED, DRAWN, UNASKED = -1, -2, -3
+"""What comes of holding a step to a model, in place of an outcome: there is none like it with a positive probability;
+the model draws what follows and lists nothing to hold it to; the answer would have cost a call."""
 
 
 class Model(ABC):
@@ -45,6 +73,41 @@ class Model(ABC):
     generation: int = 0
     device: torch.device
     dtype: torch.dtype
+
+
+class ExactModel(Model):
+    """A model that claims to be the environment, and so can be held to what the environment does.
+
+    kind: the word for it in a message.
+    is_cheap: whether it can be held to all steps for next to nothing; else only to those that it was asked about, and
+        to a few more.
+    simulator_steps: how often a simulator behind it was stepped.
+    """
+
+    exact = True
+    kind: str
+    is_cheap: bool
+    simulator_steps: int = 0
+
+    @abstractmethod
+    def hold(self, happened: Happened, *, ask_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
+        """Which of its outcomes of positive probability each step was (0 where there is only one), the first of those
+        that look like it: reward, discount and, unless the episode ended, next state are the same. Where there is none,
+        DENIED, DRAWN or UNASKED.
+
+        With repeated actions the model is held to its single steps.
+
+        Args:
+            ask_N: where an answer is worth a call. Default: everywhere.
+        """
+
+    @abstractmethod
+    def shown(self, state: int) -> str:
+        """A state in a message."""
+
+    @abstractmethod
+    def told(self, state: int, action: int) -> str:
+        """What the model says of a state and an action, in a message."""
 
 
 def value_range(reward_range: tuple[float, float], gamma: float) -> tuple[float, float]:
@@ -76,3 +139,15 @@ class SamplingModel(Model):
         So a search owns its randomness, cannot foresee what an environment will draw, and finds the same outcome
         however its batch is split or ordered.
         """
+
+
+def step_text(reward: float, discount: float, then: str) -> str:
+    """A step in a message: what it paid, and what came after it."""
+    return f"reward {_exactly(reward)}, " + (
+        "an end" if discount == 0 else f"discount {_exactly(discount)}, then {then}"
+    )
+
+
+def _exactly(x: float) -> str:
+    short = f"{x:g}"
+    return short if float(short) == x else repr(x)

@@ -22,14 +22,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import value_range
+from pgts_torch.models.base import ExactModel, value_range
 from pgts_torch.models.environments import base_actions, changing_wrapper
 from pgts_torch.models.numbering import Merge
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tensor import TensorModel
 
 
-class ClassicModel(TensorModel):
+class ClassicModel(TensorModel, ExactModel):
     """The dynamics of one environment of classic control, with the constants of an instance of it.
 
     The state is the vector `env.unwrapped.state`. States, rewards and values are float64 unless told otherwise.
@@ -46,7 +46,7 @@ class ClassicModel(TensorModel):
             discount.
     """
 
-    exact = True
+    kind, is_cheap = "dynamics", True
     env_class: type
     size: int
     constants: tuple[str, ...]

@@ -16,7 +16,17 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import PgtsError, RandomOutcomes, failure
-from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.base import (
+    DENIED,
+    DRAWN,
+    UNASKED,
+    EnumeratingModel,
+    ExactModel,
+    Happened,
+    SamplingModel,
+    Transitions,
+    step_text,
+)
 from pgts_torch.models.environments import EnvSource, all_actions, check_step, make_env
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, env_name, generator_state
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
@@ -44,7 +54,7 @@ class _Step:
 
 
 @final
-class SimulatorModel(EnumeratingModel, SamplingModel):
+class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
     """An instance of a Gymnasium environment that answers what may follow a state and an action.
 
     The instance belongs to the model alone, without wrappers: time limits end no episode here, and nothing that the
@@ -75,7 +85,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             or above 1 beside a highest value.
     """
 
-    exact = True
+    kind, is_cheap = "simulator", False
 
     def __init__(
         self,
@@ -115,7 +125,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             raise failure(f"{self.name} failed in reset with seed 0", error) from error
         self._show = self.adapter.blindfold(self.env)
         self._names_discounts = names_discounts(self.env)
-        self._sure: dict[tuple[bytes, int], _Step] = {}
+        self._sure: dict[tuple[bytes, int, int], _Step] = {}
         self._sure_bytes = 0
         self.generation = -1
         self.clear()
@@ -225,7 +235,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         """
         steps = []
         for state, action in itertools.product(state_N.tolist(), range(self.num_actions)):
-            step = self._step(state, action, _KEY_OF_CERTAINTY)
+            step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=self.action_repeat)
             if step.random:
                 raise RandomOutcomes(
                     f"{self.name} is random in state {state} under action {action}: its outcomes cannot be listed; "
@@ -250,12 +260,12 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
                 that is not finite or does not fit its space: naming environment, state, action and key.
         """
         asked = zip(state_N.tolist(), action_N.tolist(), key_N.tolist(), strict=True)
-        return Transitions(*self._answer([self._step(*one) for one in asked]))
+        return Transitions(*self._answer([self._step(*one, repeat=self.action_repeat) for one in asked]))
 
     def is_random(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Whether chance decides what follows each (state, action). The simulator is asked; raises as `sample`."""
         asked = zip(state_N.tolist(), action_N.tolist(), strict=True)
-        random = [self._step(*pair, _KEY_OF_CERTAINTY).random for pair in asked]
+        random = [self._step(*pair, _KEY_OF_CERTAINTY, repeat=self.action_repeat).random for pair in asked]
         return torch.tensor(random, dtype=torch.bool, device=self.device)
 
     def _answer(self, steps: Sequence[_Step]) -> tuple[Tensor, Tensor, Tensor]:
@@ -266,14 +276,47 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
             torch.tensor([self._number[step.child.name] for step in steps], dtype=torch.int64, device=self.device),
         )
 
-    def _step(self, state: int, action: int, key: int) -> _Step:
-        """What follows; from memory where it is sure."""
+    def hold(self, happened: Happened, *, ask_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
+        """0 where a step is, bit for bit, what the simulator gives; from memory where it was asked before, or where
+        `ask_N` says so by a step of the simulator."""
+        columns = [column_N.tolist() for column_N in vars(happened).values()]
+        ask = itertools.repeat(True) if ask_N is None else ask_N.tolist()
+        return np.array([self._hold(*one) for one in zip(*columns, ask, strict=False)], dtype=np.int64)
+
+    def _hold(
+        self, state: int, action: int, reward: float, discount: float, next_state: int, follows: bool, ask: bool
+    ) -> int:
+        step = self._sure.get((self._snapshots[state].key, action, 1))
+        if step is None:
+            if not ask:
+                return UNASKED
+            step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=1)
+            if step.random:
+                return DRAWN
+        if step.reward != reward or step.discount != discount or (step.child.cut and follows):
+            return DENIED
+        return 0 if discount == 0 or step.child.key == self._snapshots[next_state].key else DENIED
+
+    def shown(self, state: int) -> str:
+        """What the environment shows there, or else its snapshot."""
+        shown = self._observations[state]
+        what = repr(self._snapshots[state].key) if shown is None else np.array2string(np.asarray(shown), threshold=20)
+        return f"state {state} ({what})"
+
+    def told(self, state: int, action: int) -> str:
+        """The one outcome of a single step."""
+        step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=1)
+        then = self.shown(self._number[step.child.name]) + step.child.cut * ", where the episode is truncated"
+        return step_text(step.reward, step.discount, then)
+
+    def _step(self, state: int, action: int, key: int, *, repeat: int) -> _Step:
+        """What follows an action that is taken so many times; from memory where it is sure."""
         self._check("state", state, self.num_states)
         self._check("action", action, self.num_actions)
         at = self._snapshots[state]
         if at.cut:
             return _Step(-math.inf if action else 0.0, 1.0, at, self._observations[state], random=False)
-        asked = at.key, action
+        asked = at.key, action, repeat
         if asked in self._sure:
             step = self._sure[asked]
             self._known(step.child, step.shown)  # now, so that numbers do not depend on what is remembered
@@ -282,7 +325,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel):
         try:
             self.adapter.set_state(self.env, at.data)
             total, discount, random = 0.0, 1.0, False
-            for _ in range(self.action_repeat):
+            for _ in range(repeat):
                 observation, reward, weight, drew, truncated = self._stepped(taken, None if random else key)
                 total, random = total + discount * reward, random or drew
                 discount *= weight

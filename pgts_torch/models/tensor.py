@@ -2,14 +2,18 @@
 
 from abc import abstractmethod
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int, Num
+from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NotFinite, PgtsError
-from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.base import DENIED, EnumeratingModel, Happened, SamplingModel, Transitions, step_text
 from pgts_torch.models.numbering import Merge, Numbering
+
+_ROUNDING = 1e-12
+"""By how much dynamics that do the same arithmetic in another order, or on another device, may be off."""
 
 
 class TensorModel(EnumeratingModel, SamplingModel):
@@ -120,6 +124,28 @@ class TensorModel(EnumeratingModel, SamplingModel):
         return Transitions(*self._followed(state_N, action_N))
 
     @torch.no_grad()
+    def hold(self, happened: Happened, *, ask_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
+        """0 where a step is what `step` gives: the discount exactly, the reward and, unless the episode ended, every
+        number of the next state within 1e-12 (1 + its size)."""
+        columns = vars(happened).values()
+        state_N, action_N, reward_N, discount_N, next_N, _ = (torch.from_numpy(x).to(self.device) for x in columns)
+        told_N, weight_N, ahead_ND = self.step(self.states(state_N), action_N)
+        agrees_N = _close(told_N, reward_N) & (weight_N == discount_N)
+        agrees_N &= _close(ahead_ND, self.states(next_N)).all(-1) | (discount_N == 0)
+        return torch.where(agrees_N, 0, DENIED).cpu().numpy()
+
+    def shown(self, state: int) -> str:
+        """The vector."""
+        return f"state {self.states(torch.tensor([state], device=self.device))[0].tolist()}"
+
+    @torch.no_grad()
+    def told(self, state: int, action: int) -> str:
+        """The one outcome."""
+        state_1D, action_1 = self.states(torch.tensor([state], device=self.device)), torch.tensor([action])
+        reward_1, discount_1, next_1D = self.step(state_1D, action_1.to(self.device))
+        return step_text(float(reward_1), float(discount_1), f"state {next_1D[0].tolist()}")
+
+    @torch.no_grad()
     def _followed(self, state_N: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Reward, discount and number of the next state; where nothing counts after an outcome, its own state."""
         reward_N, discount_N, next_ND = self._stepped(self.states(state_N), action_N)
@@ -158,3 +184,8 @@ class TensorModel(EnumeratingModel, SamplingModel):
                 what="state",
             )
         return reward_N, discount_N, next_ND
+
+
+def _close(x: Tensor, y: Tensor) -> Tensor:
+    """Equal up to rounding."""
+    return (x - y).abs() <= _ROUNDING * (1 + y.abs())
