@@ -78,6 +78,8 @@ FAULTS: dict[str, dict[str, str]] = {
     },
     "Proofs": {
         "an episode that begins in one of several states": "a proof is over all start states, not over those drawn",
+        "no largest reward is known": "stop_at and adaptive depth are refused, with what to set: env.reward_range",
+        "a reward outside reward_range": "training stops before the policy is moved by it, exit code 2",
     },
     "Memory": {
         "lookahead of too many nodes": "refused before the model is asked, with the number and what to set",

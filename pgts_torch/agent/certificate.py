@@ -12,6 +12,7 @@ from pgts_torch.agent.critics import Critic, ExactCritic
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import World
+from pgts_torch.errors import PgtsError
 from pgts_torch.search.engine import Search
 from pgts_torch.search.upper import UpperBound
 
@@ -87,6 +88,37 @@ class Certificates:
             return "drawn starts"
         return "proved" if self._critic.is_exact and self._search.model.exact else "critic"
 
+    def check(self, wanted: str) -> None:
+        """PgtsError if there is no bound, and never will be.
+
+        Args:
+            wanted: what needs one.
+        """
+        model = self._search.model
+        if self._search.topology is None:
+            raise PgtsError(
+                f"{wanted}; where outcomes are drawn nothing bounds what is missing to the optimum: take a search that "
+                "lists outcomes, or a fixed depth without stop_at"
+            )
+        if model.highest_value < math.inf:
+            return
+        if getattr(model, "action_repeat", 1) > 1:
+            why = f"action_repeat is {model.action_repeat}, and repeated actions bound nothing: take 1"
+        elif self._world.gamma >= 1 and (model.reward_range is None or model.reward_range.high > 0):
+            why = (
+                "gamma is 1, with which rewards may add up without limit: take a gamma below 1, or, if no reward is "
+                "positive, a reward_range (env.reward_range) up to 0"
+            )
+        else:
+            why = (
+                "it takes a largest reward, which the model of this environment does not know: set reward_range "
+                "(env.reward_range) to the lowest and the highest reward of a single step"
+            )
+        raise PgtsError(
+            f"{wanted}, for which what is missing to the optimum must be bounded. But {why}; or take a fixed "
+            "depth without stop_at"
+        )
+
     def starts(self, experience: Rollout, state_N: Int[Tensor, "N"], v_N: Float[Tensor, "N"]) -> _Starts:
         """The start states of an iteration, and v there.
 
@@ -124,15 +156,19 @@ class Certificates:
             certificate = self._over_all(share_N, upper_N, v_N)
             return Bound(certificate, certificate)
         estimate = float(share_N @ (upper_N - v_N).abs())
-        model = self._search.model
-        span = model.highest_value - model.lowest_value
-        alpha = (1 - CONFIDENCE) * 6 / (math.pi * number) ** 2 / self._num_depths
-        width = span * math.sqrt(-math.log(alpha) / (2 * experience.num_episodes))
+        span = self._search.model.highest_value - self._search.model.lowest_value
+        width = self.width(experience.num_episodes, number)
         if not (complete and width < span):
             return Bound(math.inf, estimate)
         swept_N = self._together(lambda upper: upper.swept(state_N, expansions), expansions)
         certificate = float(share_N @ (swept_N - v_N).abs()) + width
         return Bound(certificate if certificate < span else math.inf, estimate)
+
+    def width(self, num_episodes: int, number: int = 1) -> float:
+        """What drawn starts put in doubt in an iteration, which no certificate from them is below: see above."""
+        alpha = (1 - CONFIDENCE) * 6 / (math.pi * number) ** 2 / self._num_depths
+        span = self._search.model.highest_value - self._search.model.lowest_value
+        return span * math.sqrt(-math.log(alpha) / (2 * num_episodes))
 
     def of(self, pi_SA: Float[Tensor, "S A"]) -> float:
         """The certificate of a policy, from all that this rank has asked so far; infinite unless it is a proof."""

@@ -42,6 +42,7 @@ from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import make_world
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.environments import EnvSource
+from pgts_torch.models.rewards import RewardRange
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Leaf, Lookahead, check_finite
 from pgts_torch.seeding import stream
@@ -97,6 +98,8 @@ class PGTS:
             further at the same depth (`TensorModel` says what T^m Q is then); not in tables. Experience, and the
             policy, take single actions.
         observation_key: which part of dictionary observations policy and critic see.
+        reward_range: the lowest and the highest reward of a single step, to which environment and model are held.
+            `stop_at` and an adaptive depth need it where the model knows no largest reward (simulators).
         gamma: discount. Default: the environment's own (pgts/*), else 0.99. Copies of pgts/* bring their own.
         seed: of everything random.
         device: where policy, critic and model live.
@@ -105,6 +108,7 @@ class PGTS:
     Raises:
         PgtsError: parts that do not fit each other, or options out of range.
         MissingModel: nothing that a lookahead could ask.
+        ModelMismatch: rewards of a table are outside `reward_range`.
     """
 
     def __init__(
@@ -126,6 +130,7 @@ class PGTS:
         action_repeat: int = 1,
         model_check: Mode = "error",
         observation_key: str | None = None,
+        reward_range: Sequence[float] | None = None,
         gamma: float | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
@@ -157,6 +162,8 @@ class PGTS:
             device=device,
             **(env_kwargs or {}),
         )
+        if reward_range is not None:
+            self.world.promise(RewardRange.of(reward_range))
         if not isinstance(policy, Policy):
             policy = make_policy(policy, self.world, seed=seed)
         if not isinstance(critic, Critic):
@@ -174,6 +181,10 @@ class PGTS:
             self.certificates = Certificates(
                 self.world, self.search, self.critic, num_depths=len(self.depths), ranks=self.ranks
             )
+            if stop_at is not None:
+                self.certificates.check(f"stop_at is {stop_at}")
+            if depth == "adaptive":
+                self.certificates.check("depth is adaptive")
         is_asked = self.search is not None
         self.model_check = ModelCheck(self.world, mode=model_check, is_asked=is_asked, seed=seed, ranks=self.ranks)
         check_parts(self._arguments, self.world, self.policy, self.critic, self.update, self.estimator)

@@ -196,6 +196,8 @@ def rollout(
         action_B = policy.sample(observation_B, generator=generator).cpu().numpy()
         try:
             reward_B, discount_B, truncated_B = episodes.step(action_B, alive_B)
+            if world.reward_range is not None:
+                world.reward_range.check(reward_B[alive_B])
             observation_B, read_B = world.see(env, episodes.observation)
         except Exception as error:
             raise _failure(env, f"in step {len(rows)}", *episodes.blame(error)) from error

@@ -16,9 +16,10 @@ from torch import Tensor
 from pgts_torch.agent.copies import check_vector_env, env_name, make_vector_env, normalizing_wrapper
 from pgts_torch.agent.observations import Observations, states_of
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.models.base import Model
+from pgts_torch.models.base import Model, promise
 from pgts_torch.models.classic import ClassicModel, dynamics_of
 from pgts_torch.models.environments import EnvSource, base_actions, changing_wrapper
+from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import adapter_for
 from pgts_torch.models.tabular import TabularModel, tabular_truth
@@ -41,6 +42,7 @@ class World(ABC):
     model: what a lookahead may ask; None: nothing.
     mdp: the exact truth, where there is one.
     start_S: the start distribution mu over all states; None where it is known from episodes only.
+    reward_range: what rewards of single steps are held to; None: nothing.
     """
 
     env: VectorEnv
@@ -51,6 +53,26 @@ class World(ABC):
     model: Model | None = None
     mdp: TabularMDP | None = None
     start_S: Float[Tensor, "S"] | None = None
+    reward_range: RewardRange | None = None
+
+    def promise(self, reward_range: RewardRange) -> None:
+        """Hold episodes, table and model to a range of rewards.
+
+        Raises:
+            ModelMismatch: the table has others.
+            PgtsError: the model repeats actions, whose rewards are sums of several, and whose values bound nothing.
+        """
+        if self.model is not None and self.model.action_repeat > 1:
+            raise PgtsError(
+                f"reward_range is given and action_repeat is {self.model.action_repeat}: no bound of values "
+                "follows where actions are repeated; leave one of the two out"
+            )
+        if self.mdp is not None:
+            happens_SAK = self.mdp.outcomes.prob_NAK > 0
+            reward_range.check(self.mdp.outcome_reward_SAK[happens_SAK])
+        self.reward_range = reward_range
+        if self.model is not None:
+            promise(self.model, reward_range, gamma=self.gamma)
 
     @abstractmethod
     def encode(self, observation: Any) -> Tensor:

@@ -85,6 +85,19 @@ def conflict(reason: str, *keys: str, **values: str) -> PydanticCustomError:
 Kwargs = Annotated[dict[str, Any], AfterValidator(_check_kwargs)]
 
 
+def _check_ascending(pair: list[float]) -> list[float]:
+    if pair[0] > pair[1]:
+        raise conflict("the lower number comes first; this is {value}", value=str(pair))
+    return pair
+
+
+Ascending = Annotated[
+    list[float],
+    Field(min_length=2, max_length=2, json_schema_extra={"requirement": "a list of two ascending numbers"}),
+    AfterValidator(_check_ascending),
+]
+
+
 class Section(BaseModel):
     """Keys that belong together."""
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -61,6 +62,7 @@ def build(config: Config) -> PGTS:
         num_envs=config.rollout.num_envs,
         actions_per_dimension=config.env.actions_per_dimension,
         observation_key=config.env.observation_key,
+        reward_range=config.env.reward_range,
         action_repeat=config.search.action_repeat,
         model_check=config.search.model_check,
         gamma=config.env.gamma,
@@ -118,9 +120,24 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
             folder = held.enter_context(opened(config, locks[0], start))
 
         ranks.first("an open folder", open_folder)
+        if ranks.leads and (why := _out_of_reach(config, algorithm)):
+            print(f"note: {why}", file=sys.stderr)
         summary = _loop(config, algorithm, folder, start, stop)
         folder.text(SUMMARY_FILE, json.dumps(asdict(summary), indent=2) + "\n")
     return summary
+
+
+def _out_of_reach(config: Config, algorithm: PGTS) -> str:
+    """Why no certificate can come down to search.stop_at; empty where one can."""
+    target, certificates, episodes = config.search.stop_at, algorithm.certificates, config.rollout.num_envs
+    if target is None or certificates is None or certificates.trust != "drawn starts":
+        return ""
+    if (least := certificates.width(episodes)) <= target:
+        return ""
+    return (
+        f"search.stop_at is {target}, which ends nothing: start states are known from the {episodes} episodes of an "
+        f"iteration only, and from so many no certificate is below {least:.3g}"
+    )
 
 
 def _loop(config: Config, algorithm: PGTS, folder: Folder, start: Start | None, stop: StopFlag) -> Summary:

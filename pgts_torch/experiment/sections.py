@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from pgts_torch.experiment.fields import (
+    Ascending,
     Clip,
     Count,
     EnvId,
@@ -42,6 +43,10 @@ class EnvConfig(Section):
     observation_key: Key | None = None
     """The part of dictionary observations that policy and critic see, for instance image; null: they are no
     dictionaries."""
+
+    reward_range: Ascending | None = None
+    """The lowest and the highest reward of a single step, for instance [0, 1], to which the run holds the environment.
+    search.stop_at and search.depth adaptive need it where the model does not know; null: the model's own."""
 
 
 class UniformInitConfig(Section):

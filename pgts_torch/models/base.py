@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
+from pgts_torch.models.rewards import RewardRange
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,8 @@ class Model(ABC):
         not: what the environment does is held to it, and a bound that it proves is called proved.
     highest_value: an upper bound of v* in every state; infinite where none is known.
     lowest_value: a lower bound of v^pi, of every policy in every state; -infinite where none is known.
+    reward_range: what its rewards are held to; None: nothing.
+    action_repeat: how often an action is taken in one outcome.
     generation: how often the model has forgotten its states and begun to number them anew.
     """
 
@@ -70,6 +73,8 @@ class Model(ABC):
     exact: bool = False
     highest_value: float = math.inf
     lowest_value: float = -math.inf
+    reward_range: RewardRange | None = None
+    action_repeat: int = 1
     generation: int = 0
     device: torch.device
     dtype: torch.dtype
@@ -110,15 +115,11 @@ class ExactModel(Model):
         """What the model says of a state and an action, in a message."""
 
 
-def value_range(reward_range: tuple[float, float], gamma: float) -> tuple[float, float]:
-    """What a state can be worth if all rewards are in [low, high] and nothing is earned after an end:
-
-    min(0, low) / (1 - gamma)  to  max(0, high) / (1 - gamma),        infinite where gamma is 1, 0 where it is 0 / 0
-    """
-    low, high = min(0.0, reward_range[0]), max(0.0, reward_range[1])
-    if gamma >= 1:
-        return -math.inf if low < 0 else 0.0, math.inf if high > 0 else 0.0
-    return low / (1 - gamma), high / (1 - gamma)
+def promise(model: Model, reward_range: RewardRange, *, gamma: float) -> None:
+    """Hold a model to a range of rewards, and bound what its states can be worth by it."""
+    low, high = reward_range.values(gamma)
+    model.reward_range = reward_range
+    model.lowest_value, model.highest_value = max(model.lowest_value, low), min(model.highest_value, high)
 
 
 class EnumeratingModel(Model):

@@ -22,9 +22,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import ExactModel, value_range
+from pgts_torch.models.base import ExactModel
 from pgts_torch.models.environments import base_actions, changing_wrapper
 from pgts_torch.models.numbering import Merge
+from pgts_torch.models.rewards import value_range
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tensor import TensorModel
 

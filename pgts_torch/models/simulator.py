@@ -356,6 +356,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         self.simulator_steps += 1
         drew = generator_state(self.env) != before if known is None else known
         reward = number_of("reward", reward)
+        if self.reward_range is not None:
+            self.reward_range.check(reward)
         if self._show is None:
             self._checked(observation, reward)
         discount = 0.0 if terminated else discount_of(info, self.gamma, named=self._names_discounts)

@@ -175,6 +175,8 @@ class TensorModel(EnumeratingModel, SamplingModel):
                 f"step answered with rewards in {reward_N.dtype} and discounts in {discount_N.dtype}; "
                 f"the model speaks {self.dtype}"
             )
+        if self.reward_range is not None:
+            self.reward_range.check(reward_N.cpu())
         counts_N = (discount_N > 0) & (reward_N > -torch.inf)
         if bool((bad_N := next_ND.isnan().any(-1) & counts_N).any()):
             n = int(torch.nonzero(bad_N)[0, 0])

@@ -445,6 +445,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "occupancy, visits or uniform or null": st.sampled_from([None, "occupancy", "visits", "uniform"]),
     "a key of dictionary observations or null": st.none() | st.from_regex(r"[A-Za-z0-9_.:-]{1,20}", fullmatch=True),
     SIZES: st.lists(st.integers(1, 65536), max_size=16),
+    "a list of two ascending numbers or null": st.sampled_from([None, [0, 1], [-1.5, -1.5]]),
     "a mapping": st.dictionaries(st.sampled_from(["n", "traps", "word"]), PLAIN),
 }
 """Valid values for each requirement."""
