@@ -9,7 +9,7 @@ import numpy as np
 from pgts_torch.errors import ModelMismatch, PgtsError
 
 _SLACK = 1e-6
-"""In units of the larger bound: by how much a reward may be outside, for it may have been stored in float32."""
+"""In units of a bound: by how much a reward may be outside of it, for it may have been stored in float32."""
 
 
 @final
@@ -37,12 +37,13 @@ class RewardRange:
 
     def values(self, gamma: float) -> tuple[float, float]:
         """The least and the most that a state can be worth (`value_range`)."""
-        return value_range((self.low - self._slack, self.high + self._slack), gamma)
+        return value_range(self._wide, gamma)
 
     def check(self, reward_N: Any) -> None:
         """ModelMismatch if one of these rewards is outside; -inf stands for an action that is not allowed."""
         reward_N = np.asarray(reward_N, dtype=np.float64)
-        off_N = (reward_N > self.high + self._slack) | ((reward_N < self.low - self._slack) & (reward_N > -math.inf))
+        low, high = self._wide
+        off_N = (reward_N > high) | ((reward_N < low) & (reward_N > -math.inf))
         if off_N.any():
             raise ModelMismatch(
                 f"a reward is {reward_N[off_N].flat[0]:g}; reward_range says that all are from {self.low:g} to "
@@ -50,8 +51,9 @@ class RewardRange:
             )
 
     @property
-    def _slack(self) -> float:
-        return _SLACK * max(abs(self.low), abs(self.high))
+    def _wide(self) -> tuple[float, float]:
+        """What is let pass. 0 stays 0: costs never add up to a gain."""
+        return self.low - _SLACK * abs(self.low), self.high + _SLACK * abs(self.high)
 
 
 def value_range(reward_range: tuple[float, float], gamma: float) -> tuple[float, float]:

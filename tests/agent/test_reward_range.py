@@ -100,6 +100,8 @@ def test_a_reward_outside_the_range_stops_before_the_policy_moves(depth, outside
 def test_rewards_in_float32_are_not_outside():
     RewardRange(0.0, 0.1).check(np.float32(0.1))
     RewardRange(-0.3, 1e6).check([np.float32(-0.3), 1e6 + 0.01, -math.inf])
+    with pytest.raises(ModelMismatch, match="a reward is 1e-09"):
+        RewardRange(-1.0, 0.0).check(1e-9)
     with pytest.raises(ModelMismatch, match=r"a reward is 0\.1001"):
         RewardRange(0.0, 0.1).check(0.1001)
 
