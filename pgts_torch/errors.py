@@ -72,3 +72,9 @@ class Stopped(Exception):
     def __init__(self, message: str, signal: int) -> None:
         super().__init__(message)
         self.signal = signal
+
+
+def check_count(name: str, value: int) -> None:
+    """PgtsError unless it is a whole number of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise PgtsError(f"{name} is {value!r}; it must be a whole number of at least 1")

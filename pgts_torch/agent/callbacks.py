@@ -9,9 +9,8 @@ from typing import Any, final
 from pgts_torch.agent import saving
 from pgts_torch.agent.evaluate import Evaluation, Score, evaluate
 from pgts_torch.agent.iteration import Iteration
-from pgts_torch.agent.optimisers import check_count
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 
 
 @dataclass(frozen=True)

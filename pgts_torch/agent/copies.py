@@ -13,8 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward, TimeLimit
 
-from pgts_torch.agent.optimisers import check_count
-from pgts_torch.errors import PgtsError, failure
+from pgts_torch.errors import PgtsError, check_count, failure
 from pgts_torch.models import snapshots
 from pgts_torch.models.environments import (
     MOST_ACTIONS,

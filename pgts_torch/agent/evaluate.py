@@ -10,11 +10,11 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.optimisers import check_count
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import FixedHorizon, rollout
 from pgts_torch.agent.world import World
+from pgts_torch.errors import check_count
 from pgts_torch.seeding import stream
 
 UNLIMITED_LENGTH = 1000

@@ -20,10 +20,10 @@ from pgts_torch.agent.critics import (
     lambda_returns,
 )
 from pgts_torch.agent.networks import MLP, Network, NetworkDescription, Trunk
-from pgts_torch.agent.optimisers import Optimiser, check_count, minibatches
+from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.seeding import stream
 
 _SMALLEST_SCALE = 1e-4

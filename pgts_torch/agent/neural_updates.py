@@ -21,11 +21,11 @@ from torch import Tensor
 
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural import NetworkPolicy
-from pgts_torch.agent.optimisers import Optimiser, check_count, check_positive, minibatches
+from pgts_torch.agent.optimisers import Optimiser, check_positive, minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import StateWeight
 from pgts_torch.agent.updates import Update, check_state_weight
-from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.search.lookahead import check_finite
 
 

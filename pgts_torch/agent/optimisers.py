@@ -135,9 +135,3 @@ def check_positive(name: str, value: float) -> None:
     """PgtsError unless it is finite and above 0."""
     if not 0 < value < math.inf:
         raise PgtsError(f"{name} is {value}; it must be finite and above 0")
-
-
-def check_count(name: str, value: int) -> None:
-    """PgtsError unless it is a whole number of at least 1."""
-    if not isinstance(value, int) or value < 1:
-        raise PgtsError(f"{name} is {value!r}; it must be a whole number of at least 1")

@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.errors import MissingModel, check_count
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.empirical import Drawn, Share
 from pgts_torch.search.expectimax import expectimax
 from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaf, Lookahead, check_finite
 from pgts_torch.search.mcts import mcts
-from pgts_torch.search.sampled import sampled
+from pgts_torch.search.sampled import plan_levels, sampled
 from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import draw_keys
 
@@ -116,6 +116,8 @@ class ExpectimaxSearch(Search):
     ) -> None:
         super().__init__(model)
         self.topology: Topology = Topology(listing(model, "expectimax"), max_bytes=max_bytes)
+        if max_width is not None:
+            check_count("max_width", max_width)
         self.max_nodes, self.max_width = max_nodes, max_width
 
     def _look(
@@ -162,6 +164,7 @@ class SampledSearch(Search):
     ) -> None:
         super().__init__(model)
         self._model = drawing(model, "sampled")
+        plan_levels(samples, 1, share, model)
         self.samples, self.share, self.max_nodes, self.max_bytes = samples, share, max_nodes, max_bytes
 
     def _look(
@@ -214,8 +217,9 @@ class MCTSSearch(Search):
     ) -> None:
         super().__init__(model)
         self.simulations, self.merge, self.max_nodes, self.max_bytes = simulations, merge, max_nodes, max_bytes
-        if samples is not None and samples < 1:
-            raise PgtsError(f"samples is {samples}; it must be at least 1")
+        check_count("simulations", simulations)
+        if samples is not None:
+            check_count("samples", samples)
         lists = samples is None and isinstance(model, EnumeratingModel)
         self.topology = Topology(listing(model, "mcts"), max_bytes=max_bytes) if lists else None
         self.samples = samples or DEFAULT_SAMPLES

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.search.known import KnownStates
 from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead, check_states, check_vector, unexpanded
@@ -218,13 +218,12 @@ def _check(
     merge: bool,
     generator: torch.Generator | None,
 ) -> None:
-    if isinstance(simulations, bool) or not isinstance(simulations, int) or simulations < 1:
-        raise PgtsError(f"simulations is {simulations!r}; it must be a whole number of at least 1")
+    check_count("simulations", simulations)
     for name, value, words in (("root", root, Root), ("rule", rule, Rule), ("backup", backup, Backup)):
         if value not in get_args(words):
             raise PgtsError(f"{name} is {value!r}; it must be one of {', '.join(map(repr, get_args(words)))}")
-    if wave is not None and (isinstance(wave, bool) or not isinstance(wave, int) or wave < 1):
-        raise PgtsError(f"wave is {wave!r}; it must be a whole number of at least 1, or None")
+    if wave is not None:
+        check_count("wave", wave)
     if exploration is not None and rule == "gumbel":
         raise PgtsError("rule='gumbel' has no exploration")
     if exploration is not None and not 0 <= exploration < math.inf:

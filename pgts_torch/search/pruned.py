@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes, backup
-from pgts_torch.errors import NodeBudgetExceeded, PgtsError
+from pgts_torch.errors import NodeBudgetExceeded, check_count
 from pgts_torch.search.lookahead import Leaves, Lookahead, check_states, check_vector
 from pgts_torch.search.topology import Topology, counting
 
@@ -53,8 +53,7 @@ def pruned(
         PgtsError: a bad width, roots that are no states, critic values of a wrong shape or not finite.
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
-    if isinstance(max_width, bool) or not isinstance(max_width, int) or max_width < 1:
-        raise PgtsError(f"max_width is {max_width!r}; it must be a whole number of at least 1")
+    check_count("max_width", max_width)
     check_vector(root_B)
     check_states(root_B, topology.model.num_states)
     calls_before = topology.model_calls

@@ -89,7 +89,7 @@ def sampled(
     leaves = Leaves(model, depth, q_leaf, v_leaf)
     check_vector(root_B)
     check_states(root_B, model.num_states)
-    plan = _plan(samples, leaves.expansions, share, model)
+    plan = plan_levels(samples, leaves.expansions, share, model)
     if replicates < 0 or replicates == 1:
         raise PgtsError(f"replicates is {replicates}; it must be 0 or at least 2")
     key = draw_keys(1, generator=generator).to(model.device)
@@ -122,7 +122,9 @@ def sampled(
     )
 
 
-def _plan(samples: int | Sequence[int | None], expansions: int, share: str, model: Model) -> tuple[int | None, ...]:
+def plan_levels(
+    samples: int | Sequence[int | None], expansions: int, share: str, model: Model
+) -> tuple[int | None, ...]:
     """C of each of `expansions` levels, None where outcomes are listed."""
     given = list(samples) if isinstance(samples, Sequence) else [samples]
     for C in given:
