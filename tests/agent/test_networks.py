@@ -26,16 +26,31 @@ def views(count: int, seed: int = 0) -> torch.Tensor:
     return torch.randint(0, 256, (count, 7, 7, 3), generator=stream(seed, "views"), dtype=torch.uint8)
 
 
-def test_an_mlp_is_the_formula_of_its_weights():
-    net = network(MLP(hidden=(4, 6), activation="tanh"), VECTORS)
+@pytest.mark.parametrize("hidden", [(), (4,), (4, 6), (7, 4, 5)])
+@pytest.mark.parametrize(("activation", "function"), [("tanh", torch.tanh), ("relu", torch.relu)])
+def test_an_mlp_is_the_formula_of_its_weights(hidden, activation, function):
+    net = network(MLP(hidden=hidden, activation=activation), VECTORS)
     x_ND = torch.randn(5, 3, generator=stream(0, "x"), dtype=torch.float64)
     weights = [value.double() for value in net.parameters()]
-    h = (x_ND @ weights[0].T + weights[1]).tanh()
-    h = (h @ weights[2].T + weights[3]).tanh()
-    torch.testing.assert_close(net.evaluate(x_ND).double(), h @ weights[4].T + weights[5], atol=1e-5, rtol=0)
-    assert not torch.allclose(
-        network(MLP(hidden=(4, 6), activation="relu"), VECTORS).evaluate(x_ND), net.evaluate(x_ND)
-    )
+    assert [len(bias) for bias in weights[1::2]] == [*hidden, 2]
+    h = x_ND
+    for weight, bias in zip(weights[:-2:2], weights[1:-2:2], strict=True):
+        h = function(h @ weight.T + bias)
+    torch.testing.assert_close(net.evaluate(x_ND).double(), h @ weights[-2].T + weights[-1], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("hidden", [(), (5,), (5, 9), (9, 5)])
+def test_a_cnn_is_the_formula_of_its_weights(hidden):
+    net = network(CNN(channels=(2, 3), kernel_size=3, stride=2, hidden=hidden), VIEWS)
+    weights = [value.double() for value in net.parameters()]
+    assert [len(bias) for bias in weights[1::2]] == [2, 3, *hidden, 2]
+    h = views(4).permute(0, 3, 1, 2).double() / 255
+    for weight, bias in zip(weights[:4:2], weights[1:4:2], strict=True):
+        h = torch.nn.functional.conv2d(h, weight, bias, stride=2).relu()
+    h = h.flatten(1)
+    for weight, bias in zip(weights[4:-2:2], weights[5:-2:2], strict=True):
+        h = (h @ weight.T + bias).relu()
+    torch.testing.assert_close(net.evaluate(views(4)).double(), h @ weights[-2].T + weights[-1], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("description", "space"), [(MLP(), VECTORS), (MLP((8,)), STATES), (CNN(), VIEWS)])

@@ -135,6 +135,30 @@ def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo():
     assert losses["policy"] == pytest.approx((seen[0][0] + seen[1][0]) / 2)
 
 
+def test_the_clip_fraction_is_the_share_of_actions_whose_ratio_is_out_of_range_by_weight_and_by_the_old_policy():
+    # Two states of weight 1 and 3, three actions of old probability 0.5, 0.25, 0.25. By hand: in the first state rho
+    # is 0.7, 1.3, 1.3, all out of the range 0.8 to 1.2; in the second 0.8995, 1, 1.201: the last one, 0.25.
+    policy = NetworkPolicy(spaces.Discrete(2), 3, network=MLP(hidden=()))
+    old_NA = torch.tensor([[0.5, 0.25, 0.25]]).repeat(2, 1)
+    new_NA = old_NA * torch.tensor([[0.7, 1.3, 1.3], [0.8995, 1.0, 1.201]])
+    policy.load_state_dict({"head.weight": old_NA.log().T, "head.bias": torch.zeros(3)})
+
+    class Step:
+        def step(self, parameters, loss, name, *, through):
+            policy.network.head.weight.data.copy_(new_NA.log().T)
+            return 0.0
+
+        def state_dict(self):
+            return {}
+
+    update = PPOUpdate(num_epochs=1, minibatch_size=2, clip_range=0.2)
+    update._optimiser = Step()
+    advantage_NA = torch.tensor([[1.0, -1.0, -1.0], [1.0, 0.0, -2.0]], dtype=torch.float64)
+    weight_N = torch.tensor([1.0, 3.0], dtype=torch.float64)
+    losses = update(policy, torch.arange(2), advantage_NA, weight_N, generator=stream(0, "update"))
+    assert losses["clip_fraction"] == pytest.approx((1 * 1.0 + 3 * 0.25) / 4)
+
+
 @pytest.mark.parametrize("entropy_coef", [0.0, 0.3])
 def test_the_gradient_of_the_clipped_objective_is_that_of_autograd(entropy_coef):
     generator = stream(0, "objective")
