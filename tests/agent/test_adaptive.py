@@ -43,6 +43,7 @@ def test_an_adaptive_depth_stays_shallow_where_there_is_a_slope():
     assert model.iterate().depth == 0
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_a_proved_policy_ends_the_training_and_is_kept():
     model = always_left(depth="adaptive", stop_at=0.05, update={"type": "projected", "step_size": 1.0})
     iterations = []
@@ -53,6 +54,7 @@ def test_a_proved_policy_ends_the_training_and_is_kept():
     assert torch.equal(model.policy.table()[iterations[-1].state_N], iterations[-1].pi_NA)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_without_stop_at_nothing_ends_early():
     model = always_left(depth=8, update={"type": "projected", "step_size": 1.0})
     assert model.learn(4_000).num_env_steps >= 4_000

@@ -98,6 +98,7 @@ def test_the_exact_critic_is_the_exact_evaluation():
     assert critic.model_calls == 0
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize("target", ["v", "q"])
 def test_the_error_of_monte_carlo_means_falls_with_the_square_root_of_the_episodes(target):
     # 15 repeats of 6 or 12 values: the slope of four such points has a standard error of about 0.03.
@@ -116,6 +117,7 @@ def test_the_error_of_monte_carlo_means_falls_with_the_square_root_of_the_episod
     assert errors[-1] < 0.06
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize("horizon", [FixedHorizon(2), GeometricHorizon()])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("target", ["v", "q"])

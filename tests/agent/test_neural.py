@@ -82,6 +82,7 @@ def test_a_policy_survives_the_round_trip_through_a_file(tmp_path):
         NetworkPolicy(VECTORS, 4, network=MLP((8,), normalize=True)).load_state_dict(policy.state_dict())
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize("horizon", [FixedHorizon(3), GeometricHorizon()])
 @pytest.mark.parametrize("method", [MonteCarlo(), TDLambda(0.9)])
 @pytest.mark.parametrize("target", ["v", "q"])

@@ -347,6 +347,7 @@ def test_observations_are_seen_after_the_steps_but_for_the_first_batch():
         assert losses["kl"] == pytest.approx(0, abs=1e-6), divergence
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize("update", [GradientUpdate(learning_rate=0.05), PPOUpdate(learning_rate=0.01, num_epochs=4)])
 def test_a_policy_and_a_critic_learn_from_sampled_actions_alone(update):
     mdp = random_mdp(6, 2, gamma=0.7, start=None)

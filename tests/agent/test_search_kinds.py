@@ -32,6 +32,7 @@ def trained(search, depth: int) -> float:
     return exact.evaluate(model.mdp, model.policy.table()).J / exact.optimal(model.mdp).J
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize("search", SEARCHES, ids=str)
 def test_every_search_climbs_the_ladder_that_a_shallow_one_cannot(search):
     assert trained(search, 4) > 0.95

@@ -363,6 +363,7 @@ def test_repeated_actions_prove_nothing_and_single_ones_do():
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_cartpole_is_learned_with_a_lookahead_of_two_steps_and_not_without_training():
     model = PGTS("CartPole-v1", depth=2, num_envs=8, seed=0, horizon={"type": "fixed", "length": 200})
 

@@ -510,6 +510,7 @@ def _nested(values: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 @given(configurations())
 def test_any_configuration_survives_printing_and_loading(config: Config) -> None:
     assert Config.model_validate(strict_yaml.parse(dump(config)).value) == config
@@ -676,6 +677,7 @@ def _mutated(text: str, generator: random.Random) -> str:
     return text
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.fault("any other damaged text")
 @pytest.mark.parametrize("count", [400, pytest.param(10_000, marks=pytest.mark.long)])
 def test_damaged_files_give_a_configuration_or_clear_lines_in_less_than_a_second_and_nothing_else(

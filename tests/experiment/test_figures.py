@@ -375,6 +375,7 @@ def test_a_band_is_the_interquartile_mean_inside_its_interval():
     assert one.low == one.iqm == one.high == J_NK[0].tolist()
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_runs_draw_independently_and_the_number_of_workers_changes_nothing():
     given = sampled.arguments(
         depth=1,
@@ -444,6 +445,7 @@ def small(monkeypatch: pytest.MonkeyPatch, ladder_members: table1.Found) -> None
     monkeypatch.setattr(study, "family_study", lambda seeds: family)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_the_command_leaves_a_document_that_is_made_of_its_data_alone(small, tmp_path, capsys):
     assert main(["figures", "--quick", "--json", "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
@@ -470,6 +472,7 @@ def test_the_command_leaves_a_document_that_is_made_of_its_data_alone(small, tmp
     assert "something else" not in text
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_one_part_alone_keeps_the_others_and_missing_ones_are_named(small, tmp_path, capsys):
     assert main(["figures", "--quick", "--only", "ladder", "--out", str(tmp_path)]) == 0
     assert "Run `pgts figures --only random`" in (tmp_path / "reproduction.md").read_text()

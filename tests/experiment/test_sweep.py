@@ -106,25 +106,24 @@ def until(done: Callable[[], bool]) -> None:
 @pytest.mark.fault("SIGTERM")
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_a_sweep_that_is_stopped_saves_and_the_same_command_ends_with_the_table_of_one_that_was_not(here):
-    long = ["--total_steps", "600", "--log.checkpoint_every", "1", "--log.keep", "999", "--run.tensorboard", "false"]
-    whole = sweep.plan(None, [*SMALL, *long], depths=(1,), num_seeds=2, out=Path("whole"))
-    for each in whole:
-        run.train(each.config)
+    long = ["--total_steps", "1500", "--log.checkpoint_every", "1", "--log.keep", "999", "--run.tensorboard", "false"]
+    whole = sweep.plan(None, [*SMALL, *long], depths=(1,), num_seeds=1, out=Path("whole"))
+    run.train(whole[0].config)
     expected = asdict(sweep.sweep(whole, jobs=1, out=Path("whole")))
-    arguments = ["sweep", "--out", "out", "--depths", "1", "--seeds", "2", "--jobs", "2", *SMALL, *long]
-    folders = [Path("out/depth-1/seed-0"), Path("out/depth-1/seed-1")]
+    arguments = ["sweep", "--out", "out", "--depths", "1", "--seeds", "1", *SMALL, *long]
+    folder = Path("out/depth-1/seed-0")
     command = [sys.executable, "-m", "pgts_torch.experiment.cli", *arguments]
     with started(command) as process:
-        until(lambda: any(map(checkpoint.listed, folders)))
+        until(lambda: bool(checkpoint.listed(folder)))
         process.terminate()
-        assert "stopped: 0 of 2 runs are done; the same command goes on\n" in process.communicate(timeout=PATIENCE)[1]
+        assert "stopped: 0 of 1 runs are done; the same command goes on\n" in process.communicate(timeout=PATIENCE)[1]
         assert process.returncode == 143
-    assert not any((folder / "summary.json").exists() for folder in folders)
-    for folder in folders:
-        RunLock(folder).__exit__(None, None, None)  # nobody has it any more
-    first = {path: path.stat().st_mtime_ns for folder in folders for path in checkpoint.listed(folder)[:1]}
+    assert not (folder / "summary.json").exists()
+    RunLock(folder).__exit__(None, None, None)  # nobody has it any more
+    first = checkpoint.listed(folder)[0]
+    written = first.stat().st_mtime_ns
     assert main(arguments) == 0
-    assert {path: path.stat().st_mtime_ns for path in first} == first  # it did not begin anew
+    assert first.stat().st_mtime_ns == written  # it did not begin anew
     answer = json.loads(Path("out/table.json").read_text())
     for row in (*answer["rows"], *expected["rows"]):
         del row["seconds"]
