@@ -15,9 +15,10 @@ from pgts_torch.agent.copies import env_name
 from pgts_torch.agent.critics import Critic, ExactCritic, MonteCarlo, RolloutCritic, TabularCritic, TDLambda
 from pgts_torch.agent.networks import CNN, MLP
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
-from pgts_torch.agent.neural_updates import GradientUpdate, NetworkMirrorUpdate, NetworkUpdate, PPOUpdate
+from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
 from pgts_torch.agent.policies import Biased, Policy, Random, SimplexPolicy, SoftmaxPolicy, TabularPolicy, Uniform
 from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Horizon
+from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate, TargetUpdate
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate, Update
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
@@ -51,7 +52,7 @@ _SEARCHES: _Choices = {
     "mcts": MCTSSearch,
 }
 _TABLE_UPDATES: _Choices = {"projected": ProjectedUpdate, "softmax": SoftmaxUpdate, "mirror": MirrorUpdate}
-_NETWORK_UPDATES: _Choices = {"gradient": GradientUpdate, "ppo": PPOUpdate, "mirror": NetworkMirrorUpdate}
+_NETWORK_UPDATES: _Choices = {"gradient": GradientUpdate, "ppo": PPOUpdate, "mirror": NetworkMirrorUpdate, "cmpo": CMPOUpdate}
 
 
 def make_device(device: torch.device | str) -> torch.device:
@@ -106,12 +107,13 @@ def make_tabular_policy(
     return _make("policy", _TABLES, description, num_states, num_actions, nested=nested, seed=seed, device=device)
 
 
-def make_update(description: Description | None, policy: Policy) -> Update:
-    """An update, of a table: projected, softmax or mirror (step_size, state_weight); of a network: gradient, ppo or
-    mirror. Default: the one for the policy."""
+def make_update(description: Description | None, policy: Policy, estimator: Estimator) -> Update:
+    """An update, of a table: projected, softmax or mirror (step_size, state_weight); of a network: gradient, ppo,
+    mirror or cmpo. Default: the one for the policy, of a network cmpo with a lookahead and ppo without."""
     network = isinstance(policy, NetworkPolicy)
     if description is None:
-        description = "ppo" if network else "projected" if isinstance(policy, SimplexPolicy) else "softmax"
+        neural = "ppo" if isinstance(estimator, SampledAdvantages) else "cmpo"
+        description = neural if network else "projected" if isinstance(policy, SimplexPolicy) else "softmax"
     kind = _parts("update", {**_TABLE_UPDATES, **_NETWORK_UPDATES}, description)[0]
     choices = _NETWORK_UPDATES if kind not in _TABLE_UPDATES or (network and kind == "mirror") else _TABLE_UPDATES
     return _make("update", choices, description)
@@ -188,10 +190,10 @@ def check_parts(
             f"the critic is {type(critic).__name__} of {critic.target}; sampled advantages stand on what was learned "
             "before, so they need a tabular or network critic of v"
         )
-    if isinstance(update, NetworkMirrorUpdate):
+    if isinstance(update, TargetUpdate):
         raise PgtsError(
-            "NetworkMirrorUpdate needs the advantages of all actions, for they stand in an exponent; sampled ones are "
-            "of the actions taken"
+            f"{type(update).__name__} needs the advantages of all actions, for they stand in an exponent; sampled ones "
+            "are of the actions taken"
         )
 
 

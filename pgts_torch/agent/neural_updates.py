@@ -32,12 +32,14 @@ from pgts_torch.search.lookahead import check_finite
 class Batch(NamedTuple):
     """What one update moves the policy by.
 
-    input_N: encoded observations.   advantage_NA, weight_N: float32.
+    input_N: encoded observations.   weight_N: float32.   advantage_NA: in reward units, in the dtype of the lookahead.
+    noise: what advantages may be off by, in reward units (`Update.__call__`).
     """
 
     input_N: Float[Tensor, "N ..."]
     advantage_NA: Float[Tensor, "N A"]
     weight_N: Float[Tensor, "N"]
+    noise: float
 
 
 class Move(NamedTuple):
@@ -87,6 +89,7 @@ class NetworkUpdate(Update):
         weight_N: Float[Tensor, "N"],
         *,
         generator: torch.Generator,
+        noise: float = 0.0,
     ) -> dict[str, float]:
         """Move the network.
 
@@ -105,7 +108,7 @@ class NetworkUpdate(Update):
             network, encoder = policy.network, policy.network.trunk.encoder
             if fresh := encoder.fresh:
                 encoder.absorb(observation_N)
-            batch = Batch(network.encode(observation_N), advantage_NA.float(), weight_N.float())
+            batch = Batch(network.encode(observation_N), advantage_NA, weight_N.float(), noise)
             old_NA, new_NA, losses = self.move(network, batch, generator)
             check_finite("probability", "the next policy", new_NA, None)
             share_N = batch.weight_N / batch.weight_N.sum()
@@ -166,11 +169,11 @@ class GradientUpdate(NetworkUpdate):
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
         """policy: less the objective without entropy, before the step; grad_norm: before clipping."""
         log_NA = network(batch.input_N).log_softmax(-1)
-        policy_loss = -(batch.weight_N @ (log_NA.exp() * batch.advantage_NA).sum(-1))
+        policy_loss = -(batch.weight_N @ (log_NA.exp() * batch.advantage_NA.float()).sum(-1))
         bonus = batch.weight_N @ entropy(log_NA) if self.entropy_coef else 0.0
         norm = self.step(network, policy_loss - self.entropy_coef * bonus)
         losses = {"policy": float(policy_loss.detach()), "grad_norm": norm}
-        return Move(log_NA.detach(), _log_probs(network, batch.input_N), losses)
+        return Move(log_NA.detach(), log_probs(network, batch.input_N), losses)
 
 
 @final
@@ -210,28 +213,28 @@ class PPOUpdate(NetworkUpdate):
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
         """policy: mean over the steps of less the objective without entropy; grad_norm: mean, before clipping;
         clip_fraction: the share of actions, after the steps, whose rho is out of range; num_steps taken."""
-        input_N, advantage_NA, weight_N = batch
-        old_NA = _log_probs(network, input_N)
+        input_N, advantage_NA, weight_N = batch.input_N, batch.advantage_NA.float(), batch.weight_N
+        old_NA = log_probs(network, input_N)
         weight_N = weight_N / weight_N.mean()
         if self.normalize_advantage:
             advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N)
         columns, policy_losses, norms = (input_N, old_NA, advantage_NA, weight_N), [], []
-        passes = _passes(network, columns, self.num_epochs, self.minibatch_size, generator)
-        for log_NA, (_, before_NA, part_NA, part_N) in passes:
-            if self.target_kl is not None and _mean(part_N, divergence(before_NA, log_NA)) > self.target_kl:
+        made = passes(network, columns, self.num_epochs, self.minibatch_size, generator)
+        for log_NA, (_, before_NA, part_NA, part_N) in made:
+            if self.target_kl is not None and mean(part_N, divergence(before_NA, log_NA)) > self.target_kl:
                 break
             with torch.no_grad():
                 gain_NA, push_NA = self.objective(log_NA, before_NA, part_NA)
-                policy_loss = -_mean(part_N, (before_NA.exp() * gain_NA).sum(-1))
+                policy_loss = -mean(part_N, (before_NA.exp() * gain_NA).sum(-1))
                 down_NA = -push_NA * (part_N / len(part_N))[:, None]
             norms.append(self.step(network, policy_loss, through=(log_NA, down_NA)))
             policy_losses.append(float(policy_loss))
-        new_NA = _log_probs(network, input_N)
+        new_NA = log_probs(network, input_N)
         outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.clip_range
         losses = {
             "policy": sum(policy_losses) / len(policy_losses),
             "grad_norm": sum(norms) / len(norms),
-            "clip_fraction": float(_mean(weight_N, (old_NA.exp() * outside_NA).sum(-1))),
+            "clip_fraction": float(mean(weight_N, (old_NA.exp() * outside_NA).sum(-1))),
             "num_steps": len(norms),
         }
         return Move(old_NA, new_NA, losses)
@@ -255,45 +258,6 @@ class PPOUpdate(NetworkUpdate):
         return gain_NA, log_NA.exp() * slope_NA
 
 
-@final
-@dataclass(eq=False, kw_only=True)
-class NetworkMirrorUpdate(NetworkUpdate):
-    """The mirror step, projected onto the network by KL (Tomar et al. 2022; Protopapas and Barakat 2024).
-
-        minimise  mean_s w(s) KL(target(.|s) || pi(.|s)),    target(a|s) = pi_old(a|s) exp(adv(s, a) / temperature) / Z
-
-    over minibatches, the weights scaled to a mean of 1. A network that can be any policy ends where `MirrorUpdate`
-    with step_size * w(s) = 1 / temperature does. The advantages must be of all actions: in the exponent, an estimate
-    from one action is not unbiased.
-
-    Args:
-        temperature: in reward units; small ones make long steps.
-        num_epochs, minibatch_size: passes over the batch, and observations in each step.
-    """
-
-    temperature: float = 1.0
-    num_epochs: int = 10
-    minibatch_size: int = 64
-
-    def check_options(self) -> None:
-        check_positive("temperature", self.temperature)
-        check_count("num_epochs", self.num_epochs)
-        check_count("minibatch_size", self.minibatch_size)
-
-    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
-        """policy: mean_s w(s) KL(target || pi) after the steps; grad_norm: mean over the steps, before clipping."""
-        old_NA = _log_probs(network, batch.input_N)
-        target_NA = (old_NA + batch.advantage_NA / self.temperature).log_softmax(-1)
-        weight_N = batch.weight_N / batch.weight_N.mean()
-        columns, norms = (batch.input_N, target_NA, weight_N), []
-        passes = _passes(network, columns, self.num_epochs, self.minibatch_size, generator)
-        for log_NA, (_, part_NA, part_N) in passes:
-            norms.append(self.step(network, _mean(part_N, divergence(part_NA, log_NA))))
-        new_NA = _log_probs(network, batch.input_N)
-        after = float(_mean(weight_N, divergence(target_NA, new_NA)))
-        return Move(old_NA, new_NA, {"policy": after, "grad_norm": sum(norms) / len(norms)})
-
-
 def entropy(log_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
     """H(pi(.|s)) in nats, from log pi."""
     return -(log_NA.exp() * log_NA).sum(-1)
@@ -305,12 +269,12 @@ def divergence(log_p_NA: Float[Tensor, "N A"], log_q_NA: Float[Tensor, "N A"]) -
 
 
 @torch.no_grad()
-def _log_probs(network: Network, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N A"]:
+def log_probs(network: Network, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N A"]:
     """log pi, without gradient."""
     return network(input_N).log_softmax(-1)
 
 
-def _passes(
+def passes(
     network: Network, columns: Sequence[Tensor], num_epochs: int, minibatch_size: int, generator: torch.Generator
 ) -> Iterator[tuple[Float[Tensor, "N A"], tuple[Tensor, ...]]]:
     """log pi of the network as it is by then, and the columns, of which the first are its inputs, in minibatches."""
@@ -319,7 +283,7 @@ def _passes(
             yield network(part[0]).log_softmax(-1), part
 
 
-def _mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"]) -> Float[Tensor, ""]:
+def mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"]) -> Float[Tensor, ""]:
     """mean_n w_n value_n."""
     return weight_N @ value_N / len(value_N)
 
@@ -328,7 +292,7 @@ def _scale(
     old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]
 ) -> Float[Tensor, ""]:
     size_N = (old_NA.exp() * advantage_NA.abs()).sum(-1)
-    return _mean(weight_N, size_N.square()).sqrt() + 1e-8
+    return mean(weight_N, size_N.square()).sqrt() + 1e-8
 
 
 def _check_numbers(advantage_NA: Tensor, weight_N: Tensor) -> None:

@@ -169,7 +169,7 @@ class PGTS:
         if not isinstance(critic, Critic):
             critic = make_critic(critic, self.world, policy, seed=seed)
         if not isinstance(update, Update):
-            update = make_update(update, policy)
+            update = make_update(update, policy, self.estimator)
         if not isinstance(horizon, Horizon):
             horizon = make_horizon(horizon)
         self.policy, self.critic, self.update, self.horizon = policy, critic, update, horizon
