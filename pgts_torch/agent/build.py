@@ -52,7 +52,12 @@ _SEARCHES: _Choices = {
     "mcts": MCTSSearch,
 }
 _TABLE_UPDATES: _Choices = {"projected": ProjectedUpdate, "softmax": SoftmaxUpdate, "mirror": MirrorUpdate}
-_NETWORK_UPDATES: _Choices = {"gradient": GradientUpdate, "ppo": PPOUpdate, "mirror": NetworkMirrorUpdate, "cmpo": CMPOUpdate}
+_NETWORK_UPDATES: _Choices = {
+    "gradient": GradientUpdate,
+    "ppo": PPOUpdate,
+    "mirror": NetworkMirrorUpdate,
+    "cmpo": CMPOUpdate,
+}
 
 
 def make_device(device: torch.device | str) -> torch.device:
@@ -107,7 +112,11 @@ def make_tabular_policy(
     return _make("policy", _TABLES, description, num_states, num_actions, nested=nested, seed=seed, device=device)
 
 
-def make_update(description: Description | None, policy: Policy, estimator: Estimator) -> Update:
+def make_update(
+    description: Description | None,
+    policy: Policy,
+    estimator: Estimator = LookaheadAdvantages(),  # noqa: B008 - frozen
+) -> Update:
     """An update, of a table: projected, softmax or mirror (step_size, state_weight); of a network: gradient, ppo,
     mirror or cmpo. Default: the one for the policy, of a network cmpo with a lookahead and ppo without."""
     network = isinstance(policy, NetworkPolicy)
@@ -184,7 +193,10 @@ def check_parts(
         if (value := arguments[name]) != default:
             raise PgtsError(f"{name} is {value}; sampled advantages look no step ahead, it must be {default}")
     if not isinstance(update, NetworkUpdate):
-        raise PgtsError(f"{type(update).__name__} takes one row a state; sampled advantages have one a visit")
+        raise PgtsError(
+            f"{type(update).__name__} takes one row a state; sampled advantages have one a visit: take a network, mlp "
+            "or cnn, as policy"
+        )
     if not isinstance(critic, TabularCritic | NetworkCritic) or critic.target != "v":
         raise PgtsError(
             f"the critic is {type(critic).__name__} of {critic.target}; sampled advantages stand on what was learned "

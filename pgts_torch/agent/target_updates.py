@@ -1,6 +1,5 @@
 """How network policies move toward a target policy that the advantages of all actions name."""
 
-import math
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import final
@@ -73,21 +72,25 @@ class NetworkMirrorUpdate(TargetUpdate):
 @final
 @dataclass(eq=False, kw_only=True)
 class CMPOUpdate(TargetUpdate):
-    """Clipped MPO, step(s, a) = clip(adv(s, a) / scale, -clip, clip) (Hessel et al. 2021, Sec. 4).
+    """Clipped MPO, step(s, a) = clip(adv(s, a) / (temperature scale), -clip, clip) (Hessel et al. 2021, Sec. 4).
 
-        scale^2 = mean_s w(s) mean_a (adv(s, a) - mean_b adv(s, b))^2, and at least noise^2
+        scale = mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|, and at least the noise
 
-    The default for lookaheads: an action that is better by the usual difference gains one unit of log pi, whatever the
-    scale of rewards. All rewards times 2^k leave every bit as it is.
+    The default for lookaheads: how far an action moves depends on how much better it is than usual, never on the scale
+    of rewards, of which a factor of 2^k leaves every bit as it is. The scale is a mean and no root of a mean square:
+    few states in which all depends on the action do not silence the many in which it matters a little.
 
     Args:
+        temperature: in units of the scale; small ones make long steps.
         clip: above 0; the most that an action gains or loses in log pi, before Z.
     """
 
     learning_rate: float = 1e-3
-    clip: float = 1.0
+    temperature: float = 0.25
+    clip: float = 2.0
 
     def check_options(self) -> None:
+        check_positive("temperature", self.temperature)
         check_positive("clip", self.clip)
         check_count("num_epochs", self.num_epochs)
         check_count("minibatch_size", self.minibatch_size)
@@ -96,18 +99,11 @@ class CMPOUpdate(TargetUpdate):
         scale = max(advantage_scale(batch.advantage_NA, batch.weight_N), batch.noise)
         if scale == 0:  # all actions are alike
             return torch.zeros_like(batch.advantage_NA, dtype=torch.float32)
-        return (batch.advantage_NA / scale).clamp(-self.clip, self.clip).float()
+        return (batch.advantage_NA / scale / self.temperature).clamp(-self.clip, self.clip).float()
 
 
 def advantage_scale(advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]) -> float:
-    """How far apart the actions of a state are: the root of mean_s w(s) mean_a (adv(s, a) - mean_b adv(s, b))^2.
-
-    Times 2^k, bit for bit, where the advantages are; what all actions of a state have in common does not count. Squares
-    are taken of shares of the largest, so that they neither overflow nor vanish.
-    """
-    apart_NA = (advantage_NA - advantage_NA.mean(-1, keepdim=True)).double()
-    largest = float(apart_NA.abs().max())
-    if largest == 0:
-        return 0.0
+    """mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|: how far apart the actions of a state are, in reward units."""
+    apart_N = (advantage_NA - advantage_NA.mean(-1, keepdim=True)).abs().mean(-1).double()
     share_N = weight_N.double() / weight_N.double().sum()
-    return largest * math.sqrt(float(share_N @ (apart_NA / largest).square().mean(-1)))
+    return float(share_N @ apart_N)

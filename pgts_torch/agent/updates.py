@@ -58,7 +58,10 @@ class Update(ABC):
         """PgtsError unless this update can move such a policy."""
         if not isinstance(policy, self.policies):
             names = " or ".join(kind.__name__ for kind in self.policies)
-            raise PgtsError(f"{type(self).__name__} moves a {names}, not a {type(policy).__name__}")
+            raise PgtsError(
+                f"{type(self).__name__} moves a {names}, not a {type(policy).__name__}; take such a policy or another "
+                "update"
+            )
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 This module and everything it imports are free of torch, so that mistakes and help appear at once.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
@@ -10,8 +11,13 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pgts_torch.experiment import strict_yaml
 from pgts_torch.experiment.fields import Count, Device, Name, Natural, Section, conflict
 from pgts_torch.experiment.sections import (
+    NETWORKS,
     TABLES,
+    AutoCriticConfig,
+    AutoPolicyConfig,
+    AutoUpdateConfig,
     BiasedInitConfig,
+    CMPOUpdateConfig,
     CNNConfig,
     EnvConfig,
     EvalConfig,
@@ -55,23 +61,31 @@ class Config(Section):
     """Threads of torch."""
 
     env: EnvConfig = EnvConfig()
-    policy: SoftmaxConfig | SimplexConfig | MLPConfig | CNNConfig = Field(default=SoftmaxConfig(), discriminator="type")
+    policy: AutoPolicyConfig | SoftmaxConfig | SimplexConfig | MLPConfig | CNNConfig = Field(
+        default=AutoPolicyConfig(), discriminator="type"
+    )
     """The policy that is trained: a table (softmax, simplex) or a network (mlp, cnn)."""
 
     rollout: RolloutConfig = RolloutConfig()
-    critic: ExactCriticConfig | TabularCriticConfig | RolloutCriticConfig | NetworkCriticConfig = Field(
-        default=TabularCriticConfig(), discriminator="type"
+    critic: AutoCriticConfig | ExactCriticConfig | TabularCriticConfig | RolloutCriticConfig | NetworkCriticConfig = (
+        Field(default=AutoCriticConfig(), discriminator="type")
     )
-    """Where the values at the leaves of the lookahead come from. With a network policy the default is network."""
+    """Where the values at the leaves of the lookahead come from."""
 
     search: SearchConfig = SearchConfig()
     estimator: LookaheadConfig | SampledAdvantagesConfig = Field(default=LookaheadConfig(), discriminator="type")
     """Where the advantages come from that the policy is moved by."""
 
     update: (
-        ProjectedUpdateConfig | SoftmaxUpdateConfig | MirrorUpdateConfig | GradientUpdateConfig | PPOUpdateConfig
-    ) = Field(default=SoftmaxUpdateConfig(), discriminator="type")
-    """How the policy moves toward the lookahead values. With a network policy the default is ppo."""
+        AutoUpdateConfig
+        | ProjectedUpdateConfig
+        | SoftmaxUpdateConfig
+        | MirrorUpdateConfig
+        | GradientUpdateConfig
+        | PPOUpdateConfig
+        | CMPOUpdateConfig
+    ) = Field(default=AutoUpdateConfig(), discriminator="type")
+    """How the policy moves toward the lookahead values."""
 
     log: LogConfig = LogConfig()
     eval: EvalConfig = EvalConfig()
@@ -102,6 +116,8 @@ class Config(Section):
     def _sees_what_the_policy_sees(cls, critic: Any, info: ValidationInfo) -> Any:
         policy, env = info.data.get("policy"), info.data.get("env")
         if policy is None or env is None:
+            return critic
+        if isinstance(critic, AutoCriticConfig):
             return critic
         network = isinstance(critic, NetworkCriticConfig)
         if not network and (policy.type == "cnn" or env.observation_key is not None):
@@ -166,9 +182,9 @@ class Config(Section):
         policy = info.data.get("policy")
         if policy is None:
             return update
-        networks = ("mlp", "cnn")
-        needed = {"projected": ("simplex",), "softmax": ("softmax",), "gradient": networks, "ppo": networks}
-        if policy.type not in needed.get(update.type, (policy.type,)):
+        needed: dict[str, tuple[str, ...]] = {"projected": ("simplex",), "softmax": ("softmax",)}
+        needed |= dict.fromkeys(("gradient", "ppo", "cmpo"), NETWORKS)
+        if policy.type not in ("auto", *needed.get(update.type, (policy.type,))):
             raise conflict(
                 "update.type is {update}, which needs policy.type {needed}; policy.type is {policy}",
                 "update.type",
@@ -177,23 +193,35 @@ class Config(Section):
                 needed=" or ".join(needed[update.type]),
                 policy=policy.type,
             )
-        if isinstance(update, MirrorUpdateConfig):
+        if isinstance(update, MirrorUpdateConfig) and policy.type != "auto":
             _check_mirror(update, policy)
-            if isinstance(info.data.get("estimator"), SampledAdvantagesConfig):
-                raise conflict(
-                    "update.type is mirror, which needs the advantages of all actions; estimator.type is sampled",
-                    "update.type",
-                    "estimator.type",
-                )
+        sampled = isinstance(info.data.get("estimator"), SampledAdvantagesConfig)
+        if sampled and isinstance(update, MirrorUpdateConfig | CMPOUpdateConfig):
+            raise conflict(
+                "update.type is {update}, which needs the advantages of all actions; estimator.type is sampled",
+                "update.type",
+                "estimator.type",
+                update=update.type,
+            )
         return update
 
-    def critic_description(self) -> dict[str, Any]:
-        """The critic as `agent.build` reads it."""
-        description = self.critic.plain()
+    def policy_description(self) -> dict[str, Any] | None:
+        """The policy as `agent.build` reads it; None: by the environment."""
+        return _chosen(self.policy)
+
+    def update_description(self) -> dict[str, Any] | None:
+        """The update, likewise."""
+        return _chosen(self.update)
+
+    def critic_description(self) -> dict[str, Any] | None:
+        """The critic, likewise."""
+        description = _chosen(self.critic)
+        if description is None:
+            return None
         match description.get("network"):
             case {"type": "shared"}:
                 description["network"] = "shared"
-            case {"type": "own"} if self.policy.type in TABLES:
+            case {"type": "own"} if self.policy.type not in NETWORKS:
                 del description["network"]
             case {"type": "own"}:
                 description["network"] = self.policy.plain()
@@ -224,16 +252,38 @@ def _check_mirror(update: MirrorUpdateConfig, policy: Any) -> None:
         )
 
 
+def _chosen(section: Section) -> dict[str, Any] | None:
+    description = section.plain()
+    return None if description["type"] == "auto" else description
+
+
 def with_types(data: dict[str, Any]) -> dict[str, Any]:
-    """The values, with the type of critic and update where they name none and the policy is a network."""
-    policy = data.get("policy")
-    if not isinstance(policy, dict) or policy.get("type") not in ("mlp", "cnn"):
+    """The values, with the type of policy, critic and update where they name other keys but not their type: the first
+    of those that suit the rest of the values and know these keys, else the first that suits."""
+    data = _typed(data, "policy", [SoftmaxConfig, MLPConfig, CNNConfig])
+    policy, sampled = _type(data, "policy"), _type(data, "estimator") == "sampled"
+    tables, networks = policy not in NETWORKS, policy not in TABLES
+    for_tables: list[type[Section]] = [ProjectedUpdateConfig if policy == "simplex" else SoftmaxUpdateConfig]
+    for_networks: list[type[Section]] = [PPOUpdateConfig] if sampled else [CMPOUpdateConfig, PPOUpdateConfig]
+    if policy in NETWORKS:  # also where states are numbered
+        data = data | {"critic": {"type": "network"} | (data.get("critic") or {})}
+    data = _typed(data, "critic", [TabularCriticConfig] * tables + [NetworkCriticConfig] * networks)
+    return _typed(data, "update", for_tables * tables + for_networks * networks)
+
+
+def _typed(data: dict[str, Any], name: str, kinds: Sequence[type[Section]]) -> dict[str, Any]:
+    section = data.get(name)
+    if not isinstance(section, dict) or "type" in section:
         return data
-    filled = {"critic": "network", "update": "ppo"}
-    sections = {name: data.get(name, {}) for name in filled}
-    return data | {
-        name: {"type": filled[name]} | section for name, section in sections.items() if isinstance(section, dict)
-    }
+    known = [{field.alias or key for key, field in kind.model_fields.items()} for kind in kinds]
+    first = next((n for n, keys in enumerate(known) if section.keys() <= keys), 0)
+    kind = kinds[first].model_fields["type"].default if section else "auto"
+    return data | {name: {"type": kind} | section}
+
+
+def _type(data: dict[str, Any], name: str) -> Any:
+    section = data.get(name)
+    return section.get("type") if isinstance(section, dict) else None
 
 
 def dump(config: Config) -> str:

@@ -76,6 +76,12 @@ class BiasedInitConfig(Section):
 Init = UniformInitConfig | RandomInitConfig | BiasedInitConfig
 
 
+class AutoPolicyConfig(Section):
+    """By the environment: a softmax table where its states are numbered, else a network, cnn for images and mlp."""
+
+    type: Literal["auto"] = "auto"
+
+
 class SoftmaxConfig(Section):
     """A table of logits, for environments whose observations are numbered states."""
 
@@ -149,7 +155,8 @@ class CNNConfig(Section):
 
 
 TABLES = ("softmax", "simplex")
-"""The types of policy that are tables; the others are networks."""
+NETWORKS = ("mlp", "cnn")
+"""The types of policy that are tables, and those that are networks; which of them auto is, the environment says."""
 
 
 class FixedHorizonConfig(Section):
@@ -193,6 +200,12 @@ class TDLambdaConfig(Section):
 
     lambda_: UnitInterval = Field(default=0.9, alias="lambda")
     """0 bootstraps after one step; 1 is Monte Carlo."""
+
+
+class AutoCriticConfig(Section):
+    """By the environment: a table where its states are numbered, else a network; with a network policy a network."""
+
+    type: Literal["auto"] = "auto"
 
 
 class ExactCriticConfig(Section):
@@ -412,6 +425,12 @@ class SampledAdvantagesConfig(Section):
 StateWeight = Literal["occupancy", "visits", "uniform"]
 
 
+class AutoUpdateConfig(Section):
+    """By the policy: softmax and projected for the tables; cmpo for networks, ppo where advantages are sampled."""
+
+    type: Literal["auto"] = "auto"
+
+
 class ProjectedUpdateConfig(Section):
     """Euclidean projection onto the simplex, the paper's; needs policy.type simplex."""
 
@@ -491,6 +510,37 @@ class PPOUpdateConfig(Section):
 
     normalize_advantage: bool = True
     """Divide advantages by the root of their mean square."""
+
+
+class CMPOUpdateConfig(Section):
+    """A step toward better actions of a length that no reward scale changes (Hessel et al. 2021); needs a network
+    policy and the advantages of all actions."""
+
+    type: Literal["cmpo"] = "cmpo"
+
+    learning_rate: Positive = 1e-3
+    """Step size of the optimizer."""
+
+    optimizer: Literal["adam", "sgd"] = "adam"
+    """Adam, or plain gradient descent."""
+
+    max_grad_norm: Clip = 0.5
+    """Longer gradients are shortened to it."""
+
+    state_weight: StateWeight = "visits"
+    """What a visited state counts for: its discounted occupancy, its share of all visits, or 1."""
+
+    temperature: Positive = 0.25
+    """By which advantages are divided, in units of their mean size; small ones make long steps."""
+
+    clip: Positive = 2.0
+    """The most that an action gains or loses in log pi in one iteration."""
+
+    num_epochs: Count = 10
+    """Passes over the visited states in each iteration."""
+
+    minibatch_size: Count = 64
+    """States in each step."""
 
 
 class MirrorUpdateConfig(Section):

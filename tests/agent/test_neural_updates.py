@@ -12,17 +12,18 @@ from pgts_torch.agent import saving
 from pgts_torch.agent.advantages import gae, score_function
 from pgts_torch.agent.networks import MLP
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
-from pgts_torch.agent.neural_updates import GradientUpdate, NetworkMirrorUpdate, NetworkUpdate, PPOUpdate
+from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
 from pgts_torch.agent.optimisers import Optimiser
 from pgts_torch.agent.policies import Random, SoftmaxPolicy
 from pgts_torch.agent.rollout import FixedHorizon
+from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.agent.updates import MirrorUpdate, SoftmaxUpdate
 from pgts_torch.errors import PgtsError
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact, random_mdp
 from tests.agent.helpers import copies, made_in
 
-UPDATES = [GradientUpdate, PPOUpdate, NetworkMirrorUpdate]
+UPDATES = [GradientUpdate, PPOUpdate, NetworkMirrorUpdate, CMPOUpdate]
 VECTORS = spaces.Box(-math.inf, math.inf, (3,))
 
 

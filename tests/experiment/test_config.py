@@ -27,7 +27,13 @@ from pgts_torch.experiment import strict_yaml
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import MAX_BYTES, MAX_MISTAKES, ConfigError, load
 from pgts_torch.experiment.schema import Option, Schema
-from pgts_torch.experiment.sections import SEARCH_OPTIONS, FixedHorizonConfig, SampledAdvantagesConfig, SearchConfig
+from pgts_torch.experiment.sections import (
+    SEARCH_OPTIONS,
+    FixedHorizonConfig,
+    SampledAdvantagesConfig,
+    SearchConfig,
+    TabularCriticConfig,
+)
 from pgts_torch.models.environments import make_env
 from pgts_torch.tabular import ladder
 from tests import reliability
@@ -127,9 +133,12 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ("env: {kwargs: {gamma: 0.9}}", "env.kwargs must not have the key gamma: env.gamma sets it"),
         ("update: {step_size: 0}", "update.step_size is 0; it must be a number > 0"),
         ("update: {step_size: .inf}", "update.step_size is .inf; it must be a number > 0"),
-        ("update: {type: adam}", "update.type is 'adam'; it must be gradient, mirror, ppo, projected or softmax"),
-        ("policy: {type: resnet}", "policy.type is 'resnet'; it must be cnn, mlp, simplex or softmax"),
-        ("policy: mlp", "policy is 'mlp'; it must be a mapping with the key type (cnn, mlp, simplex or softmax)"),
+        (
+            "update: {type: adam}",
+            "update.type is 'adam'; it must be auto, cmpo, gradient, mirror, ppo, projected or softmax",
+        ),
+        ("policy: {type: resnet}", "policy.type is 'resnet'; it must be auto, cnn, mlp, simplex or softmax"),
+        ("policy: mlp", "policy is 'mlp'; it must be a mapping with the key type (auto, cnn, mlp, simplex or softmax)"),
         ("policy: {type: mlp, hidden: 64}", f"policy.hidden is 64; it must be {SIZES}"),
         ("policy: {type: mlp, hidden: [64, 0]}", f"policy.hidden holds 0; it must be {SIZES}"),
         ("policy: {type: mlp, hidden: [[64]]}", f"policy.hidden holds a list; it must be {SIZES}"),
@@ -150,10 +159,10 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ("run: {dir: 5}", "run.dir is 5; it must be a folder or null (in quotes, to make it text)"),
         ("search: 4", "search is 4; it must be a mapping with the keys " + SEARCH_KEYS),
         ("search:", "search is empty; it must be a mapping with the keys " + SEARCH_KEYS),
-        ("critic: 4", "critic is 4; it must be a mapping with the key type (exact, network, rollout or tabular)"),
-        ("critic: {type: neural}", "critic.type is 'neural'; it must be exact, network, rollout or tabular"),
-        ("critic: {type: [1]}", "critic.type is a list; it must be exact, network, rollout or tabular"),
-        ("critic: {type: null}", "critic.type is null; it must be exact, network, rollout or tabular"),
+        ("critic: 4", "critic is 4; it must be a mapping with the key type (auto, exact, network, rollout or tabular)"),
+        ("critic: {type: neural}", "critic.type is 'neural'; it must be auto, exact, network, rollout or tabular"),
+        ("critic: {type: [1]}", "critic.type is a list; it must be auto, exact, network, rollout or tabular"),
+        ("critic: {type: null}", "critic.type is null; it must be auto, exact, network, rollout or tabular"),
         ("critic: {step_size: men}", "critic.step_size is 'men'; it must be a number in (0, 1] or mean"),
         ("critic: {method: {lambda: 2}}", "critic.method.lambda is 2; it must be a number in [0, 1]"),
         ("critic: {method: {type: td}}", "critic.method.type is 'td'; it must be monte_carlo or td_lambda"),
@@ -175,10 +184,13 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
             "it must be below 1, or policy.type simplex",
         ),
         (
-            "update: {type: projected}",
+            "{policy: {type: softmax}, update: {type: projected}}",
             "update.type is projected, which needs policy.type simplex; policy.type is softmax",
         ),
-        ("policy: {type: simplex}", "update.type is softmax, which needs policy.type softmax; policy.type is simplex"),
+        (
+            "{policy: {type: simplex}, update: {type: softmax}}",
+            "update.type is softmax, which needs policy.type softmax; policy.type is simplex",
+        ),
         (
             "{policy: {type: simplex, init: {type: biased, probability: 1}}, update: {type: mirror}}",
             "update.type is mirror, which leaves probabilities of 0 at 0; "
@@ -198,7 +210,7 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
             "critic.type is exact, which needs numbered states; with env.observation_key image it must be network",
         ),
         (
-            "critic: {type: network, network: {type: shared}}",
+            "{policy: {type: softmax}, critic: {type: network, network: {type: shared}}}",
             "critic.network.type is shared; policy.type softmax is a table, which has no network to share",
         ),
         (
@@ -226,20 +238,23 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
             "search.stop_at is 1.0; with estimator.type sampled there is no lookahead, it must be null",
         ),
         (
-            "{search: {depth: 0}, estimator: {type: sampled}}",
+            "{policy: {type: softmax}, search: {depth: 0}, estimator: {type: sampled}}",
             "estimator.type is sampled, which needs policy.type mlp or cnn; policy.type is softmax",
         ),
         (
             "{policy: {type: mlp}, search: {depth: 0}, estimator: {type: sampled}, update: {type: mirror}}",
             "update.type is mirror, which needs the advantages of all actions; estimator.type is sampled",
         ),
-        ("update: {type: ppo}", "update.type is ppo, which needs policy.type mlp or cnn; policy.type is softmax"),
+        (
+            "{policy: {type: softmax}, update: {type: ppo}}",
+            "update.type is ppo, which needs policy.type mlp or cnn; policy.type is softmax",
+        ),
         (
             "{policy: {type: mlp}, update: {type: softmax}}",
             "update.type is softmax, which needs policy.type softmax; policy.type is mlp",
         ),
         (
-            "update: {type: mirror, temperature: 2}",
+            "{policy: {type: softmax}, update: {type: mirror, temperature: 2}}",
             "update.temperature is 2.0, which the mirror update of a table does not heed; policy.type is softmax",
         ),
         (
@@ -289,8 +304,8 @@ def test_a_wrong_value_is_named_with_its_line_its_key_and_what_is_required(
             "or critic.type changed",
         ),
         (
-            ["--policy.type", "simplex"],
-            "--policy.type: update.type is softmax, which needs policy.type softmax; policy.type is simplex",
+            ["--policy.type", "simplex", "--update.type", "softmax"],
+            "--update.type: update.type is softmax, which needs policy.type softmax; policy.type is simplex",
         ),
         (["--env.kwargs.n"], "--env.kwargs.n needs a value: a plain value"),
         (["--env.kwargs.id", "x"], "--env.kwargs.id: env.kwargs must not have the key id: env.id sets it"),
@@ -305,13 +320,15 @@ def test_a_wrong_argument_is_named_with_its_flag_and_what_is_required(
 def test_all_mistakes_are_reported_at_once_in_the_order_of_lines_then_flags(
     mistakes: Callable[..., list[str]],
 ) -> None:
-    content = "update: {type: projected}\nnam: x\nsearch: {depth: -1}\nseed: 1\nseed: 2\ncritic: {type: x}\n"
+    content = (
+        "update: {type: projected, step_size: 0}\nnam: x\nsearch: {depth: -1}\nseed: 1\nseed: 2\ncritic: {type: x}\n"
+    )
     assert mistakes(content, "--sed", "3", "--threads", "0", "stray") == [
-        "c.yaml:1: update.type is projected, which needs policy.type simplex; policy.type is softmax",
+        "c.yaml:1: update.step_size is 0; it must be a number > 0",
         "c.yaml:2: nam is unknown; did you mean name?",
         "c.yaml:3: search.depth is -1; it must be a whole number >= 0 or adaptive",
         "c.yaml:5: the key seed is given twice",
-        "c.yaml:6: critic.type is 'x'; it must be exact, network, rollout or tabular",
+        "c.yaml:6: critic.type is 'x'; it must be auto, exact, network, rollout or tabular",
         "--sed is unknown; did you mean --seed?",
         "'stray' belongs to no option; write --KEY VALUE",
         "--threads is 0; it must be a whole number in [1, 1024]",
@@ -341,14 +358,19 @@ def test_the_readable_forms_of_yaml_1_2_mean_what_they_say(tmp_path: Path) -> No
     path = tmp_path / "c.yaml"
     path.write_bytes(b"\xef\xbb\xbftotal_steps: 1_000\r\nseed: 010\r\nupdate: {step_size: 5e-2}\r\nname: no\r\n")
     config = load(path)
-    assert (config.total_steps, config.seed, config.update.plain()["step_size"], config.name) == (1000, 10, 0.05, "no")
+    assert (config.total_steps, config.seed, config.update_description()["step_size"], config.name) == (
+        1000,
+        10,
+        0.05,
+        "no",
+    )
 
 
 def test_an_override_changes_one_key_and_a_mapping_replaces_a_section(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     path.write_text("critic: {type: tabular, target: q, step_size: 0.3}\nsearch: {depth: 2, max_nodes: 7}\n")
     config = load(path, ["--critic.step_size", "mean", "--search", "{depth: 3}"])
-    assert config.critic.model_dump() == Config().critic.model_dump() | {"target": "q", "step_size": "mean"}
+    assert config.critic.model_dump() == TabularCriticConfig(target="q", step_size="mean").model_dump()
     assert config.search == Config().search.model_copy(update={"depth": 3})
     assert load(path, ["--critic", "{type: exact}"]).critic.model_dump() == {"type": "exact", "target": "v"}
 
@@ -455,10 +477,11 @@ OPTIONS = Schema(Config).options()
 
 
 UPDATES = {
-    "softmax": ["softmax", "mirror"],
-    "simplex": ["projected", "mirror"],
-    "mlp": ["gradient", "ppo", "mirror"],
-    "cnn": ["gradient", "ppo", "mirror"],
+    "auto": ["auto", "softmax", "projected", "gradient", "ppo", "cmpo"],
+    "softmax": ["auto", "softmax", "mirror"],
+    "simplex": ["auto", "projected", "mirror"],
+    "mlp": ["auto", "gradient", "ppo", "mirror", "cmpo"],
+    "cnn": ["auto", "gradient", "ppo", "mirror", "cmpo"],
 }
 """What can move a policy of each type."""
 
@@ -471,9 +494,11 @@ def configurations(draw: st.DrawFn) -> Config:
     policy = types["policy.type"]
     is_table = policy in ("softmax", "simplex")
     types["update.type"] = draw(st.sampled_from(UPDATES[policy]))
-    types["critic.network.type"] = draw(st.sampled_from(["own", "mlp"] if is_table else ["own", "shared", policy]))
+    networks = ["own", "mlp"] if is_table else ["own", "shared"] + [policy] * (policy != "auto")
+    types["critic.network.type"] = draw(st.sampled_from(networks))
     types["critic.type"] = "network" if policy == "cnn" else types["critic.type"]
-    types["estimator.type"] = "lookahead" if is_table or types["update.type"] == "mirror" else types["estimator.type"]
+    needs_all = is_table or types["update.type"] in ("mirror", "cmpo")
+    types["estimator.type"] = "lookahead" if needs_all else types["estimator.type"]
     for option in OPTIONS:
         if _holds(option.when, types):
             words = st.sampled_from(_words(option))
@@ -578,8 +603,10 @@ PARTS = [
     ["--policy.type", "mlp", "--critic.type", "tabular"],
     ["--policy.type", "mlp", "--critic.network.type", "mlp", "--critic.network.hidden", "[]"],
     ["--policy.type", "mlp", "--critic.network.type", "shared", "--update.type", "gradient"],
+    ["--policy.type", "softmax", "--update.type", "softmax"],
+    ["--policy.hidden", "[8]", "--update", "{type: cmpo, clip: 0.5}"],
     ["--policy.type", "mlp", "--update", "{type: mirror, temperature: 0.5, max_grad_norm: never}"],
-    ["--policy.type", "cnn", "--policy.scale", "10", "--update.target_kl", "0.1"],
+    ["--policy.type", "cnn", "--policy.scale", "10", "--update.target_kl", "0.1", "--critic.target", "q"],
     ["--policy.type", "cnn", "--critic.network", "{type: cnn, channels: [4]}", "--critic.polyak", "0.1"],
     ["--policy.type", "mlp", "--search.depth", "0", "--estimator.type", "sampled", "--estimator.lambda", "0.9"],
 ]
@@ -590,10 +617,10 @@ PARTS = [
 def test_the_library_builds_what_is_configured(arguments: list[str]) -> None:
     config = load(None, arguments)
     world: Any = PICTURED if config.policy.type == "cnn" else NUMBERED
-    policy = build.make_policy(config.policy.plain(), world, seed=0)
+    policy = build.make_policy(config.policy_description(), world, seed=0)
     critic = build.make_critic(config.critic_description(), world, policy, seed=0)
-    assert critic.target == config.critic.target
-    build.make_update(config.update.plain(), policy).check(policy)
+    assert critic.target == config.critic.plain().get("target", "v")
+    build.make_update(config.update_description(), policy).check(policy)
     build.make_horizon(config.rollout.horizon.plain())
     build.make_estimator(config.estimator.plain())
     build.make_search(config.search.description(), NUMBERED)
@@ -610,10 +637,10 @@ def test_these_parts_name_every_type_there_is() -> None:
 
 def test_what_is_configured_reaches_the_part() -> None:
     config = load(None, ["--policy.type", "mlp", "--policy.hidden", "[7, 5]", "--update.max_grad_norm", "never"])
-    policy = build.make_policy(config.policy.plain(), NUMBERED, seed=0)
+    policy = build.make_policy(config.policy_description(), NUMBERED, seed=0)
     assert isinstance(policy, NetworkPolicy)
     assert [layer.out_features for layer in policy.network.modules() if isinstance(layer, nn.Linear)] == [7, 5, 2]
-    assert build.make_update(config.update.plain(), policy).max_grad_norm is None  # type: ignore[attr-defined]
+    assert build.make_update(config.update_description(), policy).max_grad_norm is None  # type: ignore[attr-defined]
     own = build.make_critic(config.critic_description(), NUMBERED, policy, seed=0)
     assert isinstance(own, NetworkCritic)
     assert [layer.out_features for layer in own.network.modules() if isinstance(layer, nn.Linear)] == [7, 5, 1]
@@ -625,7 +652,7 @@ def test_what_is_configured_reaches_the_part() -> None:
 
 def test_the_defaults_of_networks_are_those_of_the_library() -> None:
     policy = build.make_policy("mlp", NUMBERED, seed=0)
-    for kind in ("gradient", "ppo", "mirror"):
+    for kind in ("gradient", "ppo", "mirror", "cmpo"):
         configured = load(None, ["--policy.type", "mlp", "--update.type", kind]).update.plain()
         own, given = (build.make_update(update, policy) for update in (kind, configured))
         assert _plain_options(own) == _plain_options(given)
@@ -646,13 +673,44 @@ def _without_type(description: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("policy", ["mlp", "cnn"])
-def test_a_network_policy_brings_a_network_critic_and_ppo_with_it(policy: str, tmp_path: Path) -> None:
-    assert (Config().critic.type, Config().update.type) == ("tabular", "softmax")
+def test_a_network_policy_brings_a_network_critic_with_it(policy: str, tmp_path: Path) -> None:
     config = load(None, ["--policy.type", policy, "--update.learning_rate", "1e-3"])
-    assert (config.critic.type, config.update.type) == ("network", "ppo")
+    assert (config.critic.type, config.update.type) == ("network", "cmpo")
     assert Config.model_validate({"policy": {"type": policy}, "update": {"learning_rate": 1e-3}}) == config
     (tmp_path / "c.yaml").write_text(dump(config))
     assert load(tmp_path / "c.yaml") == config
+
+
+def test_the_environment_chooses_what_is_not_configured() -> None:
+    config = Config()
+    assert {config.policy.type, config.critic.type, config.update.type} == {"auto"}
+    assert config.policy_description() is config.critic_description() is config.update_description() is None
+    assert Config.model_validate({"policy": {}, "critic": {}, "update": {}}) == config
+
+
+@pytest.mark.parametrize(
+    ("keys", "types"),
+    [
+        ({"policy.init.type": "random"}, ("softmax", "auto", "auto")),
+        ({"policy.hidden": "[8]"}, ("mlp", "network", "auto")),
+        ({"policy.channels": "[8]"}, ("cnn", "network", "auto")),
+        ({"critic.step_size": "0.1"}, ("auto", "tabular", "auto")),
+        ({"critic.learning_rate": "0.1"}, ("auto", "network", "auto")),
+        ({"update.step_size": "0.1"}, ("auto", "auto", "softmax")),
+        ({"policy.type": "simplex", "update.step_size": "0.1"}, ("simplex", "auto", "projected")),
+        ({"update.learning_rate": "0.1"}, ("auto", "auto", "cmpo")),
+        ({"update.clip_range": "0.1"}, ("auto", "auto", "ppo")),
+        (
+            {"search.depth": "0", "estimator.type": "sampled", "update.learning_rate": "0.1"},
+            ("auto", "auto", "ppo"),
+        ),
+    ],
+)
+def test_a_section_without_type_is_of_the_first_type_that_knows_its_keys(
+    keys: dict[str, str], types: tuple[str, ...]
+) -> None:
+    config = load(None, [part for key, value in keys.items() for part in (f"--{key}", value)])
+    assert (config.policy.type, config.critic.type, config.update.type) == types
 
 
 CHARACTERS = [chr(n) for n in range(1, 300)]

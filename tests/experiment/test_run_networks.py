@@ -172,5 +172,15 @@ def test_an_environment_whose_module_is_missing_is_named_with_its_extra(tmp_path
 
 def test_a_table_in_an_environment_without_numbered_states_is_refused(tmp_path):
     with pytest.raises(PgtsError, match="the policy 'softmax' is a table"):
-        run.train(load(None, ["--env.id", "CartPole-v1", "--run.dir", str(tmp_path / "run")]))
+        run.train(
+            load(None, ["--env.id", "CartPole-v1", "--policy.type", "softmax", "--run.dir", str(tmp_path / "run")])
+        )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_environment_chooses_the_parts_that_PGTS_chooses():
+    for env_id in ("CartPole-v1", "FrozenLake-v1"):
+        configured, own = run.build(load(None, ["--env.id", env_id])), PGTS(env_id)
+        for part in ("policy", "critic", "update", "horizon"):
+            assert type(getattr(configured, part)) is type(getattr(own, part))
+        assert isinstance(own.policy, NetworkPolicy) == (env_id == "CartPole-v1")
