@@ -34,9 +34,13 @@ class TargetUpdate(NetworkUpdate):
         """step(s, a)."""
 
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
-        """policy: mean_s w(s) KL(target || pi) after the steps; grad_norm: mean over the steps, before clipping."""
-        old_NA = log_probs(network, batch.input_N)
-        target_NA = (old_NA + self.exponent(batch)).log_softmax(-1)
+        """policy: mean_s w(s) KL(target || pi) after the steps; grad_norm: mean over the steps, before clipping.
+
+        No step is taken where all actions are alike in all states: Adam would make one of the rounding."""
+        old_NA, exponent_NA = log_probs(network, batch.input_N), self.exponent(batch)
+        if not bool(exponent_NA.any()):
+            return Move(old_NA, old_NA, {"policy": 0.0, "grad_norm": 0.0})
+        target_NA = (old_NA + exponent_NA).log_softmax(-1)
         weight_N = batch.weight_N / batch.weight_N.mean()
         columns, norms = (batch.input_N, target_NA, weight_N), []
         made = passes(network, columns, self.num_epochs, self.minibatch_size, generator)
