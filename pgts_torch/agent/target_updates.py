@@ -10,7 +10,8 @@ from torch import Tensor
 
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural_updates import Batch, Move, NetworkUpdate, divergence, log_probs, mean, passes
-from pgts_torch.agent.optimisers import check_count, check_positive
+from pgts_torch.agent.optimisers import check_positive
+from pgts_torch.errors import check_count
 
 
 @dataclass(eq=False, kw_only=True)
