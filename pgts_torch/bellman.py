@@ -18,6 +18,10 @@ _INT32_LIMIT = 2**31
 _LARGE = 2**23
 
 
+LARGEST_REWARD = float(torch.finfo(torch.float64).max) ** (1 / 3)
+"""The largest size of a reward that is learned from: means of squares of returns stay numbers."""
+
+
 @dataclass(frozen=True, eq=False)
 class Outcomes:
     """What may follow each of N states under each of A actions: at most K weighted children.

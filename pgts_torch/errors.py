@@ -47,10 +47,25 @@ class ModelMismatch(PgtsError):
     lookahead is not to be trusted. The policy has not been moved by it."""
 
 
-def failure(where: str, error: Exception) -> NotFinite | ModelMismatch | Failed:
-    """The error that says where another one happened; NotFinite and ModelMismatch stay what they are."""
+def text_of(error: BaseException) -> str:
+    """Kind and text of an error of the caller's, the text alone of one of ours. Some texts cannot be printed."""
+    if isinstance(error, PgtsError):
+        return str(error)
+    try:
+        return f"{type(error).__name__}: {error}"
+    except Exception as unprintable:
+        return f"{type(error).__name__}, whose text cannot be printed ({type(unprintable).__name__})"
+
+
+def failure(where: str, error: BaseException) -> NotFinite | ModelMismatch | Failed:
+    """The error that says where another one happened; NotFinite and ModelMismatch stay what they are.
+
+    Also of SystemExit and the like, which environments raise too; only Ctrl-C is raised again, for it is the user's.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        raise error
     if not isinstance(error, PgtsError):
-        return Failed(f"{where}: {type(error).__name__}: {error}")
+        return Failed(f"{where}: {text_of(error)}")
     story = f"{where}: {error}"
     told: NotFinite | ModelMismatch | Failed
     if isinstance(error, NotFinite):

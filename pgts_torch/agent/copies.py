@@ -3,6 +3,7 @@
 import functools
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, final
 
@@ -62,7 +63,7 @@ def make_vector_env(
         raise
     except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
         raise PgtsError(f"{env} cannot be made: {error}") from error
-    except Exception as error:
+    except BaseException as error:
         raise failure(f"{env} cannot be made", error) from error
 
 
@@ -72,6 +73,16 @@ def more_copies(env: VectorEnv, num_envs: int) -> VectorEnv:
         raise PgtsError(f"{env_name(env)} was given as copies that cannot be made again; give a SyncVectorEnv or an id")
     makers = itertools.islice(itertools.cycle(env.env_fns), num_envs)
     return SyncVectorEnv(list(makers), autoreset_mode=AutoresetMode.DISABLED)
+
+
+def close_copies(env: VectorEnv) -> None:
+    """Close them all; what one of them raises is a warning, for all that was wanted of it is done."""
+    for one in env.envs if isinstance(env, SyncVectorEnv) else [env]:
+        try:
+            one.close()
+        except BaseException as error:
+            warnings.warn(str(failure(f"{env_name(env)} failed in close", error)), stacklevel=2)
+    env.closed = True
 
 
 def check_vector_env(env: VectorEnv) -> None:

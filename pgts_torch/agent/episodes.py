@@ -6,9 +6,9 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.errors import PgtsError
 from pgts_torch.models.environments import check_step
-from pgts_torch.models.steps import check_discounts, discount_of, names_discounts, number_of, rewards_of
+from pgts_torch.models.steps import check_discounts, check_rewards, discount_of, names_discounts, number_of, rewards_of
 
 
 @final
@@ -44,13 +44,12 @@ class Episodes:
             alive_B: the episodes that go on.
 
         Raises:
-            NotFinite: a reward or a discount is not.
+            NotFinite: a reward or a discount is not, or a reward is too large to be learned from.
             PgtsError: a reward is not one number, or a discount is not in [0, 1].
         """
         step = self._step_alive if self._one_by_one else self._step_all
         reward_B, discount_B, truncated_B = step(action_B, alive_B)
-        if not np.isfinite(reward_B).all():
-            raise NotFinite(f"the rewards are {reward_B.tolist()}; they must be finite", what="reward")
+        check_rewards(reward_B)
         return reward_B, discount_B, truncated_B
 
     def _step_all(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -80,7 +79,7 @@ class Episodes:
         self.observation = concatenate(space, self._each, rows)
         return reward_B, discount_B, truncated_B
 
-    def blame(self, error: Exception) -> tuple[list[int], Exception]:
+    def blame(self, error: BaseException) -> tuple[list[int], BaseException]:
         """The seeds of the copies that an error may come from; and the error, or what is wrong with the one copy that
         it comes from."""
         if self._stepping is not None:

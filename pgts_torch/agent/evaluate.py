@@ -10,6 +10,7 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.agent.copies import close_copies
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import FixedHorizon, rollout
@@ -59,6 +60,9 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
     Raises:
         PgtsError: episodes is below 1; `PGTS.make_copies` cannot make copies; or the environment failed, naming step
             and seeds.
+
+    Warns:
+        UserWarning: an environment raised an error in `close`.
     """
     check_count("episodes", episodes)
     env = algorithm.make_copies(episodes)
@@ -72,7 +76,7 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
         names=names,
         generator=stream(seed, *names, device=algorithm.device),
     )
-    env.close()
+    close_copies(env)
     return Evaluation(
         episodes,
         Score.of((made.reward_TB * made.alive_TB).sum(0)),

@@ -111,6 +111,8 @@ class PGTS:
         ModelMismatch: rewards of a table are outside `reward_range`.
     """
 
+    @torch.inference_mode(False)
+    @torch.enable_grad()
     def __init__(
         self,
         env: EnvSource | VectorEnv,
@@ -194,6 +196,8 @@ class PGTS:
         self.num_env_steps = 0
         self.num_model_calls = 0
 
+    @torch.inference_mode(False)
+    @torch.enable_grad()
     def iterate(self) -> Iteration:
         """One pass through the loop: visit states, estimate Q^pi, look m steps ahead, move pi.        [PGTS Alg. 1]"""
         draws = self._draws()
@@ -474,6 +478,8 @@ class PGTS:
             "model_check": self.model_check.state_dict(),
         }
 
+    @torch.inference_mode(False)
+    @torch.enable_grad()
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` gave."""
         self.policy.load_state_dict(state["policy"])

@@ -182,11 +182,11 @@ def rollout(
     words = seed_sequence(seed, *names, "env").generate_state(env.num_envs)
     try:
         episodes = Episodes(env, gamma=world.gamma, seeds=words.tolist())
-    except Exception as error:
+    except BaseException as error:
         raise _failure(env, "at the start", words.tolist(), error) from error
     try:
         observation_B, read_B = world.see(env, episodes.observation)
-    except Exception as error:
+    except BaseException as error:
         raise _failure(env, "at the start", *episodes.blame(error)) from error
     # What is small stays in numpy until the end: on tensors of a few numbers, each operation costs several times more.
     alive_B, weight_B = np.ones(env.num_envs, dtype=bool), np.ones(env.num_envs)
@@ -199,7 +199,7 @@ def rollout(
             if world.reward_range is not None:
                 world.reward_range.check(reward_B[alive_B])
             observation_B, read_B = world.see(env, episodes.observation)
-        except Exception as error:
+        except BaseException as error:
             raise _failure(env, f"in step {len(rows)}", *episodes.blame(error)) from error
         survival_B = horizon.survival(torch.from_numpy(discount_B), generator).numpy()
         rows.append((action_B, reward_B, discount_B, alive_B, weight_B * alive_B, survival_B))
@@ -224,7 +224,7 @@ def rollout(
     )
 
 
-def _failure(env: VectorEnv, when: str, seeds: list[int], error: Exception) -> PgtsError:
+def _failure(env: VectorEnv, when: str, seeds: list[int], error: BaseException) -> PgtsError:
     episodes = f"the episode with the seed {seeds[0]}" if len(seeds) == 1 else f"the episodes with the seeds {seeds}"
     return failure(f"{env_name(env)} failed {when} of {episodes}", error)
 
@@ -243,7 +243,7 @@ def simulated_returns(
     The first action is given or the policy's own. Episodes that are over cost nothing more.
 
     Raises:
-        PgtsError: an episode outlived `max_length` of the geometric horizon.
+        PgtsError: an episode outlived `max_length` of the geometric horizon, or a discount is outside [0, 1].
     """
     returns_B = torch.zeros(len(state_B), dtype=torch.float64, device=state_B.device)
     row_N, state_N, weight_N = torch.arange(len(state_B), device=state_B.device), state_B, torch.ones_like(returns_B)
@@ -251,6 +251,12 @@ def simulated_returns(
     num_steps = 0
     for _ in range(horizon.limit):
         drawn = model.sample(state_N, action_N, key_N=draw_keys(len(state_N), generator=generator))
+        if bool((off_N := ~((drawn.discount_N >= 0) & (drawn.discount_N <= 1))).any()):
+            n = int(torch.nonzero(off_N)[0, 0])
+            raise PgtsError(
+                f"the model's discount of state {int(state_N[n])} and action {int(action_N[n])} is "
+                f"{float(drawn.discount_N[n])}; it must be in [0, 1]"
+            )
         returns_B[row_N] += weight_N * drawn.reward_N
         num_steps += len(row_N)
         weight_N = weight_N * horizon.survival(drawn.discount_N, generator)

@@ -2,7 +2,6 @@
 
 import importlib
 import itertools
-import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,6 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from pgts_torch.errors import NotFinite, PgtsError, failure
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.steps import check_rewards
 from pgts_torch.seeding import numpy_stream
 
 EnvSource = str | EnvSpec | gymnasium.Env | Callable[[], gymnasium.Env]
@@ -50,7 +50,7 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
             made = env()
         except PgtsError:
             raise
-        except Exception as error:
+        except BaseException as error:
             raise failure(f"{getattr(env, '__name__', env)} cannot be made", error) from error
         if not isinstance(made, gymnasium.Env):
             raise PgtsError(f"{env!r} gave {made!r}; it must be a Gymnasium environment")
@@ -63,7 +63,7 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
         raise PgtsError(f"{name} needs something that is not installed: {error}") from error
     except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
         raise PgtsError(f"{name} cannot be made: {error}") from error
-    except Exception as error:
+    except BaseException as error:
         raise failure(f"{name} cannot be made", error) from error
 
 
@@ -149,19 +149,23 @@ def _bounds(space: spaces.Space) -> tuple[np.ndarray, np.ndarray]:
 
 def check_step(space: spaces.Space, observation: Any, reward: float) -> None:
     """PgtsError, NotFinite where that is it, unless a step may give this."""
-    if not math.isfinite(reward):
-        raise NotFinite(f"the reward is {reward}", what="reward")
+    check_rewards(reward)
     _check_observation(space, observation)
 
 
 def _check_observation(space: spaces.Space, value: Any) -> None:
     if isinstance(space, spaces.Box):
-        shape = np.shape(value)
-        if shape != space.shape:
-            raise PgtsError(f"the observation has shape {shape}; {space.shape} is declared")
-        if space.dtype.kind == "f" and not np.isfinite(value).all():
-            shown = np.asarray(value).tolist()
-            raise NotFinite(f"the observation is {shown}; it must be finite", what="observation")
+        try:
+            array = np.asarray(value)
+        except ValueError:
+            raise PgtsError(f"the observation is {value!r}, which has no shape; {space.shape} is declared") from None
+        if array.shape != space.shape:
+            raise PgtsError(f"the observation has shape {array.shape}; {space.shape} is declared")
+        # What a vector environment would put into its array of this dtype.
+        if array.dtype != space.dtype and not np.can_cast(array.dtype, space.dtype, "same_kind"):
+            raise PgtsError(f"the observation is of {array.dtype}; {space.dtype} is declared")
+        if space.dtype.kind == "f" and not np.isfinite(array).all():
+            raise NotFinite(f"the observation is {array.tolist()}; it must be finite", what="observation")
     elif isinstance(space, spaces.Dict):
         if not isinstance(value, dict) or value.keys() != space.keys():
             raise PgtsError(f"the observation is no dict of {', '.join(map(str, space.keys()))}")

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, text_of
 from pgts_torch.models.environments import EnvSource, all_actions, make_env, sampled_actions
 from pgts_torch.models.snapshots import adapter_for, env_name, generator_state
 from pgts_torch.models.walks import Setup, Walk, again, live, replays, walks_of
@@ -130,7 +130,7 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
     setup = Setup(env_name(first), lambda: make_env(env), adapter_for(first), actions, random)
     try:
         walks = walks_of(setup, continuations, length)
-    except Exception as error:
+    except BaseException as error:
         raise PgtsError(f"{setup.name} fails in random walks with seed {seed}: {_told(error)}") from error
     tried = _Tried()
     repeated = functools.cache(lambda: replays(setup, walks))
@@ -144,7 +144,7 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
     report = Report(setup.name, setup.adapter.name, len(actions), tried.random_share, checks, cost=None)
     try:
         return replace(report, cost=_cost(setup, walks))
-    except Exception as error:
+    except BaseException as error:
         if report.usable:
             raise PgtsError(f"{setup.name} fails where its calls are timed: {_told(error)}") from error
         return report
@@ -154,12 +154,15 @@ def _check(name: str, check: Callable[[], str], *, needed: bool = True) -> Check
     """The answer of one check; whatever the environment raises is an answer too."""
     try:
         return Check(name, needed, True, check())
-    except Exception as error:
+    except BaseException as error:
         return Check(name, needed, False, str(error) if isinstance(error, _Missing) else _told(error))
 
 
-def _told(error: Exception) -> str:
-    return str(error) if isinstance(error, PgtsError) else f"{type(error).__name__}: {error}"
+def _told(error: BaseException) -> str:
+    """What is wrong; Ctrl-C is the user's, and raised again."""
+    if isinstance(error, KeyboardInterrupt):
+        raise error
+    return text_of(error)
 
 
 def _answers(setup: Setup, walks: Sequence[Walk], tried: _Tried) -> str:

@@ -121,7 +121,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         self._observe = observe
         try:
             self.env.reset(seed=0)  # to have a state at all, which the first snapshot replaces
-        except Exception as error:
+        except BaseException as error:
             raise failure(f"{self.name} failed in reset with seed 0", error) from error
         self._show = self.adapter.blindfold(self.env)
         self._names_discounts = names_discounts(self.env)
@@ -335,7 +335,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             child = self._known(replace(reached, cut=True) if truncated and discount else reached, None)
             if self._observations[child] is None:
                 self._see(child, observation if self._show is None else self._checked(self._show(), total))
-        except Exception as error:
+        except BaseException as error:
             where = f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}"
             raise failure(where, error) from error
         step = _Step(total, discount, self._snapshots[child], self._observations[child], random)

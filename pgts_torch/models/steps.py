@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor, float64
 
+from pgts_torch.bellman import LARGEST_REWARD
 from pgts_torch.errors import NotFinite, PgtsError
 
 
@@ -58,6 +59,18 @@ def rewards_of(values: Any, count: int) -> np.ndarray:
     if reward_B.size != count or len(reward_B) != count:
         raise PgtsError(f"the rewards have shape {reward_B.shape}; they must be {count} numbers, one for each copy")
     return reward_B.reshape(count)
+
+
+def check_rewards(reward: float | np.ndarray) -> None:
+    """NotFinite unless these are finite, and small enough to be learned from."""
+    if np.isfinite(reward).all():
+        size = np.abs(reward)
+        if (size <= LARGEST_REWARD).all():
+            return
+        raise NotFinite(f"the reward is {np.max(size)} in size; it must be at most {LARGEST_REWARD:.2g}", what="reward")
+    if isinstance(reward, float):
+        raise NotFinite(f"the reward is {reward}", what="reward")
+    raise NotFinite(f"the rewards are {reward.tolist()}; they must be finite", what="reward")
 
 
 def names_discounts(env: Any) -> bool:

@@ -109,7 +109,8 @@ class TensorModel(EnumeratingModel, SamplingModel):
         """The one outcome of each action, K = 1.
 
         Raises:
-            PgtsError: `step` answers with another shape or dtype than asked for, or with a nan in a state that counts.
+            PgtsError: `step` answers with another shape or dtype than asked for, a discount outside [0, 1], or a nan in
+                a state that counts.
         """
         A = self.num_actions
         action_NA = torch.arange(A, device=self.device).expand(len(state_N), A)
@@ -174,6 +175,12 @@ class TensorModel(EnumeratingModel, SamplingModel):
             raise PgtsError(
                 f"step answered with rewards in {reward_N.dtype} and discounts in {discount_N.dtype}; "
                 f"the model speaks {self.dtype}"
+            )
+        if bool((off_N := ~((discount_N >= 0) & (discount_N <= 1))).any()):
+            n = int(torch.nonzero(off_N)[0, 0])
+            raise PgtsError(
+                f"step answers state {state_ND[n].tolist()} and action {int(action_N[n])} with the discount "
+                f"{float(discount_N[n])}; it must be in [0, 1]"
             )
         if self.reward_range is not None:
             self.reward_range.check(reward_N.cpu())

@@ -363,8 +363,9 @@ def check_answer(model: Model, state_N: Int[Tensor, "N"], answer: Outcomes) -> N
             f"the model's probabilities of what follows state {int(state_N[n])} and action {a} sum to "
             f"{float(total_NA[n, a])}"
         )
-    for name, x_NAK in (("probability", answer.prob_NAK), ("discount", answer.discount_NAK)):
-        off_NAK = ~((x_NAK >= 0) & (x_NAK <= 1 + _TOLERANCE))
+    most = 1 + _TOLERANCE
+    for name, x_NAK, highest in (("probability", answer.prob_NAK, most), ("discount", answer.discount_NAK, 1.0)):
+        off_NAK = ~((x_NAK >= 0) & (x_NAK <= highest))
         if bool(off_NAK.any()):
             n, a, k = torch.nonzero(off_NAK)[0].tolist()
             raise PgtsError(

@@ -1,5 +1,6 @@
 """Finite Markov decision processes, validated when they are made."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ from pgts_torch.tabular.forms import EXACT, STORED, Order, normalised, outcomes_
 MEAN_TOLERANCE = 1e-8
 """How far the mean of the rewards of outcomes may be from r(s, a), as a share of the largest of them."""
 
+_LARGEST_VALUE = torch.finfo(torch.float64).max / 8
+
 Transition = tuple[float, int, float, bool]
 """(probability, next state, reward, terminated), as in the P tables of Gymnasium's toy-text environments."""
 
@@ -37,8 +40,8 @@ class TabularMDP:
             outcome pays r(s, a). Values need the mean alone; what a single step may pay is `outcome_reward_SAK`.
 
     Raises:
-        PgtsError: a row is not a distribution, a discount is outside [0, 1], a value is not finite, a child does not
-            exist or a shape is wrong; the message names the first offending (s, a).
+        PgtsError: a row is not a distribution, a discount is outside [0, 1], a reward is not finite or so large that
+            values are not, a child does not exist or a shape is wrong; the message names the first offending (s, a).
     """
 
     outcomes: Outcomes
@@ -254,8 +257,8 @@ def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> _Row:
             raise PgtsError(f"P[{s}][{a}] leads to state {next_state}; states are 0 to {S - 1}")
         if p < 0 or not np.isfinite(p):
             raise PgtsError(f"P[{s}][{a}] has probability {p}; probabilities are finite and at least 0")
-        if not np.isfinite(reward):
-            raise PgtsError(f"P[{s}][{a}] has reward {reward}; rewards must be finite")
+        if not abs(reward) <= _LARGEST_VALUE:
+            raise PgtsError(f"P[{s}][{a}] has reward {reward}; rewards must be finite, at most {_LARGEST_VALUE:.2g}")
         if p > 0:
             key = (int(next_state), bool(terminated), float(reward))
             successors[key] = successors.get(key, 0.0) + float(p)
@@ -346,11 +349,25 @@ def _check_outcomes(outcomes: Outcomes) -> None:
         ~((discount >= 0) & (discount <= 1)).all(-1),
         lambda s, a: f"discount of ({s}, {a}) is {discount[s, a].tolist()}; each must be in [0, 1]",
     )
+    most = _largest_reward(float(discount.max()))
+    _refuse(
+        reward.abs() > most,
+        lambda s, a: (
+            f"R_SA[{s}, {a}] is {reward[s, a]}; with discounts up to {discount.max():.6g} rewards may be {most:.2g} in "
+            "size: beyond that values are no numbers"
+        ),
+    )
     child = outcomes.child_NAK
     _refuse(
         ((child < 0) | (child >= outcomes.num_children)).any(-1),
         lambda s, a: f"children of ({s}, {a}) are {child[s, a].tolist()}; states are 0 to {outcomes.num_children - 1}",
     )
+
+
+def _largest_reward(discount: float) -> float:
+    """The largest size of rewards with which no value, and no difference of values, overflows."""
+    steps = 1 / (1 - discount) if discount < 1 else math.inf
+    return _LARGEST_VALUE / min(steps, 1e100)
 
 
 def _refuse(bad_SA: Tensor, message: Any) -> None:
