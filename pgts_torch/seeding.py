@@ -4,7 +4,10 @@ A stream is drawn from in order. A key belongs to one thing, for instance to sam
 is drawn for it does not depend on what else is drawn: a batch may be split or reordered.
 """
 
+import random
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -82,3 +85,18 @@ def _avalanche(x_N: Tensor) -> Tensor:
 def _shifted(x_N: Tensor, bits: int) -> Tensor:
     """The bits of x moved down, zeros moving in; torch's own shift repeats the sign."""
     return (x_N >> bits) & ((1 << (64 - bits)) - 1)
+
+
+@contextmanager
+def global_generators_kept() -> Iterator[None]:
+    """What is drawn inside from the generators that all programs share is the same each time, and is not noticed
+    outside: their states are put back."""
+    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        torch.set_rng_state(states[2])

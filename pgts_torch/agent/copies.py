@@ -22,9 +22,10 @@ from pgts_torch.models.environments import (
     all_actions,
     grid_actions,
     make_env,
+    spec_like,
     spec_of,
-    wrappers_of,
 )
+from pgts_torch.models.wrappers import wrappers_of
 
 
 def make_vector_env(
@@ -140,7 +141,7 @@ def _maker(env: Any, actions_per_dimension: int | None) -> Callable[[], gymnasiu
             f"the environment is {env!r}; it must be a Gymnasium id, an environment, a function that makes one, or a "
             "VectorEnv"
         )
-    source = env.spec or env if isinstance(env, gymnasium.Env) else env
+    source = spec_like(env) if isinstance(env, gymnasium.Env) else env
     limit = {"max_episode_steps": -1} if isinstance(source, EnvSpec) else {}
     make = functools.partial(make_env, source, **limit)
     return lambda: _numbered(make(), per_dimension=actions_per_dimension)

@@ -33,13 +33,13 @@ from pgts_torch.agent.certificate import Certificates
 from pgts_torch.agent.copies import make_vector_env, more_copies, own_actions, registered_limit
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.iteration import Iteration, Seen
+from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.model_check import Mode, ModelCheck
 from pgts_torch.agent.policies import Policy, listed
 from pgts_torch.agent.ranks import checksum, present_ranks
 from pgts_torch.agent.rollout import Horizon, Rollout, rollout
 from pgts_torch.agent.sharing import whole_lookahead, whole_rollout
 from pgts_torch.agent.updates import Update
-from pgts_torch.agent.world import make_world
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.rewards import RewardRange

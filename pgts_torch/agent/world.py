@@ -6,6 +6,7 @@ A lookahead speaks of states, which are numbers; policies and critics speak of o
 from abc import ABC, abstractmethod
 from typing import Any, final
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv, VectorEnv
@@ -13,22 +14,14 @@ from gymnasium.vector.utils import iterate
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from pgts_torch.agent.copies import check_vector_env, env_name, make_vector_env, normalizing_wrapper
 from pgts_torch.agent.observations import Observations, states_of
-from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model, promise
-from pgts_torch.models.classic import ClassicModel, dynamics_of
-from pgts_torch.models.environments import EnvSource, base_actions, changing_wrapper
+from pgts_torch.models.classic import ClassicModel
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.simulator import SimulatorModel
-from pgts_torch.models.snapshots import adapter_for
-from pgts_torch.models.tabular import TabularModel, tabular_truth
-from pgts_torch.tabular.mdp import TabularMDP, check_gamma
-
-_NO_MODEL_NEEDED = "; or take depth 0 and the estimator 'sampled', which need no model"
-
-DEFAULT_GAMMA = 0.99
-"""Discount of an environment that carries none."""
+from pgts_torch.models.tabular import TabularModel
+from pgts_torch.tabular.mdp import TabularMDP
 
 
 class World(ABC):
@@ -236,7 +229,7 @@ class DynamicsWorld(World):
     Args:
         env: copies of it, each an environment of its own.
         model: its dynamics.
-        observation_key: refused, for such environments show vectors.
+        observation_key: which part of dictionary observations a policy sees, which only wrappers make of vectors.
     """
 
     def __init__(self, env: SyncVectorEnv, model: ClassicModel, *, observation_key: str | None = None) -> None:
@@ -260,8 +253,12 @@ class DynamicsWorld(World):
         return self._model.number(read_N)
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """What the environment shows in these states."""
-        return self._model.observe(self._model.states(state_N))
+        """What the environment shows in these states, through its wrappers."""
+        inner_NO = self._model.observe(self._model.states(state_N))
+        if not self._model.transforms.observations:
+            return inner_NO
+        rows = [self._seen.part(self._model.transforms.observation(row)) for row in inner_NO.cpu().numpy()]
+        return self._seen.encode_part(np.array(rows, self._seen.space.dtype))
 
     def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """The vectors."""
@@ -337,106 +334,3 @@ class PlainWorld(World):
         """What was shown before."""
         self._shown, self._count = [], 0
         return True
-
-
-def make_world(
-    env: EnvSource | VectorEnv,
-    *,
-    num_envs: int,
-    gamma: float | None,
-    observation_key: str | None,
-    plain: bool,
-    actions_per_dimension: int | None = None,
-    action_repeat: int = 1,
-    device: torch.device | str,
-    **kwargs: Any,
-) -> World:
-    """The world of an environment: what can be asked about it decides.
-
-    A transition table makes it tabular; else its dynamics are asked if they are known in torch (`models.classic`); else
-    snapshots make it simulated. It is plain where no model is needed.
-
-    Args:
-        env: what `num_envs` copies are made from (`make_vector_env`, with `kwargs`), or copies.
-        gamma: discount; None: the environment's own (pgts/*), else 0.99.
-        observation_key: which part of dictionary observations a policy sees.
-        actions_per_dimension: into how many values each dimension of continuous actions is divided.
-        plain: whether a world without a model will do: then snapshots are not taken.
-        action_repeat: how often an action is taken in one outcome of the model (`TensorModel`).
-
-    Raises:
-        PgtsError: the environment does not exist, or is none that an agent can act in; or actions are to be repeated
-            in a table, or where there is no model.
-        MissingModel: it has no model, and needs one.
-    """
-    if isinstance(env, VectorEnv):
-        copies = env
-    else:
-        copies = make_vector_env(env, num_envs, gamma=gamma, actions_per_dimension=actions_per_dimension, **kwargs)
-    check_vector_env(copies)
-    discount = DEFAULT_GAMMA if gamma is None else gamma
-    check_gamma(discount)
-    wrapper = changing_wrapper(copies.envs[0]) if isinstance(copies, SyncVectorEnv) else ""
-    if wrapper and not plain:
-        raise MissingModel(
-            f"{env_name(copies)} is wrapped in {wrapper}, which may change what a step gives, and a model only knows "
-            "the environment inside: leave it out, or make it part of an environment with get_state and set_state"
-            + _NO_MODEL_NEEDED
-        )
-    if observation_key is None and not wrapper and (truth := _truth(copies, discount)) is not None:
-        _check_single(action_repeat, "in a table")
-        return TabularWorld(copies, truth, device=device)
-    if plain:
-        if name := normalizing_wrapper(copies):
-            raise PgtsError(
-                f"{env_name(copies)} is wrapped in {name}, whose running statistics no evaluation shares and no file "
-                "keeps: leave it out, and set normalize of the network or normalize_returns of the critic"
-            )
-        _check_single(action_repeat, "without a model")
-        return PlainWorld(copies, gamma=discount, observation_key=observation_key, device=device)
-    if not isinstance(copies, SyncVectorEnv):
-        raise MissingModel(
-            f"{env_name(copies)} steps its copies together; a simulator needs a SyncVectorEnv of them"
-            + _NO_MODEL_NEEDED
-        )
-    if (dynamics := dynamics_of(copies.envs[0])) is not None:
-        vectors = dynamics(copies.envs[0], gamma=discount, action_repeat=action_repeat, device=device)
-        return DynamicsWorld(copies, vectors, observation_key=observation_key)
-    model = _simulator(copies, observation_key, gamma=discount, action_repeat=action_repeat, device=device)
-    return SimulatedWorld(copies, model, observation_key=observation_key, device=device)
-
-
-def _truth(copies: VectorEnv, gamma: float) -> TabularMDP | None:
-    """The table of copies that show their states; None if there is none, and they may have another model."""
-    if not isinstance(copies.single_observation_space, spaces.Discrete):
-        return None
-    try:
-        return tabular_truth(copies, gamma=gamma)
-    except MissingModel:
-        if isinstance(copies, SyncVectorEnv):
-            return None
-        raise
-
-
-def _simulator(
-    copies: SyncVectorEnv, observation_key: str | None, *, gamma: float, action_repeat: int, device: torch.device | str
-) -> SimulatorModel:
-    """A simulator of the environment that these are copies of; MissingModel without an adapter."""
-    try:
-        adapter = adapter_for(copies.envs[0])
-    except MissingModel as missing:
-        raise MissingModel(f"{missing}{_NO_MODEL_NEEDED}") from None
-    return SimulatorModel(
-        copies.env_fns[0],
-        gamma=gamma,
-        actions=base_actions(copies.envs[0]),
-        action_repeat=action_repeat,
-        adapter=adapter,
-        observe=None if observation_key is None else lambda observation: observation[observation_key],
-        device=device,
-    )
-
-
-def _check_single(action_repeat: int, where: str) -> None:
-    if action_repeat != 1:
-        raise PgtsError(f"action_repeat is {action_repeat}; {where} it must be 1")

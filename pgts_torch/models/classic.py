@@ -21,13 +21,15 @@ from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv, MountainCarE
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import ExactModel
-from pgts_torch.models.environments import base_actions, changing_wrapper
+from pgts_torch.models.environments import base_actions
 from pgts_torch.models.numbering import Merge
+from pgts_torch.models.provenance import overridden
 from pgts_torch.models.rewards import value_range
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tensor import TensorModel
+from pgts_torch.models.wrappers import transforms_of
 
 
 class ClassicModel(TensorModel, ExactModel):
@@ -36,8 +38,8 @@ class ClassicModel(TensorModel, ExactModel):
     The state is the vector `env.unwrapped.state`. States, rewards and values are float64 unless told otherwise.
 
     Args:
-        env: an instance, wrapped or not; nothing of it changes, and it is not needed afterwards. Its actions are
-            discrete, by itself or by an action wrapper (`with_torques`).
+        env: an instance, wrapped or not; nothing of it changes. Its actions are discrete, by itself or by an action
+            wrapper (`with_torques`). What its wrappers make of rewards is in the answers (`transforms_of`).
         gamma: discount in [0, 1] of a step that does not terminate.
         action_repeat, device, merge: as in `TensorModel`.
         dtype: of states, rewards and values.
@@ -52,6 +54,8 @@ class ClassicModel(TensorModel, ExactModel):
     size: int
     constants: tuple[str, ...]
     """Everything that a step of the environment reads of it, beside its state."""
+    pays_ends_only: bool = True
+    """Whether every reward is one end of the range of rewards or the other."""
 
     def __init__(
         self,
@@ -68,7 +72,7 @@ class ClassicModel(TensorModel, ExactModel):
         self.name, self.gamma = env_name(env), gamma
         if why := self.obstacle(env):
             raise PgtsError(f"{self.name} has no dynamics in torch: {why}")
-        actions = base_actions(env)
+        actions, self.transforms = base_actions(env), transforms_of(env)
         super().__init__(
             self.size,
             len(actions),
@@ -82,19 +86,25 @@ class ClassicModel(TensorModel, ExactModel):
         self._c = SimpleNamespace(**self._read)
         self._effect_AE = torch.tensor([self._effect(action) for action in actions], dtype=dtype, device=self.device)
         if action_repeat == 1:  # an operator of repeated actions gives no upper bound of v*
-            self.lowest_value, self.highest_value = value_range(self._reward_range(), gamma)
+            self.lowest_value, self.highest_value = value_range(self._range_outside(), gamma)
         self._same: list[Any] = []
 
     @classmethod
     def obstacle(cls, env: gymnasium.Env) -> str:
         """Why these dynamics are not those of `env`; empty where they are."""
-        if type(env.unwrapped) is not cls.env_class:
-            return f"it is a {type(env.unwrapped).__name__}, not a {cls.env_class.__name__}"
-        if wrapper := changing_wrapper(env):
-            return f"its wrapper {wrapper} may change what a step gives"
+        if why := cls._another_class(env.unwrapped) or overridden(env.unwrapped, cls.env_class):
+            return why
+        try:
+            transforms_of(env)
+        except MissingModel as missing:
+            return str(missing)
         if not isinstance(env.action_space, spaces.Discrete):
             return f"its actions are {env.action_space}; make them discrete, as with_torques does"
         return cls._unknown(env.unwrapped)
+
+    @classmethod
+    def _another_class(cls, base: Any) -> str:
+        return "" if type(base) is cls.env_class else f"it is a {type(base).__name__}, not a {cls.env_class.__name__}"
 
     @classmethod
     def _unknown(cls, base: Any) -> str:
@@ -121,7 +131,7 @@ class ClassicModel(TensorModel, ExactModel):
     def _state_of(self, env: gymnasium.Env) -> Any:
         base: Any = env.unwrapped
         if not any(base is known for known in self._same):
-            if why := self.obstacle(env):
+            if why := self._another_class(base):
                 raise PgtsError(f"{env_name(env)} is not {self.name}: {why}")
             for name, value in self._constants_of(base).items():
                 if value != self._read[name]:
@@ -138,6 +148,10 @@ class ClassicModel(TensorModel, ExactModel):
         """Reward, discount (0 where the episode terminates) and next state."""
         effect = self._effect_AE[action_N].unbind(-1)
         reward_N, terminated_N, following = self._move(state_ND.unbind(-1), effect)
+        if self.transforms.rewards:
+            distinct, index_N = reward_N.unique(return_inverse=True)
+            paid = [float(self.transforms.reward(reward)) for reward in distinct.tolist()]
+            reward_N = torch.tensor(paid, dtype=self.dtype, device=self.device)[index_N]
         discount_N = torch.full_like(reward_N, self.gamma).masked_fill_(terminated_N, 0.0)
         return reward_N, discount_N, torch.stack(list(following), -1)
 
@@ -156,6 +170,15 @@ class ClassicModel(TensorModel, ExactModel):
     @abstractmethod
     def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
         """Reward, whether the episode terminates, and the columns of the next state, from those of the states."""
+
+    def _range_outside(self) -> tuple[float, float]:
+        """No reward is lower or higher once wrappers have transformed it."""
+        if not self.transforms.rewards:
+            return self._reward_range()
+        if not self.pays_ends_only:
+            return -math.inf, math.inf
+        ends = [float(self.transforms.reward(end)) for end in self._reward_range()]
+        return min(ends), max(ends)
 
     def _constants_of(self, base: Any) -> dict[str, Any]:
         return {name: getattr(base, name) for name in self.constants}
@@ -295,7 +318,7 @@ class MountainCar(ClassicModel):
 class Pendulum(ClassicModel):
     """Angle, which is not wrapped, and velocity, under torques from a list. It never terminates."""
 
-    env_class, size = PendulumEnv, 2
+    env_class, size, pays_ends_only = PendulumEnv, 2, False
     constants = ("max_speed", "max_torque", "dt", "g", "m", "l")
 
     def observe(self, state_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N O"]:

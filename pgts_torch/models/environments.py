@@ -11,8 +11,10 @@ from gymnasium import spaces, wrappers
 from gymnasium.envs.registration import EnvSpec
 
 from pgts_torch.errors import NotFinite, PgtsError, failure
+from pgts_torch.models.attributes import attributes, changing, different, told
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.steps import check_rewards
+from pgts_torch.models.wrappers import transforms_of, wrappers_of
 from pgts_torch.seeding import numpy_stream
 
 EnvSource = str | EnvSpec | gymnasium.Env | Callable[[], gymnasium.Env]
@@ -21,30 +23,19 @@ EnvSource = str | EnvSpec | gymnasium.Env | Callable[[], gymnasium.Env]
 MOST_ACTIONS = 10_000
 """That are made of those of several dimensions."""
 
-_HARMLESS = (
-    wrappers.TimeLimit,
-    wrappers.OrderEnforcing,
-    wrappers.PassiveEnvChecker,
-    wrappers.RecordEpisodeStatistics,
-    gymnasium.ActionWrapper,
-)
-"""Wrappers that change neither states nor rewards; what an ActionWrapper makes of an action is read from it."""
+_ACTIONS_DRAWN = 20
 
 
 def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
     """A new environment, with these arguments if `env` is an id or a spec. An instance is not used itself: another one
-    is made from its spec.
+    is made from its spec, and has to be like it.
 
     Raises:
-        PgtsError: there is no such id, an extra is missing, an instance has no spec, a function makes none, or the
-            environment raises an error of its own.
+        PgtsError: there is no such id, an extra is missing, an instance is not what its spec makes (`spec_like`), a
+            function makes none, or the environment raises an error of its own.
     """
     if isinstance(env, gymnasium.Env):
-        if env.spec is None:
-            raise PgtsError(
-                f"{env_name(env)} has no spec to make another instance from: give a function that makes one"
-            )
-        env = env.spec
+        env = spec_like(env)
     if not isinstance(env, str | EnvSpec):
         try:
             made = env()
@@ -65,6 +56,34 @@ def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
         raise PgtsError(f"{name} cannot be made: {error}") from error
     except BaseException as error:
         raise failure(f"{name} cannot be made", error) from error
+
+
+def spec_like(env: gymnasium.Env) -> EnvSpec:
+    """The spec of an instance, from which others are made that are like it, in whatever state it is.
+
+    Raises:
+        PgtsError: it has none, or what this makes has other wrappers, or another value of an attribute that neither
+            reset nor step changes: the message names it.
+    """
+    name = env_name(env)
+    if env.spec is None:
+        raise PgtsError(f"{name} has no spec to make another instance from: give a function that makes one")
+    made = make_env(env.spec)
+    kinds = [[type(layer) for layer in (*wrappers_of(one), one.unwrapped)] for one in (env, made)]
+    way_out = "give a function that makes it as it is"
+    if kinds[0] != kinds[1]:
+        given, other = (" in ".join(kind.__name__ for kind in reversed(each)) for each in kinds)
+        raise PgtsError(f"{name} was given as an instance, {given}, of whose spec comes {other}: {way_out}")
+    own, held = attributes(env), attributes(made)
+    names = different(own, held)
+    if names:
+        try:
+            names -= changing(made, drawn_actions(made, 0), numpy_stream(0, "spec_like"))
+        except Exception as error:
+            raise failure(f"{name} failed in a random walk", error) from error
+    if names:
+        raise PgtsError(f"{name} was given as an instance with {told(min(names), own, held)} of its spec: {way_out}")
+    return env.spec
 
 
 _MODULES = {"MiniGrid-": ("minigrid", "envs"), "BabyAI-": ("minigrid", "envs"), "ALE/": ("ale_py", "atari")}
@@ -188,28 +207,12 @@ def with_torques(env: gymnasium.Env, count: int = 5) -> gymnasium.Env:
 
 
 def base_actions(env: gymnasium.Env) -> list[Any]:
-    """What each action of a discrete space becomes on its way through the action wrappers of `env`."""
-    actions = []
-    for action in all_actions(env.action_space):
-        for wrapper in wrappers_of(env):
-            if isinstance(wrapper, gymnasium.ActionWrapper):
-                action = wrapper.action(action)
-        actions.append(action)
-    return actions
+    """What each action of a discrete space becomes on its way through the wrappers of `env`."""
+    inner = transforms_of(env).action
+    return [inner(action) for action in all_actions(env.action_space)]
 
 
-def wrappers_of(env: gymnasium.Env) -> list[gymnasium.Wrapper]:
-    """The wrappers around an environment, from the outside."""
-    found = []
-    while isinstance(env, gymnasium.Wrapper):
-        found.append(env)
-        env = env.env
-    return found
-
-
-def changing_wrapper(env: gymnasium.Env) -> str:
-    """The name of a wrapper that may change observations, rewards or ends; empty where there is none."""
-    # An ActionWrapper, but what it makes of an action depends on the last one, and on chance.
-    sticky = wrappers.StickyAction
-    changing = (w for w in wrappers_of(env) if isinstance(w, sticky) or not isinstance(w, _HARMLESS))
-    return next((type(wrapper).__name__ for wrapper in changing), "")
+def drawn_actions(env: gymnasium.Env, seed: int) -> list[Any]:
+    """Some actions of an instance that nobody else needs."""
+    env.action_space.seed(seed)
+    return [env.action_space.sample() for _ in range(_ACTIONS_DRAWN)]

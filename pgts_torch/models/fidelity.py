@@ -13,15 +13,21 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch.errors import PgtsError, text_of
+from pgts_torch.models.attributes import changing
 from pgts_torch.models.environments import EnvSource, all_actions, make_env, sampled_actions
-from pgts_torch.models.snapshots import adapter_for, env_name, generator_state
+from pgts_torch.models.snapshots import adapter_for, env_name, generator_state, methods_for
 from pgts_torch.models.walks import Setup, Walk, again, live, replays, walks_of
+from pgts_torch.models.wrappers import transforms_of
 from pgts_torch.seeding import draw_keys, numpy_stream, stream
 
 _CONTINUOUS_ACTIONS = 8
 """How many actions of a continuous space are tried."""
 
 _ACTIONS_TRIED, _TIMED_CALLS = 8, 200
+_SHORT_WALKS, _SHORT_LENGTH, _LONG_LENGTH, _STEPS_IN_ALL, _TIMED_STEPS = 4, 20, 300, 20, 3
+"""Of the short form: some walks for what shows at once, and one to the end of an episode; so many times its length are
+the steps of all. A few steps are timed first."""
+
 _LEVELS, _WIDTH = 3, 8
 """The search that is run beside a real environment: so many levels, and states of a level."""
 
@@ -118,16 +124,18 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
         What was found. A check that fails says what is missing; an error of the environment fails its check.
 
     Raises:
-        MissingModel: no adapter knows the environment; the message says what to implement.
+        MissingModel: no adapter knows the environment, the message says what to implement; or a wrapper may change more
+            than single answers.
         PgtsError: it cannot be made, or cannot be walked in.
     """
     if min(continuations, length) < 1:
         raise PgtsError(f"continuations is {continuations} and length is {length}; both must be at least 1")
     first = make_env(env)
     space, continuous = first.action_space, isinstance(first.action_space, spaces.Box)
-    actions = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if continuous else list(all_actions(space))
+    outer = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if continuous else all_actions(space)
+    actions = [*map(transforms_of(first).action, outer)]
     random = numpy_stream(seed, "check_model")
-    setup = Setup(env_name(first), lambda: make_env(env), adapter_for(first), actions, random)
+    setup = Setup(env_name(first), lambda: make_env(env).unwrapped, adapter_for(first), actions, random)
     try:
         walks = walks_of(setup, continuations, length)
     except BaseException as error:
@@ -136,7 +144,7 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
     repeated = functools.cache(lambda: replays(setup, walks))
     checks = (
         _check("answers", lambda: _answers(setup, walks, tried)),
-        _check("restore", lambda: _restore(walks, repeated())),
+        _check("restore", lambda: _nothing_beside(setup) or _restore(walks, repeated())),
         _check("merge", lambda: _merge(walks, repeated()), needed=False),
         _check("chance", lambda: _chance(setup, walks)),
         _check("untouched", lambda: _untouched(setup, length)),
@@ -148,6 +156,42 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
         if report.usable:
             raise PgtsError(f"{setup.name} fails where its calls are timed: {_told(error)}") from error
         return report
+
+
+def why_not(setup: Setup, *, seconds: float = 0.4) -> str:
+    """Why snapshots of an environment cannot be believed, in the words of `check_model`; empty where nothing was found.
+
+    The checks `chance`, `restore` and `untouched` with a few short walks and a long one; their length is such that all
+    takes about these seconds, and two steps where one takes long. What the environment raises on the way is no answer:
+    it is told where it stops a training.
+    """
+    try:
+        longest = int(np.clip(seconds / (_STEPS_IN_ALL * _seconds_of_a_step(setup)), 2, _LONG_LENGTH))
+        few = setup.actions[: max(2, min(longest, _ACTIONS_TRIED))]
+        short = replace(setup, longest=longest, actions=few)
+        _nothing_beside(setup)
+        for count, length in ((_SHORT_WALKS, min(longest, _SHORT_LENGTH)), (1, longest)):
+            walks = walks_of(short, count, length)
+            _chance(short, walks)
+            _restore(walks, replays(short, walks))
+        _untouched(short, min(longest, _SHORT_LENGTH), width=max(1, min(_WIDTH, longest // _WIDTH)))
+    except _Missing as missing:
+        return str(missing)
+    except (Exception, SystemExit):
+        return ""
+    return ""
+
+
+def _seconds_of_a_step(setup: Setup) -> float:
+    """With its snapshot: the least of a few, which is least disturbed by what else the machine does."""
+    env, times = setup.fresh(), []
+    for _ in range(_TIMED_STEPS):
+        begin = time.perf_counter()
+        state = setup.adapter.get_state(env)
+        env.step(setup.action())
+        times.append(time.perf_counter() - begin)
+        setup.adapter.set_state(env, state.data)
+    return min(times)
 
 
 def _check(name: str, check: Callable[[], str], *, needed: bool = True) -> Check:
@@ -173,6 +217,19 @@ def _answers(setup: Setup, walks: Sequence[Walk], tried: _Tried) -> str:
     random_N = model.is_random(state_N, action_N)
     tried.random_share = float(random_N.double().mean())
     return f"{len(random_N)} (state, action) asked, {tried.random_share:.0%} of them decided by chance"
+
+
+def _nothing_beside(setup: Setup) -> str:
+    """A look for what a subclass remembers beside that which its family's snapshots hold."""
+    env, known = setup.fresh(), setup.adapter.restored
+    if known is None or type(env).__module__.split(".")[0] in ("gymnasium", "ale_py"):
+        return ""
+    if names := changing(env, setup.actions, setup.random, but=known):
+        raise _Missing(
+            f"{min(names)} changes in its steps or resets and is in no snapshot of {setup.adapter.name}: "
+            f"{methods_for(env)}"
+        )
+    return ""
 
 
 def _restore(walks: Sequence[Walk], repeated: Sequence[Walk]) -> str:
@@ -261,24 +318,24 @@ def _global_generators() -> dict[str, str]:
     return {name: repr(state) for name, state in states.items()}
 
 
-def _untouched(setup: Setup, length: int) -> str:
+def _untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
     """Two real environments live the same life; one is searched from."""
     real, twin = setup.make(), setup.make()
     seed, actions = setup.number(), [setup.action() for _ in range(2 * length)]
     for env in (real, twin):
         env.reset(seed=seed)
     begun = live(real, actions[:length]), live(twin, actions[:length])
-    before = _stable_key(setup, real.unwrapped), repr(generator_state(real.unwrapped))
+    before = _stable_key(setup, real), repr(generator_state(real))
     model = setup.model()
-    frontier_N = model.roots([real])
+    frontier_N, after = model.roots([real]), {before}
     for level in range(_LEVELS):
-        state_N = frontier_N[:_WIDTH].repeat_interleave(len(setup.actions))
-        action_N = torch.arange(len(setup.actions)).repeat(len(frontier_N[:_WIDTH]))
+        state_N = frontier_N[:width].repeat_interleave(len(setup.actions))
+        action_N = torch.arange(len(setup.actions)).repeat(len(frontier_N[:width]))
         key_N = draw_keys(len(state_N), generator=stream(seed, "untouched", level))
         drawn = model.sample(state_N, action_N, key_N=key_N)
         frontier_N = drawn.next_state_N[drawn.discount_N > 0].unique()
-    after = _stable_key(setup, real.unwrapped), repr(generator_state(real.unwrapped))
-    if before != after:
+        after.add((_stable_key(setup, real), repr(generator_state(real))))
+    if after != {before}:
         raise _Missing("a search changes the real environment: instances share something, or get_state changes its own")
     if begun[0] != begun[1]:
         raise _Missing(

@@ -30,6 +30,7 @@ from pgts_torch.models.base import (
 from pgts_torch.models.environments import EnvSource, all_actions, check_step, make_env
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, env_name, generator_state
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
+from pgts_torch.models.wrappers import transforms_of
 
 _KEY_OF_CERTAINTY = 0
 """Outcomes that are listed draw nothing; this is what they would draw from."""
@@ -57,10 +58,11 @@ class _Step:
 class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
     """An instance of a Gymnasium environment that answers what may follow a state and an action.
 
-    The instance belongs to the model alone, without wrappers: time limits end no episode here, and nothing that the
-    model is asked touches the environment that an agent acts in. Where the environment itself truncates an episode the
-    model never steps on: such a state leads to itself with reward 0 and discount 1, under its first action alone, so
-    that T leaves it the value that stands at the leaves, which is the critic's, at any depth.
+    The instance belongs to the model alone. What its wrappers make of an action, a reward or an observation is in the
+    answers (`transforms_of`); a `TimeLimit` is left out and ends no episode here. Nothing that the model is asked
+    touches the environment that an agent acts in. Where the environment itself truncates an episode the model never
+    steps on: such a state leads to itself with reward 0 and discount 1, under its first action alone, so that T leaves
+    it the value that stands at the leaves, which is the critic's, at any depth.
 
     Chance comes from the keys of the search, so a search cannot foresee what that environment will draw. A transition
     that draws nothing is asked of the simulator once, and the answer outlives `clear`, for it is no matter of numbers;
@@ -71,8 +73,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         gamma: discount in [0, 1] of an outcome that ends no episode; truncation does not end it, what follows is worth
             what the critic says. An environment with `metadata["discounts"] = True` may name another one in
             `info["discount"]`.
-        actions: the actions, in the order of their numbers. Default: all of a discrete space; for a continuous one see
-            `grid_actions` and `sampled_actions`.
+        actions: the actions, as the outermost wrapper takes them, in the order of their numbers. Default: all of a
+            discrete space; for a continuous one see `grid_actions` and `sampled_actions`.
         action_repeat: how often an action is taken in one outcome, as in `TensorModel`.
         adapter: takes and restores snapshots. Default: the one for the environment's family.
         observe: what to remember of an observation, for `observations`; an array, or None for nothing. Default: all.
@@ -80,7 +82,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         device, dtype: of the answers.
 
     Raises:
-        MissingModel: no adapter knows the environment.
+        MissingModel: no adapter knows the environment, or a wrapper may change more than single answers.
         PgtsError: it cannot be made, gamma is no discount, its actions cannot be listed, or action_repeat is below 1,
             or above 1 beside a highest value.
     """
@@ -111,7 +113,9 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         self.name = env_name(made)
         self.env: Any = made.unwrapped
         self.adapter = adapter or adapter_for(made)
-        self.actions = list(all_actions(self.env.action_space) if actions is None else actions)
+        self.transforms, self._space = transforms_of(made), made.observation_space
+        outer = all_actions(made.action_space) if actions is None else actions
+        self.actions = [self.transforms.action(action) for action in outer]
         if not self.actions:
             raise PgtsError("actions is empty; a model needs at least one")
         self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value
@@ -146,7 +150,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
 
         Args:
             env: wrapped or not; it has been reset.
-            observation: what it shows there, without wrappers; needed only by critics that read observations.
+            observation: what it shows there, through its wrappers; needed only by critics that read observations.
 
         Raises:
             PgtsError: it is another environment, or has another map or other constants than the model's.
@@ -218,7 +222,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
                     f"{self.name}: the observation of state {state} was not given, or `observe` made it None"
                 )
             rows.append(self._observations[state])
-        space = self.env.observation_space
+        space = self._space
         if self._observe is None and not isinstance(space, spaces.Box | spaces.Discrete):
             try:
                 rows = [spaces.flatten(space, row) for row in rows]
@@ -334,7 +338,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             reached = self.adapter.get_state(self.env)
             child = self._known(replace(reached, cut=True) if truncated and discount else reached, None)
             if self._observations[child] is None:
-                self._see(child, observation if self._show is None else self._checked(self._show(), total))
+                inner = observation if self._show is None else self._checked(self._show(), total)
+                self._see(child, self._outside(inner))
         except BaseException as error:
             where = f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}"
             raise failure(where, error) from error
@@ -355,13 +360,20 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         observation, reward, terminated, truncated, info = self.env.step(taken)
         self.simulator_steps += 1
         drew = generator_state(self.env) != before if known is None else known
-        reward = number_of("reward", reward)
+        if self._show is None:
+            self._checked(observation, number_of("reward", reward))
+        reward = number_of("reward", self.transforms.reward(reward))
         if self.reward_range is not None:
             self.reward_range.check(reward)
-        if self._show is None:
-            self._checked(observation, reward)
         discount = 0.0 if terminated else discount_of(info, self.gamma, named=self._names_discounts)
         return observation, reward, discount, drew, bool(truncated)
+
+    def _outside(self, inner: Any) -> Any:
+        """What the wrappers make of an observation, in the dtype that their space declares."""
+        if not self.transforms.observations:
+            return inner
+        outside = self.transforms.observation(inner)
+        return np.asarray(outside, self._space.dtype) if isinstance(self._space, spaces.Box) else outside
 
     def _checked(self, observation: Any, reward: float) -> Any:
         """The observation; PgtsError unless it and the reward are what the environment declares."""

@@ -29,6 +29,7 @@ import gymnasium
 import numpy as np
 
 from pgts_torch.errors import MissingModel
+from pgts_torch.models.provenance import overridden
 
 _MASK = 2**64 - 1
 _ODD = 0x9E3779B97F4A7C15
@@ -57,9 +58,12 @@ class SnapshotAdapter(ABC):
 
     Attributes:
         name: of the family of environments.
+        restored: the attributes of an environment that change in steps and resets and are in a snapshot, or are for
+            rendering only; None: whatever there is.
     """
 
     name: str
+    restored: frozenset[str] | None = None
 
     @abstractmethod
     def get_state(self, env: Any) -> Snapshot:
@@ -151,6 +155,7 @@ class ToyText(SnapshotAdapter):
     """FrozenLake, CliffWalking and Taxi: the state, and whether Taxi's passenger may still change his mind."""
 
     name = "toy text"
+    restored = frozenset({"s", "lastaction", "fickle_step", "taxi_orientation"})
 
     def get_state(self, env: Any) -> Snapshot:
         key = struct.pack("<q?", env.s, vars(env).get("fickle_step", False))
@@ -166,6 +171,12 @@ class ToyText(SnapshotAdapter):
         fickle = vars(env).get("fickle_step", False)
         return fickle or len({row[1:] for row in env.P[env.s][action] if row[0] > 0}) > 1
 
+    def obstacle(self, env: Any) -> str:
+        # Whether chance decides is read from P, which tells what these steps do and no others.
+        family = next(cls for cls in type(env).__mro__ if cls.__module__.startswith(_TOY_TEXT))
+        why = overridden(env, family)
+        return f"{why}, where snapshots are made for {family.__name__}: {methods_for(env)}" if why else ""
+
     def same_world(self, env: Any, own: Any) -> bool:
         return type(env) is type(own) and env.P == own.P
 
@@ -175,6 +186,7 @@ class Blackjack(SnapshotAdapter):
     """The two hands. The suit of the dealer's card is for rendering."""
 
     name = "toy text"
+    restored = frozenset({"player", "dealer", "dealer_top_card_suit", "dealer_top_card_value_str"})
 
     def get_state(self, env: Any) -> Snapshot:
         key = bytes(env.player) + b"|" + bytes(env.dealer)
@@ -193,6 +205,7 @@ class ClassicControl(SnapshotAdapter):
     """CartPole, Acrobot, MountainCar and Pendulum: the vector `state`, in its dtype, and CartPole's mark of an end."""
 
     name = "classic control"
+    restored = frozenset({"state", "steps_beyond_terminated", "last_u", "screen", "clock", "isopen", "surf"})
 
     def get_state(self, env: Any) -> Snapshot:
         state = np.asarray(env.state)
@@ -271,10 +284,14 @@ def adapter_for(env: gymnasium.Env) -> SnapshotAdapter:
             if why := adapter.obstacle(base):
                 raise MissingModel(f"{env_name(env)} cannot be restored: {why}")
             return adapter
-    raise MissingModel(
-        f"{env_name(env)} cannot be restored: give {type(base).__name__} the methods get_state(self), which returns "
-        "all that step reads or changes except self.np_random (bytes, or what pickles), and set_state(self, state), "
-        "which puts it back"
+    raise MissingModel(f"{env_name(env)} cannot be restored: {methods_for(base)}")
+
+
+def methods_for(base: Any) -> str:
+    """What to write, in the words of a refusal."""
+    return (
+        f"give {type(base).__name__} the methods get_state(self), which returns all that step reads or changes except "
+        "self.np_random (bytes, or what pickles), and set_state(self, state), which puts it back"
     )
 
 

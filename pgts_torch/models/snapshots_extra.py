@@ -154,6 +154,7 @@ class Ale(SnapshotAdapter):
     """
 
     name = "ALE"
+    restored = frozenset({"ale"})
 
     def get_state(self, env: Any) -> Snapshot:
         key = env.ale.cloneState(include_rng=False).serialize()
@@ -192,6 +193,7 @@ class Mujoco(SnapshotAdapter):
     from which environments read where the bodies were."""
 
     name = "MuJoCo"
+    restored = frozenset({"model", "data", "mujoco_renderer"})
 
     def get_state(self, env: Any) -> Snapshot:
         import mujoco

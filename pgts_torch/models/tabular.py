@@ -136,7 +136,8 @@ def _looks(child: np.ndarray, discount: np.ndarray, reward: np.ndarray) -> np.nd
 
 
 def tabular_truth(env: gymnasium.Env | gymnasium.vector.VectorEnv, *, gamma: float) -> TabularMDP:
-    """The MDP behind an environment or its copies: its `mdp` if it is one of ours, else its `P` table.
+    """The MDP that an environment publishes or its copies do, as it stands: its `mdp` if it has one, else its table P.
+    `published.table_of` holds it to what they do.
 
     Args:
         gamma: discount of a P table; ours carry their own.

@@ -11,26 +11,28 @@ from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter
 from pgts_torch.models.steps import number_of
 
-_LONGEST_WALK = 50
-"""The most steps before a continuation begins."""
-
 
 @dataclass(frozen=True)
 class Setup:
-    """What all checks share."""
+    """What all checks share.
+
+    make: makes an instance without wrappers.   actions: of the environment inside them.
+    longest: the most steps before a continuation begins, or before a state is restored that was met elsewhere.
+    """
 
     name: str
-    make: Callable[[], gymnasium.Env]
+    make: Callable[[], Any]
     adapter: SnapshotAdapter
     actions: Sequence[Any]
     random: np.random.Generator
+    longest: int = 50
 
     def model(self) -> SimulatorModel:
         return SimulatorModel(self.make, gamma=1.0, actions=self.actions, adapter=self.adapter)
 
     def fresh(self) -> Any:
         """A new instance, without wrappers, at the start of some episode."""
-        env = self.make().unwrapped
+        env = self.make()
         env.reset(seed=self.number())
         return env
 
@@ -57,15 +59,24 @@ def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
     env = setup.fresh()
     walks = []
     for _ in range(count):
-        env.reset(seed=setup.number())
-        for _ in range(int(setup.random.integers(_LONGEST_WALK))):
-            start = setup.adapter.get_state(env)
-            _, _, terminated, truncated, _ = env.step(setup.action())
-            if terminated or truncated:
-                setup.adapter.set_state(env, start.data)
-                break
+        _go_somewhere(setup, env)
         walks.append(walk_on(setup, env, setup.number(), tuple(setup.action() for _ in range(length))))
     return walks
+
+
+def _go_somewhere(setup: Setup, env: Any) -> None:
+    """To a random step of an episode, by steps alone: the episode is made up to its end, and once more up to there."""
+    seed, actions, over = setup.number(), list[Any](), False
+    env.reset(seed=seed)
+    while not over and len(actions) < setup.longest:
+        actions.append(setup.action())
+        _, _, terminated, truncated, _ = env.step(actions[-1])
+        over = terminated or truncated
+    env.reset(seed=seed)
+    for action in actions[: int(setup.random.integers(len(actions)))]:
+        _, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:  # reset did not heed the seed
+            env.reset(seed=seed)
 
 
 def walk_on(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
@@ -99,8 +110,13 @@ def bits(value: Any) -> bytes:
 
 
 def replays(setup: Setup, walks: Sequence[Walk]) -> list[Walk]:
-    """Each walk again, in an instance that has walked another one just before."""
+    """Each walk again, in an instance that came to the end of an episode first, and has walked another one just
+    before: what a snapshot lacks is then as different as can be."""
     env = setup.fresh()
+    for _ in range(setup.longest):
+        _, _, terminated, truncated, _ = env.step(setup.action())
+        if terminated or truncated:
+            break
     return [again(setup, env, walk) for walk in walks]
 
 

@@ -169,9 +169,14 @@ class TabularMDP:
             raise MissingModel(f"{env} has no transition table: env.unwrapped.P is missing")
         if start is None:
             start = getattr(unwrapped, "initial_state_distrib", None)
-        rows, columns = getattr(unwrapped, "nrow", 0), getattr(unwrapped, "ncol", 0)
-        shape = getattr(unwrapped, "shape", (int(rows), int(columns)))
-        return cls.from_transitions(table, gamma, start=start, shape=shape)
+        shape = getattr(unwrapped, "shape", (getattr(unwrapped, "nrow", 0), getattr(unwrapped, "ncol", 0)))
+        try:
+            laid_out = len(shape) == 2 and int(shape[0]) * int(shape[1]) == len(table)
+        except (TypeError, ValueError):  # attributes of another meaning
+            laid_out = False
+        return cls.from_transitions(
+            table, gamma, start=start, shape=(int(shape[0]), int(shape[1])) if laid_out else (0, 0)
+        )
 
     def save_npz(self, path: str | Path) -> None:
         """Write the MDP as `load_npz` reads it, without names and shape of the picture.

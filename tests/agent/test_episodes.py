@@ -8,9 +8,9 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 
+from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Horizon, Rollout, rollout
-from pgts_torch.agent.world import make_world
 from pgts_torch.seeding import stream
 
 

@@ -5,13 +5,13 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
 
+from pgts_torch.agent.copies import check_vector_env, make_vector_env
 from pgts_torch.agent.rollout import (
     FixedHorizon,
     GeometricHorizon,
     Rollout,
     simulated_returns,
 )
-from pgts_torch.agent.world import check_vector_env, make_vector_env
 from pgts_torch.bellman import Outcomes
 from pgts_torch.envs import TabularVectorEnv
 from pgts_torch.errors import PgtsError

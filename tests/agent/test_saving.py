@@ -12,10 +12,10 @@ import torch
 
 from pgts_torch import PGTS
 from pgts_torch.agent import saving
+from pgts_torch.agent.copies import make_vector_env
 from pgts_torch.agent.policies import SoftmaxPolicy
 from pgts_torch.agent.rollout import FixedHorizon
 from pgts_torch.agent.updates import SoftmaxUpdate
-from pgts_torch.agent.world import make_vector_env
 from pgts_torch.errors import PgtsError
 from tests.agent.helpers import same_bits
 

@@ -19,10 +19,11 @@ from torch import nn
 
 import pgts_torch  # noqa: F401  (registers the environments)
 from pgts_torch.agent import build
+from pgts_torch.agent.copies import make_vector_env
 from pgts_torch.agent.critics import TDLambda
 from pgts_torch.agent.networks import CNN, MLP
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
-from pgts_torch.agent.world import TabularWorld, make_vector_env
+from pgts_torch.agent.world import TabularWorld
 from pgts_torch.experiment import strict_yaml
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import MAX_BYTES, MAX_MISTAKES, ConfigError, load

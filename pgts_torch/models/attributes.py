@@ -1,0 +1,158 @@
+"""What an environment holds, in values that can be compared: are two instances alike, and what changes in a step?"""
+
+import collections
+import enum
+import functools
+import hashlib
+import marshal
+import pickle
+import random
+import time
+import types
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+
+_NOT_COMPARED = frozenset({"env", "spec", "_cached_spec", "_np_random", "_np_random_seed", "np_random"})
+"""Attributes that differ between instances that are alike: what is wrapped, and what chance is drawn from."""
+
+_GENERATORS = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random, torch.Generator)
+
+_LARGE = 4096
+"""Bytes from which on a digest stands for an array."""
+
+_MOST_PARTS = 100_000
+"""Of one attribute that are compared; an environment may hold a link to half of the program."""
+
+_EPISODES, _LOOKED_AFTER, _LONGEST, _SECONDS = 3, 5, 200, 0.2
+"""How `changing` walks: so many episodes, looking after each of the first steps and at the end, which is after so many
+steps at the latest, and after one step once these seconds are over."""
+
+
+def attributes(env: gymnasium.Env, *, but: Iterable[str] = ()) -> dict[str, Any]:
+    """Every attribute of an environment and its wrappers by its name, as what `fingerprint` makes of it.
+
+    Attributes of a wrapper are called `WRAPPER.NAME`. What classes outside of Gymnasium keep for all their instances is
+    among them. Generators are not.
+    """
+    but, layers = _NOT_COMPARED.union(but), list[Any]([env])
+    while isinstance(layers[-1], gymnasium.Wrapper):
+        layers.append(layers[-1].env)
+    held = dict[str, Any]()
+    for layer in layers:
+        start = "" if layer is layers[-1] else f"{type(layer).__name__}."
+        own = {name: value for cls in reversed(_classes_outside(type(layer))) for name, value in _data_of(cls).items()}
+        named = {name: value for name, value in (own | vars(layer)).items() if name not in but}
+        # The layers themselves are no part of what they hold: a function may enclose one of them.
+        held |= {start + name: fingerprint(value, besides=layers) for name, value in named.items()}
+    return held
+
+
+def changing(env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Generator, **but: Any) -> set[str]:
+    """The names of the attributes that change in resets and steps; the environment is walked in.
+
+    Args:
+        env: an instance that nobody else needs.
+        but: as in `attributes`.
+    """
+    now, found, until = attributes(env, **but), set[str](), time.monotonic() + _SECONDS
+    for _ in range(_EPISODES):
+        env.reset(seed=int(generator.integers(2**31)))
+        over, taken = False, 0
+        while not over:
+            if taken <= _LOOKED_AFTER:
+                before, now = now, attributes(env, **but)
+                found |= different(before, now)
+            *_, terminated, truncated, _ = env.step(actions[int(generator.integers(len(actions)))])
+            taken += 1
+            over = terminated or truncated or taken == _LONGEST or time.monotonic() > until
+        before, now = now, attributes(env, **but)
+        found |= different(before, now)
+    return found
+
+
+def different(held: dict[str, Any], other: dict[str, Any]) -> set[str]:
+    """The names under which two environments hold different values, or only one of them holds any."""
+    missing = object()
+    return {name for name in held.keys() | other.keys() if held.get(name, missing) != other.get(name, missing)}
+
+
+def told(name: str, held: dict[str, Any], other: dict[str, Any]) -> str:
+    """An attribute that is another one in two environments, in words, with what it is where that is short."""
+    plain = [name in each and isinstance(each[name], bool | int | float | str | None) for each in (held, other)]
+    return f"{name} = {held[name]!r}, where another instance has {other[name]!r}" if all(plain) else f"another {name}"
+
+
+def fingerprint(value: Any, *, besides: Sequence[Any] = ()) -> Any:
+    """Something that is equal for values that are alike. Functions are alike where their code and what they enclose
+    is; objects where their attributes are; what cannot be looked into, where its class is the same; and so are the
+    objects that are in `besides`."""
+    return _print_of(value, {id(known): -1 - k for k, known in enumerate(besides)}, [0])
+
+
+def _print_of(value: Any, seen: dict[int, int], parts: list[int]) -> Any:
+    parts[0] += 1
+    kind = type(value)
+    if value is None or kind in (bool, int, str, bytes) or isinstance(value, type | types.ModuleType | enum.Enum):
+        return value
+    if isinstance(value, float | np.generic):
+        plain = value.item() if isinstance(value, np.generic) else float(value)
+        return plain if plain == plain else "nan"
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        content = value.tobytes()
+        return value.dtype.str, value.shape, content if len(content) < _LARGE else hashlib.blake2b(content).digest()
+    if isinstance(value, _GENERATORS) or parts[0] > _MOST_PARTS:
+        return kind
+    if kind in (list, tuple, dict):
+        try:
+            return marshal.dumps(value, 2)  # a large table takes a millisecond so, and twenty one by one
+        except ValueError:
+            pass
+    if id(value) in seen:
+        return "=", seen[id(value)]
+    seen[id(value)] = len(seen)
+    inner = functools.partial(_print_of, seen=seen, parts=parts)
+    return kind, _parts_of(value, inner)
+
+
+def _parts_of(value: Any, inner: Callable[[Any], Any]) -> Any:
+    """What a value consists of."""
+    if isinstance(value, dict):
+        return [(repr(name), inner(part)) for name, part in value.items()]
+    if isinstance(value, set | frozenset):
+        return sorted(map(repr, value))
+    if isinstance(value, list | tuple | collections.deque | np.ndarray):
+        return [inner(part) for part in value]
+    if isinstance(value, types.FunctionType):
+        cells = [inner(cell.cell_contents) for cell in value.__closure__ or ()]
+        return value.__code__, inner(value.__defaults__), inner(value.__kwdefaults__), cells
+    if isinstance(value, types.MethodType):
+        return inner(value.__func__), inner(value.__self__)
+    if isinstance(value, functools.partial):
+        return inner(value.func), inner(value.args), inner(value.keywords)
+    slots = [name for cls in type(value).__mro__ for name in getattr(cls, "__slots__", ()) if hasattr(value, name)]
+    named = {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})
+    if named or isinstance(value, spaces.Space):
+        return [(name, inner(part)) for name, part in named.items() if name not in _NOT_COMPARED]
+    try:
+        return pickle.dumps(value)
+    except Exception:  # a window, a lock, a handle: nothing to compare
+        return None
+
+
+def _classes_outside(cls: type) -> list[type]:
+    """The classes that an environment is made of, except Gymnasium's and Python's own."""
+    return [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("gymnasium", "typing", "builtins")]
+
+
+def _data_of(cls: type) -> dict[str, Any]:
+    """What a class holds beside its code."""
+    code = (types.FunctionType, staticmethod, classmethod, property, functools.cached_property, type)
+    plain = {name: value for name, value in vars(cls).items() if not name.startswith("__")}
+    return {name: value for name, value in plain.items() if not isinstance(value, code) and name != "metadata"}

@@ -1,0 +1,70 @@
+"""Is what a model was written for what runs? A table or an adapter belongs to the `step` and `reset` of one class."""
+
+import dis
+import functools
+import inspect
+import types
+from typing import Any
+
+_ALWAYS = ("__getattribute__", "__setattr__", "__getattr__")
+_NO_MATTER = frozenset({"render", "close", "render_mode", "metadata", "_np_random", "_np_random_seed"})
+
+
+def overridden(env: Any, family: type, methods: tuple[str, ...] = ("step", "reset")) -> str:
+    """What an unwrapped environment does otherwise than a class that it is an instance of, in these methods or in what
+    they use of it (but to render): "step is overridden by Shaped"; empty where nothing is.
+
+    Overridden is what a class that is not among the bases of `family` defines, and a method that is set on the
+    instance.
+    """
+    strangers = [cls for cls in type(env).__mro__ if cls not in family.__mro__]
+    for name in _used_by(family, methods):
+        if name in vars(env) and callable(inspect.getattr_static(family, name, None)):
+            return f"{name} was set on the instance"
+        if cls := next((cls for cls in strangers if name in vars(cls)), None):
+            return f"{name} is overridden by {cls.__qualname__}"
+    return ""
+
+
+def origin(env: Any, attribute: str) -> type:
+    """The class that an attribute of an environment belongs to: the most derived one that sets it, or whose `step`
+    reads it. The class of the instance itself where none does, for then it was set from outside."""
+    return next((cls for cls in type(env).__mro__ if _writes(cls, attribute)), type(env))
+
+
+def _writes(cls: type, attribute: str) -> bool:
+    stored = {
+        line.argval
+        for value in vars(cls).values()
+        for code in _codes_of(value)
+        for line in dis.get_instructions(code)
+        if line.opname == "STORE_ATTR"
+    }
+    read = {name for code in _codes_of(vars(cls).get("step")) for name in code.co_names}
+    return attribute in vars(cls) or attribute in stored or attribute in read
+
+
+@functools.cache
+def _used_by(family: type, methods: tuple[str, ...]) -> tuple[str, ...]:
+    """These methods and every name of the class that their code mentions, or the code of what it mentions."""
+    found, entrances = dict[str, None](), (*methods, *_ALWAYS)
+    waiting = [*entrances]
+    while waiting:
+        name = waiting.pop(0)
+        # All holders, for `super().reset` runs those of the bases too.
+        holders = [vars(cls)[name] for cls in family.__mro__ if cls is not object and name in vars(cls)]
+        if name in found or name in _NO_MATTER or not (holders or name in entrances):
+            continue
+        found[name] = None
+        waiting += [used for value in holders for code in _codes_of(value) for used in code.co_names]
+    return tuple(found)
+
+
+def _codes_of(value: Any) -> list[types.CodeType]:
+    """The code of a function, a property or a method of a class, with that of functions inside."""
+    functions = [value.fget, value.fset] if isinstance(value, property) else [getattr(value, "__func__", value)]
+    waiting, codes = [f.__code__ for f in functions if isinstance(f, types.FunctionType)], list[types.CodeType]()
+    while waiting:
+        codes.append(waiting.pop())
+        waiting += [inner for inner in codes[-1].co_consts if isinstance(inner, types.CodeType)]
+    return codes

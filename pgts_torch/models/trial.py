@@ -1,0 +1,136 @@
+"""Models that claim to be an environment, held to its steps for a moment before they are believed."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+from jaxtyping import Float
+
+from pgts_torch.models.base import DENIED, ExactModel, Happened, step_text
+from pgts_torch.models.classic import ClassicModel
+from pgts_torch.models.steps import discount_of, names_discounts, number_of
+from pgts_torch.models.tabular import TabularModel
+from pgts_torch.tabular.mdp import TabularMDP
+
+_STEPS, _LONGEST_EPISODE, _RESETS = 400, 40, 1000
+_SECONDS = 0.3
+"""After which a trial ends in a slow environment, though never before its first step."""
+
+
+def table_contradiction(mdp: TabularMDP, env: gymnasium.Env, gamma: float, generator: np.random.Generator) -> str:
+    """The first thing in a short random walk that cannot be by a table; empty where there is none.
+
+    Starts must have positive probability, and each step must be one of the outcomes that have (`TabularModel.hold`).
+
+    Args:
+        env: an instance that nobody else needs, in the wrappers that the table is meant to hold for.
+        gamma: discount of a step that names none.
+    """
+
+    def state_of(shown: Any) -> int:
+        if not _is_state(shown, mdp.num_states):
+            raise _NoState(f"it shows {shown!r}, which is none of the states 0 to {mdp.num_states - 1}")
+        return int(shown)
+
+    def began(state: int) -> None:
+        if mdp.start_S[state] == 0:
+            raise _NoState(f"it starts in state {state}, which has probability 0 there")
+
+    try:
+        return _denied(TabularModel(mdp), _walk(env, gamma, generator, state_of, began))
+    except _NoState as off:
+        return str(off)
+
+
+def dynamics_contradiction(model: ClassicModel, env: gymnasium.Env, generator: np.random.Generator) -> str:
+    """The first step of a short random walk that dynamics in torch do not give too (`TensorModel.hold`); empty where
+    there is none.
+
+    Args:
+        model: of its own, for it numbers the states that are met.
+        env: an instance that nobody else needs, in the wrappers that the dynamics are meant to hold for.
+    """
+    return _denied(model, _walk(env, model.gamma, generator, lambda _: int(model.roots([env])), lambda _: None))
+
+
+def counted_starts(env: gymnasium.Env, num_states: int, generator: np.random.Generator) -> Float[np.ndarray, "S"]:
+    """How often each state came first in up to 1,000 seeded resets, as shares.
+
+    Raises:
+        ValueError: it began with what is no state.
+    """
+    counts, until = np.zeros(num_states), time.monotonic() + _SECONDS
+    for _ in range(_RESETS):
+        state, _ = env.reset(seed=_seed(generator))
+        if not _is_state(state, num_states):
+            raise ValueError(f"reset gave {state!r}, which is none of the states 0 to {num_states - 1}")
+        counts[int(state)] += 1
+        if time.monotonic() > until:
+            break
+    return counts / counts.sum()
+
+
+class _NoState(Exception):
+    """Something was shown that is no state, or no start."""
+
+
+_Step = tuple[int, int, float, float, int]
+"""State, number of the action, reward, discount and next state."""
+
+
+def _denied(model: ExactModel, steps: Iterator[_Step]) -> str:
+    """The first step that a model denies, in words."""
+    columns = list(zip(*steps, strict=True))
+    if not columns:
+        return ""
+    state_N, action_N, reward_N, discount_N, next_N = map(np.array, columns)
+    happened = Happened(state_N, action_N, reward_N, discount_N, next_N, np.zeros(len(state_N), dtype=bool))
+    off = np.flatnonzero(model.hold(happened) == DENIED)
+    if not off.size:
+        return ""
+    state, action, reward, discount, following = (column[off[0]] for column in columns)
+    return (
+        f"after action {action} in {model.shown(state)} came {step_text(reward, discount, model.shown(following))}; "
+        f"it has {model.told(state, action)}"
+    )
+
+
+def _walk(
+    env: gymnasium.Env,
+    gamma: float,
+    generator: np.random.Generator,
+    state_of: Callable[[Any], int],
+    began: Callable[[int], None],
+) -> Iterator[_Step]:
+    """Random episodes, up to where the environment raises: that is no contradiction, and is told where it stops a
+    training."""
+    until, taken, named = time.monotonic() + _SECONDS, 0, names_discounts(env)
+    try:
+        while taken < _STEPS and (time.monotonic() < until or taken == 0):
+            shown, _ = env.reset(seed=_seed(generator))
+            state = state_of(shown)
+            began(state)
+            for _ in range(_LONGEST_EPISODE):
+                action = int(generator.integers(env.action_space.n))  # type: ignore[attr-defined]
+                shown, reward, terminated, truncated, info = env.step(action)
+                discount = 0.0 if terminated else discount_of(info, gamma, named=named)
+                before, state = state, state_of(shown)
+                yield before, action, number_of("reward", reward), discount, state
+                taken += 1
+                if terminated or truncated or time.monotonic() > until:
+                    break
+    except _NoState:
+        raise
+    except (Exception, SystemExit):
+        return
+
+
+def _is_state(shown: Any, num_states: int) -> bool:
+    array = np.asarray(shown)
+    return array.ndim == 0 and array.dtype.kind in "iu" and 0 <= int(array) < num_states
+
+
+def _seed(generator: np.random.Generator) -> int:
+    return int(generator.integers(2**31))
