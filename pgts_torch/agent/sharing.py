@@ -95,5 +95,7 @@ def _joined(parts: Sequence[Lookahead]) -> Lookahead:
         **{name: rows(name) for name in _VALUES},
         model_calls=sum(part.model_calls for part in parts),
         critic_calls=sum(part.critic_calls for part in parts),
+        samples=parts[0].samples,
+        value_range=parts[0].value_range,
         nodes_per_level=tuple(map(sum, zip_longest(*(part.nodes_per_level for part in parts), fillvalue=0))),
     )

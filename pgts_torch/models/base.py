@@ -65,6 +65,7 @@ class Model(ABC):
     lowest_value: a lower bound of v^pi, of every policy in every state; -infinite where none is known.
     reward_range: what its rewards are held to; None: nothing.
     action_repeat: how often an action is taken in one outcome.
+    is_certain: whether it is known that no action has more than one outcome.
     generation: how often the model has forgotten its states and begun to number them anew.
     """
 
@@ -75,6 +76,7 @@ class Model(ABC):
     lowest_value: float = -math.inf
     reward_range: RewardRange | None = None
     action_repeat: int = 1
+    is_certain: bool = False
     generation: int = 0
     device: torch.device
     dtype: torch.dtype

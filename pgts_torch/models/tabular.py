@@ -52,6 +52,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
         self.device = self.table.device
         self.dtype = dtype
         self.highest_value, self.lowest_value = highest_value(mdp.outcomes), lowest_value(mdp.outcomes)
+        self.is_certain = bool((mdp.outcomes.prob_NAK.amax(-1) == 1).all())
         self._cumulative_NAK = self.table.prob_NAK.cumsum(-1)
         self._mdp = mdp
 

@@ -69,6 +69,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
         self.device = self._numbering.device
         self.dtype = dtype
         self.action_repeat = action_repeat
+        self.is_certain = True
         self.simulator_steps = 0
         """How many (state, action) `step` was asked for."""
 

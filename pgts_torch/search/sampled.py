@@ -108,9 +108,12 @@ def sampled(
     v_N = _leaf_values(leaves, empirical, steps, bottom_N)
     q_BA = _backups([outcomes for _, outcomes in reversed(steps)], v_N)[empirical.root_B]
     stderr_BA = bias_BA = torch.full_like(q_BA, torch.nan)
-    if replicates and 1 not in plan:
+    fewest = min(C for C in plan if C is not None)
+    if replicates and fewest > 1:
         again_RNA = _bootstrap(empirical, plan, steps, v_N, replicates)
         stderr_BA, bias_BA = _spread(q_BA, again_RNA[:, empirical.root_B])
+        if len(plan) == 1:  # it would be noise of the bootstrap: there is no maximum over samples
+            bias_BA = torch.zeros_like(bias_BA)
     return Lookahead(
         q_BA,
         stderr_BA=stderr_BA,
@@ -119,6 +122,8 @@ def sampled(
         model_calls=empirical.model_calls,
         critic_calls=leaves.calls,
         nodes_per_level=nodes_per_level,
+        samples=fewest,
+        value_range=(0.0, 0.0) if model.is_certain else (model.lowest_value, model.highest_value),
     )
 
 

@@ -1,0 +1,82 @@
+"""How often do the intervals of a sampled lookahead hold T^m Q?
+
+    python benchmarks/coverage.py [--quick]
+
+Random MDPs of 12 states and 2 actions in which every action has two outcomes, a likely and an unlikely one. Leaf values
+are those of a random policy (values), or 0 and the highest, so that what is drawn is a Bernoulli variable (prizes). The
+unlikely outcome has a probability between 0 and 1/2 (even), or of 0.02 to 0.1 (rare).
+"""
+
+import argparse
+
+import numpy as np
+import torch
+
+from pgts_torch.bellman import Outcomes
+from pgts_torch.models import TabularModel
+from pgts_torch.search.sampled import sampled
+from pgts_torch.seeding import numpy_stream, stream
+from pgts_torch.tabular import TabularMDP, exact
+
+STATES, ACTIONS, GAMMA = 12, 2, 0.9
+SAMPLES, DEPTHS = (2, 4, 8, 16), (0, 1, 2, 3)
+UNLIKELY = {"even": (0.0, 0.5), "rare": (0.02, 0.1)}
+
+
+def case(kind: str, chance: str, seed: int) -> tuple[TabularMDP, torch.Tensor]:
+    """An MDP, and the values at the leaves."""
+    random = numpy_stream(seed, "coverage", kind, chance)
+    p_SA = random.uniform(*UNLIKELY[chance], size=(STATES, ACTIONS))
+    outcomes = Outcomes(
+        torch.from_numpy(random.uniform(0, 1, (STATES, ACTIONS)) * (kind == "values")),
+        torch.from_numpy(np.stack([p_SA, 1 - p_SA], -1)),
+        torch.full((STATES, ACTIONS, 2), GAMMA, dtype=torch.float64),
+        torch.from_numpy(random.integers(0, STATES, size=(STATES, ACTIONS, 2))),
+        STATES,
+    )
+    mdp = TabularMDP(outcomes, torch.full((STATES,), 1 / STATES, dtype=torch.float64))
+    if kind == "prizes":
+        return mdp, torch.from_numpy(random.integers(0, 2, STATES).astype(np.float64))
+    return mdp, exact.policy_values(mdp, torch.from_numpy(random.dirichlet(np.ones(ACTIONS), size=STATES)))
+
+
+def covered(kind: str, chance: str, depth: int, samples: int, mdps: int) -> tuple[float, float]:
+    """The share of all q of all MDPs that lie in their interval, and its mean width in units of the range of values."""
+    held, width = [], []
+    for seed in range(mdps):
+        mdp, v_S = case(kind, chance, seed)
+        model = TabularModel(mdp)
+        if kind == "prizes":
+            model.lowest_value, model.highest_value = 0.0, 1.0
+        look = sampled(
+            model,
+            torch.arange(STATES),
+            depth=depth,
+            v_leaf=lambda state_N, v_S=v_S: v_S[state_N],
+            samples=samples,
+            generator=stream(seed, "coverage"),
+        )
+        truth_SA = exact.lookahead(mdp, exact.backup(mdp.outcomes, v_S), depth)
+        low, high = look.interval()
+        # A value that all samples hit exactly may miss the truth by rounding only.
+        held.append(((low <= truth_SA + 1e-12) & (truth_SA <= high + 1e-12)).double().mean())
+        width.append((high - low).mean() / (model.highest_value - model.lowest_value))
+    return float(torch.stack(held).mean()), float(torch.stack(width).mean())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="fewer MDPs")
+    mdps = 3 if parser.parse_args().quick else 60
+    print(f"{mdps} MDPs of each kind; how often the 95 % interval holds T^m Q, and (its mean width / range of values)")
+    print(f"{'leaves':<10}{'chance':<8}{'C':>3}" + "".join(f"{f'm = {depth}':>16}" for depth in DEPTHS))
+    for kind in ("values", "prizes"):
+        for chance in UNLIKELY:
+            for samples in SAMPLES:
+                cells = [covered(kind, chance, depth, samples, mdps) for depth in DEPTHS]
+                shown = "".join(f"{f'{held:.1%} ({width:.2f})':>16}" for held, width in cells)
+                print(f"{kind:<10}{chance:<8}{samples:>3}{shown}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
