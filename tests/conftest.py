@@ -23,6 +23,12 @@ hypothesis.settings.register_profile("pgts", derandomize=True, deadline=None, ma
 hypothesis.settings.load_profile("pgts")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker(pytest.mark.timeout(3600))
+
+
 @pytest.fixture
 def unchecked_shapes() -> Iterator[None]:
     """The package as users run it, without jaxtyping: its own messages must name what is wrong."""

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import tempfile
 import traceback
@@ -45,10 +44,10 @@ def _forked(work: Callable[[], int]) -> int:
         pid = os.fork()
     if pid == 0:
         code = 70
-        for number, handler in AS_IN_A_TERMINAL.items():
-            signal.signal(number, handler)
-        signal.alarm(PATIENCE)  # ends a process that waits for another one in vain
         try:
+            for number, handler in AS_IN_A_TERMINAL.items():
+                signal.signal(number, handler)
+            signal.alarm(PATIENCE)  # ends a process that waits for another one in vain
             code = work()
         except BaseException:
             traceback.print_exc()
@@ -90,15 +89,13 @@ def on_ranks(size: int, work: Callable[[], Any]) -> list[Any]:
 
 
 def launched(size: int, work: Callable[[], int]) -> list[int]:
-    """The exit codes of processes that believe to be started by torchrun."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
+    """The exit codes of processes that believe to be started by torchrun, which keeps the store where they meet."""
+    store = distributed.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)  # at a port that nobody has
 
-    def started(rank: int) -> int:
-        names = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": size, "MASTER_PORT": port}
-        os.environ.update({name: str(value) for name, value in names.items()})
-        os.environ.update(TORCHELASTIC_RUN_ID="test", MASTER_ADDR="localhost")
+    def started_by_torchrun(rank: int) -> int:
+        numbers = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": size, "MASTER_PORT": store.port}
+        os.environ.update({name: str(number) for name, number in numbers.items()})
+        os.environ.update(TORCHELASTIC_RUN_ID="test", TORCHELASTIC_USE_AGENT_STORE="True", MASTER_ADDR="localhost")
         return work()
 
-    return forked([lambda rank=rank: started(rank) for rank in range(size)])
+    return forked([lambda rank=rank: started_by_torchrun(rank) for rank in range(size)])
