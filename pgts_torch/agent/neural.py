@@ -26,7 +26,7 @@ from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.seeding import stream
 
-_SMALLEST_SCALE = 1e-4
+_ROUNDING = torch.finfo(torch.float32).eps
 _SLOWEST_RATE = 0.1
 
 
@@ -77,7 +77,8 @@ class NetworkCritic(Critic):
 
     y_t are lambda-returns or Monte-Carlo returns: where an episode was cut, v of the target network stands for the
     rest; where it terminated, nothing does. mean and scale follow the targets (1/k of fit k, never less than 1/10);
-    when they change, the last layer is changed so that v stays as it is (PopArt; van Hasselt et al. 2016).
+    when they change, the last layer is changed so that v stays as it is (PopArt; van Hasselt et al. 2016). In the
+    first fit v counts as 0, unless it was asked for before. So rewards times 2^k give values times 2^k, bit for bit.
 
     Args:
         observation_space, num_actions: what is seen and done.
@@ -159,7 +160,8 @@ class NetworkCritic(Critic):
             encoder.absorb(observation_V)
         if self.normalize_returns:
             self._rescale(target_V)
-        columns = (self.network.encode(observation_V), action_V, ((target_V - self._mean) / self._scale).float())
+        y_V = (target_V - self._mean) / self._scale if self._scale else torch.zeros_like(target_V)
+        columns = (self.network.encode(observation_V), action_V, y_V.float())
         norms = []
         for _ in range(self.num_epochs):
             for input_N, action_N, y_N in minibatches(columns, self.minibatch_size, generator=generator):
@@ -167,10 +169,10 @@ class NetworkCritic(Critic):
                 norms.append(self._optimiser.step(self.network.weights, loss, "value"))
         self._num_fits += 1
         self._move_target_network()
-        explained = 1 - error_V.var(correction=0) / target_V.var(correction=0).clamp(min=1e-12)
+        spread, unexplained = float(target_V.var(correction=0)), float(error_V.var(correction=0))
         return {
             "value": float(error_V.square().mean()),
-            "explained_variance": float(explained),
+            "explained_variance": 1 - unexplained / spread if spread else 0.0,
             "value_grad_norm": sum(norms) / len(norms),
         }
 
@@ -229,6 +231,8 @@ class NetworkCritic(Critic):
         asked, self._asked = self._asked, None
         if asked is not None and asked[0] is rollout and not self._lags:
             v_TB, next_v_TB = asked[1]
+        elif asked is None and not self._num_fits and self.normalize_returns:
+            v_TB = next_v_TB = torch.zeros_like(rollout.reward_TB)
         else:
             v_TB, next_v_TB = rollout.values(lambda observation_N: self._v(self._target_network, observation_N))
         if isinstance(self.method, MonteCarlo):
@@ -243,8 +247,9 @@ class NetworkCritic(Critic):
         new_mean, new_var = float(target_V.mean()), float(target_V.var(correction=0))
         mean = old_mean + rate * (new_mean - old_mean)
         spread = (1 - rate) * (old_scale**2 + (old_mean - mean) ** 2) + rate * (new_var + (new_mean - mean) ** 2)
-        self._mean, self._scale = mean, max(math.sqrt(spread), _SMALLEST_SCALE)
-        if self._num_fits:
+        # What is less than the rounding of the targets is none of their spread. Where all are 0, so is the scale.
+        self._mean, self._scale = mean, max(math.sqrt(spread), _ROUNDING * float(target_V.abs().max()))
+        if self._num_fits and self._scale:
             for network in {self.network, self._target_network}:
                 network.head.weight.mul_(old_scale / self._scale)
                 network.head.bias.mul_(old_scale / self._scale).add_((old_mean - self._mean) / self._scale)

@@ -91,8 +91,8 @@ class CMPOUpdate(TargetUpdate):
     """
 
     learning_rate: float = 1e-3
-    temperature: float = 0.25
-    clip: float = 2.0
+    temperature: float = 0.2
+    clip: float = 3.0
 
     def check_options(self) -> None:
         check_positive("temperature", self.temperature)

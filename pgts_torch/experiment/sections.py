@@ -530,10 +530,10 @@ class CMPOUpdateConfig(Section):
     state_weight: StateWeight = "visits"
     """What a visited state counts for: its discounted occupancy, its share of all visits, or 1."""
 
-    temperature: Positive = 0.25
+    temperature: Positive = 0.2
     """By which advantages are divided, in units of their mean size; small ones make long steps."""
 
-    clip: Positive = 2.0
+    clip: Positive = 3.0
     """The most that an action gains or loses in log pi in one iteration."""
 
     num_epochs: Count = 10

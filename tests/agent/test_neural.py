@@ -51,6 +51,20 @@ def tabular_critic(value_S: list[float] | Tensor, **options) -> NetworkCritic:
     return critic
 
 
+def fitted(critic: NetworkCritic) -> NetworkCritic:
+    """The critic as one that has been fitted before: what it says counts."""
+    critic._num_fits = 1
+    return critic
+
+
+def test_before_the_first_fit_nothing_is_known_unless_it_was_asked_for():
+    made, of_tens = by_hand(), tabular_critic([10.0] * 4)
+    zeros = fitted(tabular_critic([0.0] * 4))
+    assert torch.equal(of_tens._targets(made)[1], zeros._targets(made)[1])
+    of_tens.values(made)
+    assert torch.equal(of_tens._targets(made)[1], fitted(of_tens)._targets(made)[1])
+
+
 def test_a_policy_is_the_softmax_of_its_network_and_nearly_uniform_at_first():
     policy = NetworkPolicy(VECTORS, 5, seed=1)
     probs_NA = policy.probs(POINTS_SD)
@@ -118,9 +132,10 @@ def test_a_critic_converges_to_the_values_of_a_policy_that_stands_still(target, 
 )
 def test_what_was_cut_is_bootstrapped_and_what_terminated_is_not(method, expected):
     made = by_hand()
-    target_TB = tabular_critic([10.0] * 4, method=method)._targets(made)[1]
+    known, blind = (fitted(tabular_critic([value] * 4, method=method)) for value in (10.0, 0.0))
+    target_TB = known._targets(made)[1]
     torch.testing.assert_close([*target_TB[:, 0].tolist(), float(target_TB[2, 1])], expected)
-    blind_TB = tabular_critic([0.0] * 4, method=method)._targets(made)[1]
+    blind_TB = blind._targets(made)[1]
     assert blind_TB[2, 1] == target_TB[2, 1]
     assert blind_TB[2, 0] != target_TB[2, 0]
 
@@ -205,7 +220,8 @@ def test_a_target_network_lags_behind(polyak, target_period):
 
 @pytest.mark.parametrize(("polyak", "asks"), [(1.0, 1), (0.5, 2)])
 def test_values_that_were_asked_for_before_a_fit_are_not_asked_for_again(polyak, asks, monkeypatch):
-    asking, silent = (tabular_critic([0.5, -1.0, 2.0, 0.0], learning_rate=0.1, polyak=polyak) for _ in range(2))
+    values, options = [0.5, -1.0, 2.0, 0.0], {"learning_rate": 0.1, "polyak": polyak}
+    asking, silent = (fitted(tabular_critic(values, **options)) for _ in range(2))
     counted, evaluate = [], asking.network.evaluate
     monkeypatch.setattr(asking.network, "evaluate", lambda seen_N: counted.append(seen_N) or evaluate(seen_N))
     made = by_hand()
