@@ -82,6 +82,11 @@ FAULTS: dict[str, dict[str, str]] = {
         "gradient that is not finite": STOPPED,
         "step that overflows": "taken back: policy and optimiser as before",
     },
+    "Learning": {
+        "rewards in another unit, networks": "times 2^k, every bit of the policy is the same",
+        "a policy that hardly moves": "the summary says so, with what to change",
+        "a greedy policy that is worse than drawn actions": "the summary says so",
+    },
     "Proofs": {
         "an episode that begins in one of several states": "a proof is over all start states, not over those drawn",
         "no largest reward is known": "stop_at and adaptive depth are refused, with what to set: env.reward_range",

@@ -1,10 +1,11 @@
 """The loop around the algorithm: build it from a configuration, iterate, write down what happened."""
 
+import copy
 import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +22,7 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.ranks import joined_ranks
 from pgts_torch.errors import Failed, ModelMismatch, NotFinite, Stopped, failure
 from pgts_torch.experiment import checkpoint, diagnostics
+from pgts_torch.experiment.advice import Movement, greedy_is_worse, span_of, stuck
 from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import KINDS
@@ -98,6 +100,7 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
     with joined_ranks(config.device) as ranks, StopFlag() as stop, ExitStack() as held:
         ranks.first("the run folder", lambda: check_dir(config))
         algorithm = ranks.together("the algorithm", lambda: build(config))
+        movement = Movement(copy.deepcopy(algorithm.policy))
         locks: list[RunLock] = []
 
         def claim() -> tuple[Path, Start | None]:
@@ -122,7 +125,7 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
         ranks.first("an open folder", open_folder)
         if ranks.leads and (why := _out_of_reach(config, algorithm)):
             print(f"note: {why}", file=sys.stderr)
-        summary = _loop(config, algorithm, folder, start, stop)
+        summary = _loop(config, algorithm, folder, start, stop, movement)
         folder.text(SUMMARY_FILE, json.dumps(asdict(summary), indent=2) + "\n")
     return summary
 
@@ -140,8 +143,10 @@ def _out_of_reach(config: Config, algorithm: PGTS) -> str:
     )
 
 
-def _loop(config: Config, algorithm: PGTS, folder: Folder, start: Start | None, stop: StopFlag) -> Summary:
-    recorder = _Recorder(config, algorithm, folder, stop)
+def _loop(
+    config: Config, algorithm: PGTS, folder: Folder, start: Start | None, stop: StopFlag, movement: Movement
+) -> Summary:
+    recorder = _Recorder(config, algorithm, folder, stop, movement)
     if start is not None:
         recorder.load(start.notes)
     try:
@@ -173,7 +178,9 @@ class _Recorder:
     The tags of an iteration speak of the policy that made its episodes, which is the one before its update.
     """
 
-    def __init__(self, config: Config, algorithm: PGTS, folder: Folder, stop: StopFlag) -> None:
+    def __init__(self, config: Config, algorithm: PGTS, folder: Folder, stop: StopFlag, movement: Movement) -> None:
+        self.movement = movement
+        self._last: Iteration | None = None
         self.config, self.algorithm, self.folder, self.stop = config, algorithm, folder, stop
         self.ended_by: EndedBy | None = None
         is_known = algorithm.world.mdp is not None and algorithm.ranks.leads
@@ -196,6 +203,7 @@ class _Recorder:
         seconds = time.perf_counter() - self._clock
         k, step = algorithm.num_iterations, algorithm.num_env_steps
         self._deepest, self._certificate = max(self._deepest, iteration.depth), iteration.certificate
+        self._last = iteration
         if k % self.config.log.every == 0 and algorithm.ranks.leads:
             tags = diagnostics.metrics(algorithm, iteration)
             if self.truth is not None and self._pi_SA is not None:
@@ -229,12 +237,15 @@ class _Recorder:
         """A checkpoint, unless the last one was taken just now."""
         if self._saved_at == self.algorithm.num_env_steps:
             return
+        if self._last is not None:
+            self.movement.measure(self.algorithm, self._last)
         progress = {
             "ended_by": self.ended_by,
             "depth": self._deepest,
             "certificate": None if math.isinf(self._certificate) else self._certificate,
             "seconds": time.perf_counter() - self._started,
             "evaluations": {kind: evaluation.state_dict() for kind, evaluation in self._evaluations.items()},
+            "movement": self.movement.state_dict(),
         }
         notes = Notes(
             iterations=self.algorithm.num_iterations,
@@ -257,6 +268,7 @@ class _Recorder:
         self._deepest = progress["depth"]
         self._certificate = math.inf if progress["certificate"] is None else progress["certificate"]
         self._started -= progress["seconds"]
+        self.movement.load_state_dict(progress.get("movement", {}))
         for kind, evaluation in self._evaluations.items():
             if kind in progress["evaluations"]:
                 evaluation.load_state_dict(progress["evaluations"][kind])
@@ -325,7 +337,18 @@ class _Recorder:
             seconds=seconds,
             deterministic=deterministic,
             sampled=sampled,
+            notes=tuple(filter(None, (self._advice(exactly), greedy_is_worse(deterministic, sampled)))),
         )
+
+    def _advice(self, exactly: Mapping[str, float | None]) -> str | None:
+        """That the policy hardly moved, if it did not and should have."""
+        missing = stationary_gap = None
+        if self.truth is not None:
+            span = float(span_of(self.truth.optimum.q_SA.reshape(1, -1)))
+            J, best, gap = (exactly[name] or 0.0 for name in ("J", "J_optimal", "stationarity_gap"))
+            missing, stationary_gap = ((best - J) / span, gap / span) if span > 0 else (0.0, 0.0)
+        shares = {"missing_share": missing, "stationary_share": stationary_gap}
+        return stuck(self.movement, self.algorithm.update, depth=self._deepest, **shares)
 
 
 def _evaluations(config: EvalConfig, seed: int, folder: Folder) -> dict[str, EvalCallback]:

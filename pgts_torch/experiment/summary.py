@@ -32,6 +32,7 @@ class Summary:
         run hold over the starts that were drawn, as far as the critic is right.
     ended_by: what ended the training: the certificate came down to `search.stop_at`, greedy episodes reached
         `eval.stop_at_return`, or neither before `total_steps`.
+    notes: what the user should know of a run that learned little (`experiment.advice`).
     """
 
     run: str
@@ -51,12 +52,13 @@ class Summary:
     deterministic: Evaluation
     sampled: Evaluation
     certificate_confidence: float = 1.0
+    notes: tuple[str, ...] = ()
 
 
 def from_json(content: Mapping[str, Any]) -> Summary:
     """The summary that a run has left as JSON; TypeError or KeyError if it is of another form."""
     evaluations = {kind: _evaluation(content[kind]) for kind in ("deterministic", "sampled")}
-    return Summary(**{**content, **evaluations})
+    return Summary(**{**content, **evaluations, "notes": tuple(content.get("notes", ()))})
 
 
 def _evaluation(content: Mapping[str, Any]) -> Evaluation:
@@ -95,6 +97,7 @@ def rows(summary: Summary) -> dict[str, str]:
     rows |= {
         "greedy episodes, return": _score_text(summary.deterministic),
         "sampled episodes, return": _score_text(summary.sampled),
+        **({"note": "; ".join(summary.notes)} if summary.notes else {}),
         "search": summary.search,
         "training ended by": ended,
         "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",

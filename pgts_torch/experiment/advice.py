@@ -1,0 +1,111 @@
+"""What a finished run has to say about itself: that it hardly learned, or that its most probable actions are bad."""
+
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pgts_torch.agent.evaluate import Evaluation
+from pgts_torch.agent.iteration import Iteration
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.target_updates import TargetUpdate
+from pgts_torch.agent.updates import TabularUpdate, Update
+
+HARDLY = 0.05
+"""A policy of which less than this share of probability is elsewhere than at first has hardly moved."""
+
+LARGE = 0.1
+"""What is missing is large if it is more than this share of what actions differ by."""
+
+
+class Movement:
+    """How far a policy has come since before the first iteration, and what a lookahead still sees better.
+
+    Args:
+        first: the policy as it was then.
+    """
+
+    def __init__(self, first: Policy) -> None:
+        self.first = first
+        self.moved: float | None = None
+        self.gap_share: float | None = None
+
+    def measure(self, algorithm: PGTS, iteration: Iteration) -> None:
+        """At the states of an iteration that was made just now, by their weights in the update:
+
+        moved = mean of 1/2 sum_a |pi - pi_first|, in [0, 1];   gap_share = mean g_m / mean (max_a q - min_a q)
+        """
+        share_N = iteration.weight_N / iteration.weight_N.sum()
+        observation_N = algorithm.world.observe(iteration.state_N)
+        apart_NA = (algorithm.policy.probs(observation_N) - self.first.probs(observation_N)).abs()
+        self.moved = float(apart_NA.sum(-1).to(share_N.dtype) @ share_N) / 2
+        self.gap_share = None
+        if iteration.look is not None:
+            span = float(span_of(iteration.look.q_BA) @ share_N.to(iteration.look.q_BA.dtype))
+            gap = float(iteration.gap_N @ share_N.to(iteration.gap_N.dtype))
+            self.gap_share = gap / span if 0 < span < math.inf else None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"moved": self.moved, "gap_share": self.gap_share}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave."""
+        self.moved, self.gap_share = state.get("moved"), state.get("gap_share")
+
+
+def span_of(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
+    """max_a q - min_a q, over the actions that are allowed."""
+    least_NA = torch.where(q_NA.isfinite(), q_NA, math.inf)
+    return q_NA.amax(-1) - least_NA.amin(-1)
+
+
+def stuck(
+    movement: Movement,
+    update: Update,
+    *,
+    depth: int,
+    missing_share: float | None,
+    stationary_share: float | None,
+) -> str | None:
+    """That the policy hardly moved though much is missing, and what to change; None where that is not so.
+
+    Args:
+        depth: m, the largest of the run.
+        missing_share: (J* - J) / (max q* - min q*), where the truth is known. Else the gap of the last lookahead says
+            what is missing, as far as the critic is right.
+        stationary_share: the largest exact g_m as such a share, where the truth is known.
+    """
+    if movement.moved is None or movement.moved >= HARDLY:
+        return None
+    share = movement.gap_share if missing_share is None else missing_share
+    if share is None or share <= LARGE:
+        return None
+    told = f"the policy hardly moved: {movement.moved:.1%} of its probability is elsewhere than at the start, and " + (
+        f"a lookahead of depth {depth} still sees better actions" if missing_share is None else "J is far from J*"
+    )
+    if stationary_share is not None and stationary_share <= LARGE * share:
+        return f"{told}. Such a lookahead sees nothing better: set a deeper one, search.depth above {depth}"
+    return f"{told}. Set {_longer_steps(update)}, more total_steps, or a deeper lookahead, search.depth above {depth}"
+
+
+def _longer_steps(update: Update) -> str:
+    if isinstance(update, TabularUpdate):
+        return f"a larger update.step_size than {update.step_size:g}"
+    rate = f"a larger update.learning_rate than {getattr(update, 'learning_rate', 0):g}"
+    return f"{rate}, a smaller update.temperature" if isinstance(update, TargetUpdate) else rate
+
+
+def greedy_is_worse(greedy: Evaluation, drawn: Evaluation) -> str | None:
+    """That episodes of the most probable actions return less than those of drawn ones, beyond both confidence
+    intervals; None where that is not so, or one episode tells nothing."""
+    one, other = greedy.episodic_return, drawn.episodic_return
+    if one.half_width is None or other.half_width is None or one.mean + one.half_width >= other.mean - other.half_width:
+        return None
+    return (
+        "the most probable actions are worse than drawn ones, beyond the confidence intervals: act by drawn actions, "
+        "predict(..., deterministic=False), or train on until they agree"
+    )
