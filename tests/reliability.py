@@ -19,6 +19,8 @@ NAMED = "refused by name, exit code 2"
 DAMAGED = "noticed; the checkpoint before leads to the same bits, with a warning; `--strict-resume` refuses"
 STOPPED = "stops before the policy moves; checkpoints stay, `failure.json`, exit code 1"
 
+UNUSED = "not used: the next model is, or the refusal names what is overridden or the step that contradicts it"
+
 CONTRADICTED = "stops before the policy moves; state, action, both answers named, `failure.json`, exit code 2"
 
 FAULTS: dict[str, dict[str, str]] = {
@@ -45,6 +47,11 @@ FAULTS: dict[str, dict[str, str]] = {
         "no time limit and no horizon": "the guard of the geometric horizon, or of evaluations, ends it",
         "autoreset in the next step": "refused with the mode that works",
         "environment raises an error": "environment, step and seed are named, `failure.json`, exit code 2",
+        "a table of transitions that is not that of step and reset": UNUSED,
+        "copies of an environment that differ, or differ from the instance that was given": "the attribute is named",
+        "a subclass with a state of its own beside the snapshots of its family": "attribute and remedy are named",
+        "get_state or set_state that does not hold what step reads or changes": "refused in the words of `check-model`",
+        "a wrapper that has a step of its own, a memory, or draws": "refused by its name; stateless ones are applied",
         "environment without a model": "the two methods that it lacks are named, exit code 2",
         "environment that contradicts its model": CONTRADICTED,
         "probabilities that are not the environment's": f"off by more than 2 %: {CONTRADICTED}; else a warning",

@@ -25,7 +25,7 @@ from pgts_torch.agent.copies import check_vector_env, env_name, make_vector_env,
 from pgts_torch.agent.world import DynamicsWorld, PlainWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.models.attributes import attributes, changing, different, told
+from pgts_torch.models.attributes import attributes, changing, different, own_to_each, told
 from pgts_torch.models.classic import CLASSIC
 from pgts_torch.models.environments import EnvSource, base_actions
 from pgts_torch.models.fidelity import why_not
@@ -132,8 +132,8 @@ class _Sought:
 
     @cached_property
     def own_to_each(self) -> frozenset[str]:
-        """The attributes in which two new instances differ, as a map that is drawn when it is made."""
-        return frozenset(different(attributes(self.fresh()), attributes(self.fresh())))
+        """The attributes in which new instances differ."""
+        return frozenset(own_to_each(self.fresh))
 
 
 def _first_model(
@@ -252,8 +252,14 @@ def _simulator(sought: _Sought) -> SimulatedWorld:
     if adapter.restored is not None and (why := _own(sought, sought.own_to_each)):
         raise MissingModel(f"{sought.name} cannot be restored: {why}, which is in no snapshot")
     others = itertools.count()
-    actions = base_actions(env)
-    setup = Setup(sought.name, lambda: sought.fresh(next(others)).unwrapped, adapter, actions, sought.random)
+    setup = Setup(
+        sought.name,
+        lambda: sought.fresh(next(others)).unwrapped,
+        adapter,
+        base_actions(env),
+        sought.random,
+        alike=not sought.own_to_each,
+    )
     if why := why_not(setup):
         raise MissingModel(f"{sought.name} cannot serve as a model: {why}")
     model = SimulatorModel(

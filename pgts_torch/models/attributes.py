@@ -28,6 +28,9 @@ _LARGE = 4096
 _MOST_PARTS = 100_000
 """Of one attribute that are compared; an environment may hold a link to half of the program."""
 
+_INSTANCES = 6
+"""That are compared: where two have drawn the same, others have not."""
+
 _EPISODES, _LOOKED_AFTER, _LONGEST, _SECONDS = 3, 5, 200, 0.2
 """How `changing` walks: so many episodes, looking after each of the first steps and at the end, which is after so many
 steps at the latest, and after one step once these seconds are over."""
@@ -72,6 +75,16 @@ def changing(env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Ge
             over = terminated or truncated or taken == _LONGEST or time.monotonic() > until
         before, now = now, attributes(env, **but)
         found |= different(before, now)
+    return found
+
+
+def own_to_each(make: Callable[[], gymnasium.Env]) -> set[str]:
+    """The names of the attributes in which a few new instances differ, as a map that is drawn when one is made."""
+    until, first, found = time.monotonic() + _SECONDS, attributes(make()), set[str]()
+    for k in range(_INSTANCES - 1):
+        if k and time.monotonic() > until:
+            break
+        found |= different(first, attributes(make()))
     return found
 
 

@@ -13,7 +13,7 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch.errors import PgtsError, text_of
-from pgts_torch.models.attributes import changing
+from pgts_torch.models.attributes import changing, own_to_each
 from pgts_torch.models.environments import EnvSource, all_actions, make_env, sampled_actions
 from pgts_torch.models.snapshots import adapter_for, env_name, generator_state, methods_for
 from pgts_torch.models.walks import Setup, Walk, again, live, replays, walks_of
@@ -27,6 +27,9 @@ _ACTIONS_TRIED, _TIMED_CALLS = 8, 200
 _SHORT_WALKS, _SHORT_LENGTH, _LONG_LENGTH, _STEPS_IN_ALL, _TIMED_STEPS = 4, 20, 300, 20, 3
 """Of the short form: some walks for what shows at once, and one to the end of an episode; so many times its length are
 the steps of all. A few steps are timed first."""
+
+_WALKS_APART = 12
+"""In as many instances, where each has something of its own: two may have drawn the same."""
 
 _LEVELS, _WIDTH = 3, 8
 """The search that is run beside a real environment: so many levels, and states of a level."""
@@ -135,7 +138,8 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
     outer = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if continuous else all_actions(space)
     actions = [*map(transforms_of(first).action, outer)]
     random = numpy_stream(seed, "check_model")
-    setup = Setup(env_name(first), lambda: make_env(env).unwrapped, adapter_for(first), actions, random)
+    alike = not own_to_each(lambda: make_env(env))
+    setup = Setup(env_name(first), lambda: make_env(env).unwrapped, adapter_for(first), actions, random, alike=alike)
     try:
         walks = walks_of(setup, continuations, length)
     except BaseException as error:
@@ -170,7 +174,8 @@ def why_not(setup: Setup, *, seconds: float = 0.4) -> str:
         few = setup.actions[: max(2, min(longest, _ACTIONS_TRIED))]
         short = replace(setup, longest=longest, actions=few)
         _nothing_beside(setup)
-        for count, length in ((_SHORT_WALKS, min(longest, _SHORT_LENGTH)), (1, longest)):
+        many = _SHORT_WALKS if setup.alike else _WALKS_APART
+        for count, length in ((many, min(longest, _SHORT_LENGTH)), (1, longest)):
             walks = walks_of(short, count, length)
             _chance(short, walks)
             _restore(walks, replays(short, walks))

@@ -78,24 +78,25 @@ def _published(env: gymnasium.Env, gamma: float, transforms: Transforms, generat
         raise MissingModel(f"the table P of {env_name(env)} is not used: it lacks what a fickle passenger draws")
     start = getattr(base, _STARTS, None)
     try:
-        if len(base.P[0]) != base.action_space.n:
-            raise MissingModel(
-                f"the table P of {env_name(env)} is not used: it has {len(base.P[0])} actions, and its space is "
-                f"{base.action_space}"
-            )
         if start is None:
             start = counted_starts(env, len(base.P), generator)
-        if transforms.actions or transforms.rewards:
-            positions = [_position(base, action) for action in base_actions(env)]
-            P: Any = {
-                s: [
-                    [(p, child, float(transforms.reward(reward)), end) for p, child, reward, end in base.P[s][a]]
-                    for a in positions
-                ]
-                for s in range(len(base.P))
-            }
-            return TabularMDP.from_transitions(P, gamma, start=start)
-        return TabularMDP.from_gymnasium(env, gamma, start=start)
+        mdp = TabularMDP.from_gymnasium(env, gamma, start=start)
+        if mdp.num_actions != base.action_space.n:
+            raise MissingModel(
+                f"the table P of {env_name(env)} is not used: it has {mdp.num_actions} actions, and its space is "
+                f"{base.action_space}"
+            )
+        if not (transforms.actions or transforms.rewards):
+            return mdp
+        positions = [_position(base, action) for action in base_actions(env)]
+        P: Any = {
+            s: [
+                [(p, child, float(transforms.reward(reward)), end) for p, child, reward, end in base.P[s][a]]
+                for a in positions
+            ]
+            for s in range(len(base.P))
+        }
+        return TabularMDP.from_transitions(P, gamma, start=start, shape=mdp.shape)
     except MissingModel:
         raise
     except Exception as error:

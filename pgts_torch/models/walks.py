@@ -18,6 +18,7 @@ class Setup:
 
     make: makes an instance without wrappers.   actions: of the environment inside them.
     longest: the most steps before a continuation begins, or before a state is restored that was met elsewhere.
+    alike: whether new instances are; else each state is restored in one of its own.
     """
 
     name: str
@@ -26,6 +27,7 @@ class Setup:
     actions: Sequence[Any]
     random: np.random.Generator
     longest: int = 50
+    alike: bool = True
 
     def model(self) -> SimulatorModel:
         return SimulatorModel(self.make, gamma=1.0, actions=self.actions, adapter=self.adapter)
@@ -112,12 +114,20 @@ def bits(value: Any) -> bytes:
 def replays(setup: Setup, walks: Sequence[Walk]) -> list[Walk]:
     """Each walk again, in an instance that came to the end of an episode first, and has walked another one just
     before: what a snapshot lacks is then as different as can be."""
+    env, repeated = _at_the_end(setup), list[Walk]()
+    for walk in walks:
+        repeated.append(again(setup, env if setup.alike else _at_the_end(setup), walk))
+    return repeated
+
+
+def _at_the_end(setup: Setup) -> Any:
+    """A new instance in which an episode is over, or long."""
     env = setup.fresh()
     for _ in range(setup.longest):
         _, _, terminated, truncated, _ = env.step(setup.action())
         if terminated or truncated:
             break
-    return [again(setup, env, walk) for walk in walks]
+    return env
 
 
 def live(env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
