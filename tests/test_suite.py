@@ -1,0 +1,51 @@
+"""The suite itself: no process is waited for without end, and no benchmark is forgotten."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def endless_waits(source: str) -> Iterator[str]:
+    """Calls in a test that wait for a process, however long that takes."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            called, limited = ast.unparse(node.func), any(keyword.arg == "timeout" for keyword in node.keywords)
+            runs = called in ("subprocess.run", "subprocess.check_output", "subprocess.check_call")
+            waits = node.func.attr in ("wait", "communicate") and not node.args
+            if (runs or waits) and not limited:
+                yield f"line {node.lineno}: {called}"
+
+
+def test_every_process_that_a_test_waits_for_has_a_time_limit():
+    sources = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")}
+    assert {path.name: waits for path, source in sources.items() if (waits := list(endless_waits(source)))} == {}
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("subprocess.run(['ls'], check=True)", 1),
+        ("subprocess.run(['ls'], timeout=3)", 0),
+        ("process.wait()", 1),
+        ("process.wait(PATIENCE)", 0),
+        ("out = process.communicate()[1]", 1),
+        ("out = process.communicate(timeout=PATIENCE)[1]", 0),
+    ],
+)
+def test_a_wait_without_end_is_found(source, count):
+    assert len(list(endless_waits(source))) == count
+
+
+def test_each_benchmark_runs_in_its_short_form_before_a_release():
+    scripts = [path for path in (ROOT / "benchmarks").glob("*.py") if "__main__" in path.read_text(encoding="utf-8")]
+    long = (ROOT / ".ci" / "long").read_text(encoding="utf-8")
+    part = re.search(r"^benchmarks\(\) \{\n(.*?)^\}", long, re.DOTALL | re.MULTILINE)
+    assert part is not None
+    forgotten = {path.stem for path in scripts} - set(re.findall(r"\w+", part[1])) - {"learning"}  # which starts others
+    assert len(scripts) > 10
+    assert forgotten == set()
