@@ -1,13 +1,15 @@
-"""Randomness without a global state: named streams from one seed, and keys that name a single draw.
+"""Randomness without a global state: named streams from one seed, and keys that name a single draw. What others draw
+from the generators that a whole process shares is made a function of the seed, too (`SharedGenerators`).
 
 A stream is drawn from in order. A key belongs to one thing, for instance to sample 3 of an action in a state, and what
 is drawn for it does not depend on what else is drawn: a batch may be split or reordered.
 """
 
+import pickle
 import random
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, Self, final
 
 import numpy as np
 import torch
@@ -54,6 +56,51 @@ def stream(seed: int, *names: str | int, device: torch.device | str = "cpu") -> 
     return torch.Generator(device).manual_seed(int(state) % 2**63)
 
 
+@final
+class SharedGenerators:
+    """While the context lasts the generators that a process shares, of `random`, `numpy.random` and torch, are those of
+    a stream; afterwards, also after an error, they are as they were.
+
+    drawn: after the context: the modules from whose generators somebody has drawn in it.
+
+    Args:
+        seed, names: the stream, as in `stream`. Without a seed the generators go on from where they are.
+    """
+
+    def __init__(self, seed: int | None = None, *names: str | int) -> None:
+        self._seed, self._names = seed, names
+        self.drawn: tuple[str, ...] = ()
+
+    def __enter__(self) -> Self:
+        self._before = _shared_states()
+        self._begun = self._before
+        if self._seed is not None:
+            words = seed_sequence(self._seed, *self._names, "shared generators").generate_state(3).tolist()
+            random.seed(words[0])
+            np.random.seed(words[1])  # noqa: NPY002
+            torch.default_generator.manual_seed(words[2])
+            self._begun = _shared_states()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        ended = _shared_states()
+        self.drawn = tuple(name for name, state in ended.items() if state != self._begun[name])
+        if ended != self._before:
+            random.setstate(self._before["random"])
+            state: Any = pickle.loads(self._before["numpy.random"])
+            np.random.set_state(state)  # noqa: NPY002
+            torch.set_rng_state(torch.frombuffer(bytearray(self._before["torch"]), dtype=torch.uint8))
+
+
+def _shared_states() -> dict[str, Any]:
+    """By module the state of its shared generator, in values that can be compared."""
+    return {
+        "random": random.getstate(),
+        "numpy.random": pickle.dumps(np.random.get_state(legacy=False)),  # noqa: NPY002
+        "torch": torch.get_rng_state().numpy().tobytes(),
+    }
+
+
 def draw_keys(count: int, *, generator: torch.Generator) -> Int[Tensor, "N"]:
     """Keys, 64 bits each, from a stream."""
     return torch.randint(-(2**63), 2**63 - 1, (count,), generator=generator, device=generator.device)
@@ -85,18 +132,3 @@ def _avalanche(x_N: Tensor) -> Tensor:
 def _shifted(x_N: Tensor, bits: int) -> Tensor:
     """The bits of x moved down, zeros moving in; torch's own shift repeats the sign."""
     return (x_N >> bits) & ((1 << (64 - bits)) - 1)
-
-
-@contextmanager
-def global_generators_kept() -> Iterator[None]:
-    """What is drawn inside from the generators that all programs share is the same each time, and is not noticed
-    outside: their states are put back."""
-    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    random.seed(0)
-    np.random.seed(0)  # noqa: NPY002
-    try:
-        yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        torch.set_rng_state(states[2])

@@ -55,6 +55,7 @@ FAULTS: dict[str, dict[str, str]] = {
         "environment without a model": "the two methods that it lacks are named, exit code 2",
         "environment that contradicts its model": CONTRADICTED,
         "probabilities that are not the environment's": f"off by more than 2 %: {CONTRADICTED}; else a warning",
+        "environment that draws from global generators": "seeded, put back and said; a lookahead refuses such a step",
         "environment that truncates its own episodes": "never stepped past it; the critic's value stands there",
         "environment leaves the process, or raises what cannot be printed": "as any other error of the environment",
         "environment raises an error in close": "a warning",

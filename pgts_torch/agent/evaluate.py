@@ -16,7 +16,7 @@ from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import FixedHorizon, rollout
 from pgts_torch.agent.world import World
 from pgts_torch.errors import check_count
-from pgts_torch.seeding import stream
+from pgts_torch.seeding import SharedGenerators, stream
 
 UNLIMITED_LENGTH = 1000
 """Longest episode where the environment sets no time limit."""
@@ -65,8 +65,9 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
         UserWarning: an environment raised an error in `close`.
     """
     check_count("episodes", episodes)
-    env = algorithm.make_copies(episodes)
     names = ("evaluate", "deterministic" if deterministic else "sampled")
+    with SharedGenerators(seed, *names, "construction"):
+        env = algorithm.make_copies(episodes)
     made = rollout(
         _Watched(algorithm.world, env),
         env,
@@ -87,7 +88,8 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
 
 @final
 class _Watched(World):
-    """Copies in which a policy is only watched: no state is asked for again, so none is told from another.
+    """Copies in which a policy is only watched: no state is asked for again, so none is told from another, and what
+    training says of the environment is not said once more.
 
     Args:
         world: says what the policy sees.
@@ -97,7 +99,7 @@ class _Watched(World):
     def __init__(self, world: World, env: VectorEnv) -> None:
         self.env, self._world = env, world
         self.num_actions, self.observation_space = world.num_actions, world.observation_space
-        self.gamma, self.device = world.gamma, world.device
+        self.gamma, self.device, self.noticed = world.gamma, world.device, True
 
     def encode(self, observation: Any) -> Tensor:
         """As in the world."""

@@ -35,7 +35,7 @@ from pgts_torch.models.snapshots import adapter_for
 from pgts_torch.models.trial import dynamics_contradiction
 from pgts_torch.models.walks import Setup
 from pgts_torch.models.wrappers import check_transforms, transforms_of, wrappers_of
-from pgts_torch.seeding import global_generators_kept, numpy_stream
+from pgts_torch.seeding import SharedGenerators, numpy_stream
 from pgts_torch.tabular.mdp import check_gamma
 
 _NO_MODEL_NEEDED = "; or take depth 0 and the estimator 'sampled', which need no model"
@@ -82,7 +82,7 @@ def make_world(
     discount = DEFAULT_GAMMA if gamma is None else gamma
     check_gamma(discount)
     sought = _Sought(copies, discount, observation_key, action_repeat, torch.device(device))
-    with global_generators_kept():
+    with SharedGenerators(0, "models"):
         world, reasons = _first_model(sought, (_table,) if plain else (_table, _dynamics, _simulator))
     if world is not None:
         return world

@@ -45,7 +45,7 @@ from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Leaf, Lookahead, check_finite
-from pgts_torch.seeding import stream
+from pgts_torch.seeding import SharedGenerators, stream
 from pgts_torch.tabular.mdp import TabularMDP
 
 Callback = Callable[["PGTS", Iteration], bool | None]
@@ -153,17 +153,18 @@ class PGTS:
         self.ranks = present_ranks()
         if num_envs < self.ranks.size > 1 and not isinstance(env, VectorEnv):
             raise PgtsError(f"num_envs is {num_envs}; {self.ranks.size} ranks need at least as many")
-        self.world = make_world(
-            env,
-            num_envs=self.ranks.count(num_envs),
-            gamma=gamma,
-            observation_key=observation_key,
-            plain=isinstance(self.estimator, SampledAdvantages),
-            actions_per_dimension=actions_per_dimension,
-            action_repeat=action_repeat,
-            device=device,
-            **(env_kwargs or {}),
-        )
+        with SharedGenerators(seed, "construction"):
+            self.world = make_world(
+                env,
+                num_envs=self.ranks.count(num_envs),
+                gamma=gamma,
+                observation_key=observation_key,
+                plain=isinstance(self.estimator, SampledAdvantages),
+                actions_per_dimension=actions_per_dimension,
+                action_repeat=action_repeat,
+                device=device,
+                **(env_kwargs or {}),
+            )
         if reward_range is not None:
             self.world.promise(RewardRange.of(reward_range))
         if not isinstance(policy, Policy):

@@ -1,5 +1,6 @@
 """Experience: what a policy does in an environment, or in a model of it."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, final
@@ -16,7 +17,7 @@ from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.world import World
 from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.base import SamplingModel
-from pgts_torch.seeding import draw_keys, seed_sequence
+from pgts_torch.seeding import SharedGenerators, draw_keys, seed_sequence
 
 StateWeight = Literal["occupancy", "visits", "uniform"]
 
@@ -167,7 +168,8 @@ def rollout(
 ) -> Rollout:
     """One episode of each copy of a vector environment, from a fresh reset.
 
-    What happens is a function of (seed, names), the policy and nothing else: the environment is seeded anew.
+    What happens is a function of (seed, names), the policy and nothing else: the environment is seeded anew, and so are
+    for the time being the generators that it may share with the whole process (`SharedGenerators`), which is said.
 
     Args:
         world: says which states the copies are in.
@@ -179,6 +181,30 @@ def rollout(
         PgtsError: an episode outlived `max_length` of the geometric horizon; or the environment raised an error or
             answered with something that is not a number, naming environment, step and seed.
     """
+    if world.draws_its_own:
+        return _episodes(world, env, policy, horizon, seed=seed, names=names, generator=generator)
+    with SharedGenerators(seed, *names) as shared:
+        made = _episodes(world, env, policy, horizon, seed=seed, names=names, generator=generator)
+    if shared.drawn and not world.noticed:
+        world.noticed = True
+        warnings.warn(
+            f"{env_name(env)} draws from the generator of {shared.drawn[0]}, which the whole process shares: it is "
+            "seeded for each iteration and put back afterwards; better draw from self.np_random",
+            stacklevel=3,
+        )
+    return made
+
+
+def _episodes(
+    world: World,
+    env: VectorEnv,
+    policy: Policy,
+    horizon: Horizon,
+    *,
+    seed: int,
+    names: tuple[str | int, ...],
+    generator: torch.Generator,
+) -> Rollout:
     words = seed_sequence(seed, *names, "env").generate_state(env.num_envs)
     try:
         episodes = Episodes(env, gamma=world.gamma, seeds=words.tolist())

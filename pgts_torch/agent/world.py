@@ -4,6 +4,7 @@ A lookahead speaks of states, which are numbers; policies and critics speak of o
 """
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
@@ -18,6 +19,7 @@ from pgts_torch.agent.observations import Observations, states_of
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model, promise
 from pgts_torch.models.classic import ClassicModel
+from pgts_torch.models.environments import draws_its_own
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.tabular import TabularModel
@@ -32,6 +34,7 @@ class World(ABC):
     observation_space: of what a policy sees.
     gamma: discount of a step that names none.
     device: where observations and states live.
+    noticed: whether it has been said that the environment draws from the generators of the whole process.
     model: what a lookahead may ask; None: nothing.
     mdp: the exact truth, where there is one.
     start_S: the start distribution mu over all states; None where it is known from episodes only.
@@ -43,6 +46,7 @@ class World(ABC):
     observation_space: spaces.Space[Any]
     gamma: float
     device: torch.device
+    noticed: bool = False
     model: Model | None = None
     mdp: TabularMDP | None = None
     start_S: Float[Tensor, "S"] | None = None
@@ -66,6 +70,12 @@ class World(ABC):
         self.reward_range = reward_range
         if self.model is not None:
             promise(self.model, reward_range, gamma=self.gamma)
+
+    @cached_property
+    def draws_its_own(self) -> bool:
+        """Whether the copies are known to draw from no generators but their own."""
+        each = self.env.envs if isinstance(self.env, SyncVectorEnv) else [self.env]
+        return all(map(draws_its_own, each))
 
     @abstractmethod
     def encode(self, observation: Any) -> Tensor:

@@ -216,3 +216,15 @@ def drawn_actions(env: gymnasium.Env, seed: int) -> list[Any]:
     """Some actions of an instance that nobody else needs."""
     env.action_space.seed(seed)
     return [env.action_space.sample() for _ in range(_ACTIONS_DRAWN)]
+
+
+_OWN_GENERATORS = ("gymnasium.envs.toy_text.", "gymnasium.envs.classic_control.", "pgts_torch.envs.")
+_WITHOUT_GENERATORS = ("gymnasium.wrappers.common", "pgts_torch.agent.copies")
+
+
+def draws_its_own(env: Any) -> bool:
+    """Whether an environment is known to draw from generators of its own alone, and never from those of a process."""
+    around, base = wrappers_of(env), env.unwrapped
+    known = all(type(wrapper).__module__ in _WITHOUT_GENERATORS for wrapper in around)
+    changed = any({"step", "reset"} & vars(each).keys() for each in (*around, base))
+    return known and not changed and type(base).__module__.startswith(_OWN_GENERATORS)

@@ -18,7 +18,7 @@ from pgts_torch.models.environments import EnvSource, all_actions, make_env, sam
 from pgts_torch.models.snapshots import adapter_for, env_name, generator_state, methods_for
 from pgts_torch.models.walks import Setup, Walk, again, live, replays, walks_of
 from pgts_torch.models.wrappers import transforms_of
-from pgts_torch.seeding import draw_keys, numpy_stream, stream
+from pgts_torch.seeding import SharedGenerators, draw_keys, numpy_stream, stream
 
 _CONTINUOUS_ACTIONS = 8
 """How many actions of a continuous space are tried."""
@@ -276,10 +276,10 @@ def _chance(setup: Setup, walks: Sequence[Walk]) -> str:
             raise _Missing(
                 "get_state returns the generator too, and a search would foresee what will be drawn: leave it out"
             )
-        before = _global_generators()
-        differ += again(setup, env, replace(walk, key=setup.number())).seen != walk.seen
-        if moved := [name for name, state in _global_generators().items() if state != before[name]]:
-            raise _Missing(f"step draws from the global generator of {moved[0]}: draw from self.np_random only")
+        with SharedGenerators() as shared:
+            differ += again(setup, env, replace(walk, key=setup.number())).seen != walk.seen
+        if shared.drawn:
+            raise _Missing(f"step draws from the global generator of {shared.drawn[0]}: draw from self.np_random only")
     return f"of the key alone; {differ} of {len(walks)} continuations differ under another key"
 
 
@@ -310,17 +310,6 @@ def _stable_key(setup: Setup, env: Any) -> bytes | None:
     """The key of a snapshot; None if another one, taken at once, has another."""
     key = setup.adapter.get_state(env).key
     return key if setup.adapter.get_state(env).key == key else None
-
-
-def _global_generators() -> dict[str, str]:
-    """The states of the generators that all programs share."""
-    numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
-    states = {
-        "random": random.getstate(),
-        "numpy": (numpy_state["state"]["key"].tobytes(), numpy_state["state"]["pos"]),
-        "torch": torch.get_rng_state().tolist(),
-    }
-    return {name: repr(state) for name, state in states.items()}
 
 
 def _untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:

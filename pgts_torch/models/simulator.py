@@ -2,9 +2,9 @@
 
 import itertools
 import math
-import sys
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, final
 
 import gymnasium
@@ -15,7 +15,8 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import PgtsError, RandomOutcomes, failure
+from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, failure
+from pgts_torch.models.answers import Answers, Step, copied
 from pgts_torch.models.base import (
     DENIED,
     DRAWN,
@@ -27,31 +28,14 @@ from pgts_torch.models.base import (
     Transitions,
     step_text,
 )
-from pgts_torch.models.environments import EnvSource, all_actions, check_step, make_env
+from pgts_torch.models.environments import EnvSource, all_actions, check_step, draws_its_own, make_env
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, env_name, generator_state
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
 from pgts_torch.models.wrappers import transforms_of
+from pgts_torch.seeding import SharedGenerators
 
 _KEY_OF_CERTAINTY = 0
 """Outcomes that are listed draw nothing; this is what they would draw from."""
-
-_MOST_BYTES = 2**28
-"""`clear` forgets what the simulator has answered once it takes more memory than this, roughly."""
-
-_BYTES_OF_AN_ANSWER = 500
-"""What an answer takes beside the state that it led to and what that shows."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """What an action gave. shown: what `observe` made of the observation. random: it may give something else under
-    another key."""
-
-    reward: float
-    discount: float
-    child: Snapshot
-    shown: Any
-    random: bool
 
 
 @final
@@ -128,9 +112,9 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         except BaseException as error:
             raise failure(f"{self.name} failed in reset with seed 0", error) from error
         self._show = self.adapter.blindfold(self.env)
+        self._draws_its_own = draws_its_own(made)
         self._names_discounts = names_discounts(self.env)
-        self._sure: dict[tuple[bytes, int, int], _Step] = {}
-        self._sure_bytes = 0
+        self._sure = Answers()
         self.generation = -1
         self.clear()
 
@@ -141,8 +125,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         self._snapshots: list[Snapshot] = []
         self._observations: list[Any] = []
         self._number: dict[tuple[bytes, bool], int] = {}
-        if self._sure_bytes > _MOST_BYTES:
-            self._sure, self._sure_bytes = {}, 0
+        self._sure.bound()
         self._known_worlds: list[Any] = []
 
     def root(self, env: gymnasium.Env, observation: Any = None) -> int:
@@ -179,7 +162,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
 
     def _see(self, number: int, observation: Any) -> None:
         shown = self._observe(observation) if self._observe else observation
-        self._observations[number] = _copied(shown)  # an environment may write into what it has shown
+        self._observations[number] = copied(shown)  # an environment may write into what it has shown
 
     def _known(self, snapshot: Snapshot, shown: Any) -> int:
         """The number of a state that shows this."""
@@ -238,14 +221,15 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             PgtsError: the environment fails, see `sample`.
         """
         steps = []
-        for state, action in itertools.product(state_N.tolist(), range(self.num_actions)):
-            step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=self.action_repeat)
-            if step.random:
-                raise RandomOutcomes(
-                    f"{self.name} is random in state {state} under action {action}: its outcomes cannot be listed; "
-                    "search it by `sampled`, or make a TabularModel of it if it has a table P"
-                )
-            steps.append(step)
+        with self._watched():
+            for state, action in itertools.product(state_N.tolist(), range(self.num_actions)):
+                step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=self.action_repeat)
+                if step.random:
+                    raise RandomOutcomes(
+                        f"{self.name} is random in state {state} under action {action}: its outcomes cannot be listed; "
+                        "search it by `sampled`, or make a TabularModel of it if it has a table P"
+                    )
+                steps.append(step)
         reward_N, discount_N, child_N = self._answer(steps)
         shape = len(state_N), self.num_actions
         return Outcomes(
@@ -264,15 +248,36 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
                 that is not finite or does not fit its space: naming environment, state, action and key.
         """
         asked = zip(state_N.tolist(), action_N.tolist(), key_N.tolist(), strict=True)
-        return Transitions(*self._answer([self._step(*one, repeat=self.action_repeat) for one in asked]))
+        with self._watched():
+            return Transitions(*self._answer([self._step(*one, repeat=self.action_repeat) for one in asked]))
 
     def is_random(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Whether chance decides what follows each (state, action). The simulator is asked; raises as `sample`."""
-        asked = zip(state_N.tolist(), action_N.tolist(), strict=True)
-        random = [self._step(*pair, _KEY_OF_CERTAINTY, repeat=self.action_repeat).random for pair in asked]
+        random = []
+        for pair in zip(state_N.tolist(), action_N.tolist(), strict=True):
+            with SharedGenerators() as shared:
+                step = self._step(*pair, _KEY_OF_CERTAINTY, repeat=self.action_repeat)
+            if shared.drawn:
+                self._sure.forget()
+            random.append(step.random or bool(shared.drawn))
         return torch.tensor(random, dtype=torch.bool, device=self.device)
 
-    def _answer(self, steps: Sequence[_Step]) -> tuple[Tensor, Tensor, Tensor]:
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        """MissingModel where a step in this context has drawn from a generator that the whole process shares."""
+        if self._draws_its_own:
+            yield
+            return
+        with SharedGenerators() as shared:
+            yield
+        if shared.drawn:
+            self._sure.forget()
+            raise MissingModel(
+                f"{self.name} cannot be a model: step draws from the global generator of {shared.drawn[0]}: draw from "
+                "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
+            )
+
+    def _answer(self, steps: Sequence[Step]) -> tuple[Tensor, Tensor, Tensor]:
         """Rewards, discounts and children."""
         return (
             torch.tensor([step.reward for step in steps], dtype=self.dtype, device=self.device),
@@ -285,7 +290,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         `ask_N` says so by a step of the simulator."""
         columns = [column_N.tolist() for column_N in vars(happened).values()]
         ask = itertools.repeat(True) if ask_N is None else ask_N.tolist()
-        return np.array([self._hold(*one) for one in zip(*columns, ask, strict=False)], dtype=np.int64)
+        with self._watched():
+            return np.array([self._hold(*one) for one in zip(*columns, ask, strict=False)], dtype=np.int64)
 
     def _hold(
         self, state: int, action: int, reward: float, discount: float, next_state: int, follows: bool, ask: bool
@@ -299,7 +305,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
                 return DRAWN
         if step.reward != reward or step.discount != discount or (step.child.cut and follows):
             return DENIED
-        return 0 if discount == 0 or step.child.key == self._snapshots[next_state].key else DENIED
+        return 0 if discount == 0 or self.adapter.same_state(step.child, self._snapshots[next_state]) else DENIED
 
     def shown(self, state: int) -> str:
         """What the environment shows there, or else its snapshot."""
@@ -313,16 +319,16 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         then = self.shown(self._number[step.child.name]) + step.child.cut * ", where the episode is truncated"
         return step_text(step.reward, step.discount, then)
 
-    def _step(self, state: int, action: int, key: int, *, repeat: int) -> _Step:
+    def _step(self, state: int, action: int, key: int, *, repeat: int) -> Step:
         """What follows an action that is taken so many times; from memory where it is sure."""
         self._check("state", state, self.num_states)
         self._check("action", action, self.num_actions)
         at = self._snapshots[state]
         if at.cut:
-            return _Step(-math.inf if action else 0.0, 1.0, at, self._observations[state], random=False)
+            return Step(-math.inf if action else 0.0, 1.0, at, self._observations[state], random=False)
         asked = at.key, action, repeat
-        if asked in self._sure:
-            step = self._sure[asked]
+        if (known := self._sure.get(asked)) is not None:
+            step = known
             self._known(step.child, step.shown)  # now, so that numbers do not depend on what is remembered
             return step
         taken = self.actions[action]
@@ -343,11 +349,9 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         except BaseException as error:
             where = f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}"
             raise failure(where, error) from error
-        step = _Step(total, discount, self._snapshots[child], self._observations[child], random)
+        step = Step(total, discount, self._snapshots[child], self._observations[child], random)
         if not random:
-            self._sure[asked] = step
-            self._sure_bytes += _BYTES_OF_AN_ANSWER + len(step.child.key) + sys.getsizeof(step.child.data)
-            self._sure_bytes += _bytes_of(step.shown)
+            self._sure.add(asked, step)
         return step
 
     def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, float, bool, bool]:
@@ -383,19 +387,3 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
     def _check(self, what: str, number: int, count: int) -> None:
         if not 0 <= number < count:
             raise PgtsError(f"{self.name}: {what} {number} does not exist; there are {count}, from 0 on")
-
-
-def _copied(shown: Any) -> Any:
-    """The same, in arrays and lists that nobody else holds."""
-    if isinstance(shown, dict):
-        return {name: _copied(part) for name, part in shown.items()}
-    if isinstance(shown, tuple):
-        return tuple(map(_copied, shown))
-    return shown.copy() if isinstance(shown, np.ndarray | list) else shown
-
-
-def _bytes_of(shown: Any) -> int:
-    """The bytes of the arrays in what was shown."""
-    if isinstance(shown, dict | tuple):
-        return sum(map(_bytes_of, shown.values() if isinstance(shown, dict) else shown))
-    return np.asarray(shown).nbytes

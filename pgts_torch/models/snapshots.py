@@ -73,6 +73,10 @@ class SnapshotAdapter(ABC):
     def set_state(self, env: Any, data: Any) -> None:
         """Give `env` the state whose `Snapshot.data` this is."""
 
+    def same_state(self, one: Snapshot, other: Snapshot) -> bool:
+        """Whether two snapshots are of one state, also where their keys differ."""
+        return one.key == other.key
+
     def seed(self, env: Any, key: int) -> None:
         """Whatever `env` draws from here on is a function of the 64 bits of `key`; its state stays as it is."""
         reseed(env, key)
@@ -148,6 +152,36 @@ class OwnState(SnapshotAdapter):
     def set_state(self, env: Any, data: Any) -> None:
         is_bytes, content = data
         env.set_state(content if is_bytes else pickle.loads(content)[0])
+
+    def same_state(self, one: Snapshot, other: Snapshot) -> bool:
+        """Pickles of one state may differ, as where a number is of Python here and of numpy there, or an object is met
+        twice; so what they hold is compared."""
+        contents = [_content(snapshot.data[1]) for snapshot in (one, other)]
+        return one.key == other.key or (None not in contents and _same(*contents))
+
+
+def _content(pickled: bytes) -> tuple[Any] | None:
+    """What is in a pickle; None where bytes are none."""
+    try:
+        return (pickle.loads(pickled),) if pickled.startswith(b"\x80") else None
+    except Exception:  # bytes of somebody's own making, that begin like a pickle
+        return None
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values hold the same, however numbers are typed."""
+    if isinstance(one, np.ndarray | np.generic) or isinstance(other, np.ndarray | np.generic):
+        first, second = np.asarray(one), np.asarray(other)
+        if first.dtype.hasobject or second.dtype.hasobject:
+            return first.shape == second.shape and all(map(_same, first.ravel(), second.ravel()))
+        return first.shape == second.shape and bool(((first == second) | ((first != first) & (second != second))).all())
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_same(one[name], other[name]) for name in one)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if type(one) is type(other) and type(one).__eq__ is object.__eq__ and hasattr(one, "__dict__"):
+        return _same(vars(one), vars(other))
+    return bool(one == other) or (one != one and other != other)
 
 
 @final

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from torch import Tensor
 
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.models import SimulatorModel, TabularModel, simulator
+from pgts_torch.models import SimulatorModel, TabularModel
 from pgts_torch.models.environments import all_actions, grid_actions, make_env, sampled_actions
 from pgts_torch.models.snapshots import generator_state
 from pgts_torch.search import Topology, expectimax, sampled
@@ -152,7 +152,7 @@ def test_a_search_asks_the_simulator_once_for_each_state_and_action():
 
 @pytest.mark.parametrize(("most_bytes", "asked_again"), [(10**9, False), (0, True)])
 def test_answers_outlive_the_numbers_of_states_unless_they_take_much_memory(most_bytes, asked_again, monkeypatch):
-    monkeypatch.setattr(simulator, "_MOST_BYTES", most_bytes)
+    monkeypatch.setattr("pgts_torch.models.answers._MOST_BYTES", most_bytes)
     model, answers, steps = SimulatorModel("CliffWalking-v1", gamma=0.9), [], []
     for state in (0, 36, 36):  # the second search leads to states that the first one has numbered otherwise
         model.clear()
@@ -179,7 +179,7 @@ class Panorama(Corridor):
 
 
 def test_what_states_show_counts_as_memory(monkeypatch):
-    monkeypatch.setattr(simulator, "_MOST_BYTES", 2**20)
+    monkeypatch.setattr("pgts_torch.models.answers._MOST_BYTES", 2**20)
     for make, asked_again in ((lambda: Corridor(slip=0.0), False), (Panorama, True)):
         model = SimulatorModel(make, gamma=0.9)
         for _ in range(2):
