@@ -222,9 +222,9 @@ def test_a_step_beyond_a_truncation_that_the_simulator_makes_is_a_contradiction(
             return observation, reward, terminated, self.position >= self.limit, info
 
     model = PGTS(Short, depth=1, policy="mlp", **SMALL)
-    model.learn(80)
+    model.iterate()
     for env in real(model):
-        env.limit = 99
+        env.limit, env.begin = 99, 2
     with pytest.raises(
         ModelMismatch, match=r"and the episode went on; the simulator says .* where the episode is trunc"
     ):

@@ -94,20 +94,27 @@ def test_an_environment_that_draws_its_own_is_not_accused():
 @pytest.mark.parametrize("module", DRAWS)
 def test_a_step_that_draws_from_a_global_generator_is_no_model(module):
     before = states()
-    said = f"step draws from the global generator of {module}: draw from self.np_random"
-    refused = pytest.raises(MissingModel, match=said)
-    with refused, pytest.warns(UserWarning, match="draws from the generator of"):
-        PGTS(lambda: Windy(module), depth=1, **SMALL).learn(60)
+    with pytest.raises(
+        MissingModel, match=f"step draws from the global generator of {module}: draw from self.np_random"
+    ):
+        PGTS(lambda: Windy(module), depth=1, **SMALL)
     assert states() == before
-    model, env = SimulatorModel(lambda: Windy(module), gamma=0.9), Windy(module)
+
+
+@pytest.mark.parametrize("module", DRAWS)
+def test_a_simulator_notices_later_too_that_a_step_draws_from_a_global_generator(module):
+    model, env = SimulatorModel(lambda: Windy(module, "later"), gamma=0.9), Windy(module, "later")
     env.reset(seed=0)
-    state_N, action_N = torch.tensor([model.root(env)] * 2), torch.tensor([0, 0])
+    state_N, action_N = torch.tensor([model.root(env)] * 2), torch.tensor([0, 1])
+    assert model.is_random(state_N, action_N).tolist() == [False, False]
+    model.clear()
+    model.env.where = "step"
+    env.position = 7.0
+    state_N, before = torch.tensor([model.root(env)] * 2), states()
+    with pytest.raises(MissingModel, match=f"step draws from the global generator of {module}"):
+        model.sample(state_N, action_N, key_N=action_N)
     assert model.is_random(state_N, action_N).tolist() == [True, True]
-
-
-def test_a_reset_that_does_is_one():
-    with pytest.warns(UserWarning, match="draws from the generator of"):
-        PGTS(lambda: Windy("random", "reset"), depth=1, **SMALL).learn(60)
+    assert states() == before
 
 
 def test_an_error_leaves_the_users_generators_as_they_were():
