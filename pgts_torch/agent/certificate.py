@@ -151,16 +151,21 @@ class Certificates:
         state_N, share_N, v_N = starts
         if self._search.topology is None or v_N is None:
             return Bound(math.inf, math.inf)
-        upper_N = self._together(lambda upper: upper.at(state_N), expansions)
+
+        def tightened(upper: UpperBound) -> Tensor:
+            upper.tighten(expansions)
+            return upper.at(state_N)
+
+        upper_N = self._together(tightened)
         if self._world.start_S is not None:
             certificate = self._over_all(share_N, upper_N, v_N)
             return Bound(certificate, certificate)
         estimate = float(share_N @ (upper_N - v_N).abs())
         span = self._search.model.highest_value - self._search.model.lowest_value
         width = self.width(experience.num_episodes, number)
-        if not (complete and width < span):
+        if not (complete and estimate + width < span):  # T^n w is no smaller than v_hat
             return Bound(math.inf, estimate)
-        swept_N = self._together(lambda upper: upper.swept(state_N, expansions), expansions)
+        swept_N = self._together(lambda upper: upper.swept(state_N, expansions))
         certificate = float(share_N @ (swept_N - v_N).abs()) + width
         return Bound(certificate if certificate < span else math.inf, estimate)
 
@@ -202,15 +207,10 @@ class Certificates:
         if state:
             self._own().load_state_dict(state)
 
-    def _together(self, read: Callable[[UpperBound], Tensor], expansions: int) -> Float[Tensor, "N"]:
-        """The smallest of what is read from the bounds of all ranks, after some sweeps."""
-
-        def tightened() -> Tensor:
-            upper = self._own()
-            upper.tighten(expansions)
-            return read(upper).cpu()
-
-        return torch.stack(self._ranks.gather("certificate", tightened)).amin(0).to(self._world.device)
+    def _together(self, read: Callable[[UpperBound], Tensor]) -> Float[Tensor, "N"]:
+        """The smallest of what is read from the bounds of all ranks."""
+        each = self._ranks.gather("certificate", lambda: read(self._own()).cpu())
+        return torch.stack(each).amin(0).to(self._world.device)
 
     def _own(self) -> UpperBound:
         """The bound over what this rank has asked; anew where states are numbered anew."""

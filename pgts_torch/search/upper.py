@@ -69,10 +69,14 @@ class UpperBound:
         With as many sweeps as a lookahead of full width has levels, the bound at its roots is no larger than T^n w.
         """
         if self.w < math.inf:
+            before = self._taken
             self._take_in()
             if not self._settled and len(self._state_X):
                 entries = len(self._reward) * self._num_outcomes
-                self._sweep(max(least, min(_MOST_SWEEPS, _WORK // entries)))
+                times = max(least, min(_MOST_SWEEPS, _WORK // entries))
+                # Where X has just grown, and no longer fits the budget, nothing is gained by beginning from below.
+                both = self._beta < UNDISCOUNTED and (self._taken == before or times * entries <= _WORK)
+                self._sweep(times, both=both)
 
     def at(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         """The bound; w at states that no search has expanded."""
@@ -125,35 +129,37 @@ class UpperBound:
         if self._beta < UNDISCOUNTED and len(reward):
             self._below_S[self._state_X] = min(0.0, float(reward.min())) / (1 - self._beta)
 
-    def _sweep(self, times: int) -> None:
-        """So many sweeps of both, or until they have converged."""
-        u_S2 = torch.stack([self._bound_S, self._below_S], -1)
-        old_X2, error = u_S2[self._state_X], 0.0
-        for n in range(times):
-            new_X2 = self._backed_up(u_S2)
+    def _sweep(self, times: int, *, both: bool) -> None:
+        """So many sweeps of both, or of the one from above, or until they have converged."""
+        u_SC = torch.stack([self._bound_S, self._below_S] if both else [self._bound_S], -1)
+        old_XC = u_SC[self._state_X]
+        for n in range(1, times + 1):
+            new_XC = self._backed_up(u_SC)
             # From above a sweep never rises, but for rounding.
-            new_X2[:, 0] = torch.minimum(new_X2[:, 0], old_X2[:, 0])
-            u_S2[self._state_X] = new_X2
-            if (n + 1) % _EVERY == 0 or n == times - 1:
-                size = self._largest_reward + float(u_S2.abs().max())
-                fall, rise = (old_X2[:, 0] - new_X2[:, 0]).max(), (new_X2[:, 1] - old_X2[:, 1]).max()
-                self._settled = float(fall) <= _CONVERGED * size
-                error = self._rounding * size
-                delta = max(0.0, float(rise)) + 2 * error
-                if self._beta < UNDISCOUNTED:
-                    above_X = new_X2[:, 1] + error + self._beta * delta / (1 - self._beta)
-                    self._settled = self._settled or float(rise) <= _CONVERGED * size
+            new_XC[:, 0] = torch.minimum(new_XC[:, 0], old_XC[:, 0])
+            u_SC[self._state_X] = new_XC
+            if n % _EVERY == 0 or n == times:
+                change_C, size = (new_XC - old_XC).amax(0).tolist(), self._largest_reward + float(u_SC.abs().max())
+                fall = float((old_XC[:, 0] - new_XC[:, 0]).max())
+                self._settled = min([fall, *change_C[1:]]) <= _CONVERGED * size
                 if self._settled:
                     break
-            old_X2 = new_X2
-        self._bound_S, self._below_S = u_S2.unbind(-1)
-        if self._beta < UNDISCOUNTED:
-            self._bound_S[self._state_X] = torch.minimum(new_X2[:, 0], above_X)
+            old_XC = new_XC
+        self._bound_S = u_SC[:, 0]
+        if both:
+            self._below_S = u_SC[:, 1]
+            error = self._rounding * size
+            delta = max(0.0, change_C[1]) + 2 * error
+            above_X = new_XC[:, 1] + error + self._beta * delta / (1 - self._beta)
+            self._bound_S[self._state_X] = torch.minimum(new_XC[:, 0], above_X)
 
     def _backed_up(self, u_SC: Float[Tensor, "S C"]) -> Float[Tensor, "X C"]:
         """T u on X, for each of C functions; the first rounded up."""
-        q_XAC = torch.addmm(self._reward, self._weight, u_SC).view(len(self._state_X), -1, u_SC.shape[1])
-        new_XC = q_XAC.amax(1)
+        if u_SC.shape[1] == 1:  # a vector is half as fast again as a matrix of one column
+            q = torch.addmv(self._reward[:, 0], self._weight, u_SC[:, 0])
+        else:
+            q = torch.addmm(self._reward, self._weight, u_SC)
+        new_XC = q.view(len(self._state_X), -1, u_SC.shape[1]).amax(1)
         new_XC[:, 0] += self._rounding * (self._largest_reward + u_SC[:, 0].abs().max())
         return new_XC
 
