@@ -42,8 +42,9 @@ def case(kind: str, chance: str, mdps: int) -> tuple[TabularMDP, torch.Tensor]:
     return mdp, exact.policy_values(mdp, torch.from_numpy(random.dirichlet(np.ones(ACTIONS), size=S)))
 
 
-def covered(kind: str, chance: str, depth: int, samples: int, mdps: int) -> tuple[float, float]:
-    """The share of all q of all MDPs that lie in their interval, and its mean width in units of the range of values."""
+def covered(kind: str, chance: str, depth: int, samples: int, mdps: int) -> tuple[float, float, float]:
+    """Which share of all q of all MDPs lies in its interval, their mean width in units of the range of values, and
+    which share lies within 1.96 standard errors."""
     mdp, v_S = case(kind, chance, mdps)
     model = TabularModel(mdp)
     if kind == "prizes":
@@ -54,21 +55,28 @@ def covered(kind: str, chance: str, depth: int, samples: int, mdps: int) -> tupl
     low, high = look.interval()
     # Where all samples are the truth itself it is missed by rounding only.
     held_SA = (low <= truth_SA + 1e-12) & (truth_SA <= high + 1e-12)
-    return float(held_SA.double().mean()), float((high - low).mean() / (model.highest_value - model.lowest_value))
+    normal_SA = (look.q_BA - truth_SA).abs() <= 1.96 * look.stderr_BA + 1e-12
+    width = (high - low).mean() / (model.highest_value - model.lowest_value)
+    return float(held_SA.double().mean()), float(width), float(normal_SA.double().mean())
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer MDPs")
     mdps = 20 if parser.parse_args().quick else 400
-    print(f"{mdps} MDPs of each kind; how often the 95 % interval holds T^m Q, and (its mean width / range of values)")
-    print(f"{'leaves':<10}{'chance':<8}{'C':>3}" + "".join(f"{f'm = {depth}':>16}" for depth in DEPTHS))
+    print(f"{mdps} MDPs of each kind; how often the 95 % interval holds T^m Q, and (its mean width / range of values);")
+    print("1.96 stderr: how often q -+ 1.96 stderr does at m = 0")
+    print(
+        f"{'leaves':<10}{'chance':<8}{'C':>3}"
+        + "".join(f"{f'm = {depth}':>16}" for depth in DEPTHS)
+        + f"{'1.96 stderr':>13}"
+    )
     for kind in ("values", "prizes"):
         for chance in UNLIKELY:
             for samples in SAMPLES:
                 cells = [covered(kind, chance, depth, samples, mdps) for depth in DEPTHS]
-                shown = "".join(f"{f'{held:.1%} ({width:.2f})':>16}" for held, width in cells)
-                print(f"{kind:<10}{chance:<8}{samples:>3}{shown}", flush=True)
+                shown = "".join(f"{f'{held:.1%} ({width:.2f})':>16}" for held, width, _ in cells)
+                print(f"{kind:<10}{chance:<8}{samples:>3}{shown}{cells[0][2]:>13.1%}", flush=True)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.critics import Critic, ExactCritic
+from pgts_torch.agent.policies import fitting
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import World
@@ -199,13 +200,21 @@ class Certificates:
         Args:
             with_states: whether states keep their numbers; else nothing outlives an iteration.
         """
-        return {} if self._upper is None or not with_states else self._upper.state_dict()
+        is_known = self._upper is not None and self._upper.w < math.inf
+        return self._upper.state_dict() if self._upper is not None and is_known and with_states else {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` gave; the search has taken over what it asked about."""
         self._upper = None
         if state:
-            self._own().load_state_dict(state)
+            assert self._search.topology is not None
+            each = torch.empty(len(self._search.topology.asked), dtype=torch.float64)
+            values = {name: fitting(state, name, each) for name in ("bound", "below")}
+            if not all(bool(value.isfinite().all()) for value in values.values()):
+                raise PgtsError("the upper bounds of a saved search are not finite")
+            self._own().load_state_dict(
+                {**values, **{name: state.get(name) is True for name in ("settled", "current")}}
+            )
 
     def _together(self, read: Callable[[UpperBound], Tensor]) -> Float[Tensor, "N"]:
         """The smallest of what is read from the bounds of all ranks."""
