@@ -34,7 +34,13 @@ GAMMA, STEP_SIZE = 0.99, 10.0
 DEPTHS = (0, 4, 8, 16, 32, 48)
 UPDATES = {
     "pgts": {"type": "softmax", "step_size": STEP_SIZE, "state_weight": "occupancy"},
-    "h-pmd": {"type": "mirror", "step_size": STEP_SIZE, "state_weight": "uniform"},
+    "h-pmd": {
+        "type": "mirror",
+        "step_size": STEP_SIZE,
+        "state_weight": "uniform",
+        "normalize": "none",
+        "floor": None,
+    },
 }
 METHODS = ("ppo", "a2c", *(f"pgts-{m}" for m in DEPTHS), "h-pmd-16", "pgts-adaptive")
 NAMES = {"ppo": "PPO", "a2c": "A2C", "pgts-0": "policy gradient, m = 0", "pgts-adaptive": "PGTS, adaptive m"}
@@ -64,7 +70,13 @@ def tree_search_run(method: str, size: int, seed: int) -> Record:
         num_envs=BATCH,
         gamma=GAMMA,
         seed=seed,
-        critic={"type": "tabular", "target": "v", "method": {"type": "td_lambda", "lambda": 0.9}, "step_size": 0.5},
+        critic={
+            "type": "tabular",
+            "target": "v",
+            "method": {"type": "td_lambda", "lambda": 0.9},
+            "step_size": 0.5,
+            "initial": 0.0,
+        },
         update=UPDATES[family],
         horizon={"type": "fixed", "length": size},
         env_kwargs={"n": size, "start": 0, "mapping_seed": seed},

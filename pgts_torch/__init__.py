@@ -51,6 +51,9 @@ def _register_environments() -> None:
         ("Random", "random_mdp", 100),
         ("Grid", "grid", 200),
         ("DeepSea", "deep_sea", None),
+        ("CombinationLock", "combination_lock", 100),
+        ("RiverSwim", "river_swim", 200),
+        ("Corridor", "corridor", 200),
     ]:
         # Registering an id twice makes Gymnasium warn, and a reload of this module is no mistake of the user.
         if f"pgts/{name}-v0" not in gymnasium.registry:

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -11,7 +12,17 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.seeding import numpy_stream
-from pgts_torch.tabular import TabularMDP, deep_sea, grid, ladder, random_mdp, tightrope
+from pgts_torch.tabular import (
+    TabularMDP,
+    combination_lock,
+    corridor,
+    deep_sea,
+    grid,
+    ladder,
+    random_mdp,
+    river_swim,
+    tightrope,
+)
 
 ZOO: dict[str, Callable[[], TabularMDP]] = {
     "ladder": lambda: ladder(5),
@@ -22,6 +33,9 @@ ZOO: dict[str, Callable[[], TabularMDP]] = {
     "grid": grid,
     "grid, absorbing": lambda: grid(5, traps=(12,), absorbing=True),
     "deep_sea": lambda: deep_sea(6, mapping_seed=3, stochastic=True),
+    "combination_lock": lambda: combination_lock(4, 3),
+    "river_swim": river_swim,
+    "corridor": corridor,
     "FrozenLake": lambda: TabularMDP.from_gymnasium(gymnasium.make("FrozenLake-v1"), 0.99),
     "CliffWalking": lambda: TabularMDP.from_gymnasium(gymnasium.make("CliffWalking-v1"), 0.95),
     "Taxi": lambda: TabularMDP.from_gymnasium(gymnasium.make("Taxi-v4"), 0.9),
@@ -32,6 +46,13 @@ ZOO: dict[str, Callable[[], TabularMDP]] = {
 @functools.cache
 def zoo(name: str) -> TabularMDP:
     return ZOO[name]()
+
+
+def rewarded(mdp: TabularMDP, *, factor: float = 1.0, constant: float = 0.0) -> TabularMDP:
+    """The MDP with other rewards."""
+    outcomes = replace(mdp.outcomes, reward_NA=factor * mdp.outcomes.reward_NA + constant)
+    reward_SAK = None if mdp.reward_SAK is None else factor * mdp.reward_SAK + constant
+    return replace(mdp, outcomes=outcomes, reward_SAK=reward_SAK)
 
 
 def random_policy(mdp: TabularMDP, seed: int = 0) -> Tensor:

@@ -18,23 +18,6 @@ class LookaheadAdvantages:
     """Of all actions, by a lookahead from the visited states."""
 
 
-def centred(q_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
-    """Advantages of all actions, none on the average of the policy:
-
-        A(s, a) = q(s, a) - <pi(.|s), q(s, .)>,        so that sum_a pi(a|s) A(s, a) = 0
-
-    The largest value of a state is taken off first. So actions of equal values have advantages of exactly 0, the
-    rounding is that of the differences and not of q, and q times 2^k gives exactly 2^k times the advantages.
-
-    Args:
-        q_NA: (T^m Q)(s, .); -inf where an action is not allowed, whose probability must be 0.
-        pi_NA: the policy.
-    """
-    below_NA = q_NA - q_NA.amax(-1, keepdim=True)
-    share_NA = torch.where(pi_NA > 0, pi_NA * below_NA, 0.0)
-    return below_NA - share_NA.sum(-1, keepdim=True)
-
-
 @final
 @dataclass(frozen=True)
 class SampledAdvantages:

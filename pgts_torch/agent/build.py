@@ -117,12 +117,13 @@ def make_update(
     policy: Policy,
     estimator: Estimator = LookaheadAdvantages(),  # noqa: B008 - frozen
 ) -> Update:
-    """An update, of a table: projected, softmax or mirror (step_size, state_weight); of a network: gradient, ppo,
+    """An update, of a table: projected, softmax or mirror (step_size, state_weight; of mirror also
+    normalize, floor); of a network: gradient, ppo,
     mirror or cmpo. Default: the one for the policy, of a network cmpo with a lookahead and ppo without."""
     network = isinstance(policy, NetworkPolicy)
     if description is None:
         neural = "ppo" if isinstance(estimator, SampledAdvantages) else "cmpo"
-        description = neural if network else "projected" if isinstance(policy, SimplexPolicy) else "softmax"
+        description = neural if network else "projected" if isinstance(policy, SimplexPolicy) else "mirror"
     kind = _parts("update", {**_TABLE_UPDATES, **_NETWORK_UPDATES}, description)[0]
     choices = _NETWORK_UPDATES if kind not in _TABLE_UPDATES or (network and kind == "mirror") else _TABLE_UPDATES
     return _make("update", choices, description)

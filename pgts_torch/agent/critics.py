@@ -2,7 +2,9 @@
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, TypeVar, final
 
 import torch
@@ -27,12 +29,14 @@ class Critic(ABC):
     draws_when_asked: whether it draws when it is asked for values, not when it is fitted.
     is_exact: whether its values are those of the policy, but for `error`.
     error: by how much the mean of its v over the start distribution may miss J^pi; infinite where it is an estimate.
+    dtype: that its values are rounded to.
     """
 
     target: Target
     draws_when_asked: bool = False
     is_exact: bool = False
     error: float = math.inf
+    dtype: torch.dtype = torch.float64
 
     @abstractmethod
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
@@ -135,7 +139,7 @@ class TabularCritic(Critic):
 
         V(s) <- V(s) + alpha (mean of the targets at s - V(s))
 
-    A state that was never visited keeps the value 0.
+    What was never visited is worth what all visits of the iteration are on average, or a given number.
 
     Args:
         num_states, num_actions: the shape of the table.
@@ -143,6 +147,9 @@ class TabularCritic(Critic):
         method: how targets are made.
         step_size: alpha in (0, 1]; or "mean": alpha is the share of the new visits among all so far, which makes the
             estimate the mean of all targets. "mean" suits a policy that stands still.
+        initial: of cells that were never visited: a number, or "mean": the w that makes the mean of an iteration's
+            targets w, where w stands for the rest of episodes that were cut in such a cell. A constant added to all
+            rewards of a continuing task adds constant / (1 - gamma) to it, as to all values; a factor multiplies it.
     """
 
     def __init__(
@@ -153,23 +160,29 @@ class TabularCritic(Critic):
         target: Target = "v",
         method: Method = TDLambda(),
         step_size: float | Literal["mean"] = 0.5,
+        initial: float | Literal["mean"] = "mean",
         device: torch.device | str = "cpu",
     ) -> None:
         if step_size != "mean" and not (isinstance(step_size, int | float) and 0 < step_size <= 1):
             raise PgtsError(f"step_size is {step_size!r}; it must be in (0, 1] or 'mean'")
+        if initial != "mean" and not (isinstance(initial, int | float) and math.isfinite(initial)):
+            raise PgtsError(f"initial is {initial!r}; it must be a finite number or 'mean'")
         self.num_states, self.num_actions = num_states, num_actions
         self.target = check_target(target)
         self.method = method
         self.step_size = step_size
+        self.initial = initial
         self._policy: Policy | None = None
         cells = num_states if target == "v" else num_states * num_actions
-        self._value_C = torch.zeros(cells, dtype=torch.float64, device=device)
+        self._value_C = torch.full((cells,), 0.0 if initial == "mean" else initial, dtype=torch.float64, device=device)
         self._count_C = torch.zeros(cells, dtype=torch.float64, device=device)
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
         """Move every visited cell toward the mean of its targets; returns the mean squared error before."""
         self._policy = policy
-        target_TB = self._targets(rollout)[rollout.alive_TB]
+        if self.initial == "mean":
+            self._value_C = torch.where(self._count_C > 0, self._value_C, self._mean_target(rollout))
+        target_TB = self._targets(rollout, self.v)[rollout.alive_TB]
         check_targets(target_TB)
         cell_TB = rollout.state_TB
         if self.target == "q":
@@ -188,9 +201,12 @@ class TabularCritic(Critic):
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         """The table, or sum_a pi(a|s) Q(s, a) of it."""
+        return self._read(self._value_C, state_N)
+
+    def _read(self, value_C: Float[Tensor, "C"], state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         if self.target == "v":
-            return self._value_C[state_N]
-        return (_fitted(self._policy).probs(state_N) * self.q(state_N)).sum(-1)
+            return value_C[state_N]
+        return (_fitted(self._policy).probs(state_N) * value_C.view(-1, self.num_actions)[state_N]).sum(-1)
 
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
         if self.target != "q":
@@ -206,12 +222,25 @@ class TabularCritic(Critic):
             fitting(state, "count_C", self._count_C),
         )
 
-    def _targets(self, rollout: Rollout) -> Float[Tensor, "T B"]:
+    def _targets(self, rollout: Rollout, v: Callable[[Tensor], Tensor]) -> Float[Tensor, "T B"]:
         next_TB = rollout.next_state_TB
-        bootstrap_TB = self.v(next_TB.reshape(-1)).view(next_TB.shape)
+        bootstrap_TB = v(next_TB.reshape(-1)).view(next_TB.shape)
         if isinstance(self.method, TDLambda):
             return lambda_returns(rollout, bootstrap_TB, rollout.discount_TB, self.method.lambda_)
         return lambda_returns(rollout, bootstrap_TB, rollout.survival_TB, 1.0)
+
+    def _mean_target(self, rollout: Rollout) -> Float[Tensor, ""]:
+        """The w of which the targets have the mean, if it is what cells that were never visited are worth.
+
+        Targets are a + b w: w = mean a / (1 - mean b). Two passes with w = 0 and, without rewards and with all other
+        values 0, w = 1. Where no target ends anywhere else (mean b = 1) nothing is known of w, and it is 0.
+        """
+        value_C, seen_C = self._value_C, self._count_C > 0
+        unseen_C = (~seen_C).to(value_C)
+        silent = replace(rollout, reward_TB=torch.zeros_like(rollout.reward_TB))
+        a = self._targets(rollout, partial(self._read, value_C * seen_C))[rollout.alive_TB].mean()
+        b = self._targets(silent, partial(self._read, unseen_C))[rollout.alive_TB].mean()
+        return torch.where(b < 1, a / (1 - b), 0.0)
 
 
 @final

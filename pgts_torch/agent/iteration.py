@@ -25,6 +25,8 @@ class Seen:
         proof only if the start distribution is known, the critic exact and the model the environment; else it holds as
         far as the critic is right at the start states, and with 95 % where these are drawn. Infinite where nothing can
         be said: no largest value is known, the search is a sampled one, or too few starts were drawn.
+    noise: root mean square of the standard errors of a sampled lookahead, in reward units; 0 where nothing was sampled
+        or nothing is known of it.
     """
 
     state_N: Int[Tensor, "N"]
@@ -35,6 +37,7 @@ class Seen:
     look: Lookahead | None
     gap_N: Float[Tensor, "N"]
     certificate: float
+    noise: float
 
 
 @dataclass(frozen=True, eq=False)

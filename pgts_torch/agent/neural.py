@@ -94,6 +94,8 @@ class NetworkCritic(Critic):
         seed: the weights are drawn from the stream (seed, "critic").
     """
 
+    dtype = torch.float32
+
     def __init__(
         self,
         observation_space: Space[Any],

@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pgts_torch.agent import saving
-from pgts_torch.agent.advantages import LookaheadAdvantages, SampledAdvantages, centred, score_function
+from pgts_torch.agent.advantages import LookaheadAdvantages, SampledAdvantages, score_function
 from pgts_torch.agent.build import (
     DEFAULT_TOLERANCE,
     Description,
@@ -46,10 +46,14 @@ from pgts_torch.models.rewards import RewardRange
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Leaf, Lookahead, check_finite
 from pgts_torch.seeding import SharedGenerators, stream
+from pgts_torch.tabular.ascent import centred
 from pgts_torch.tabular.mdp import TabularMDP
 
 Callback = Callable[["PGTS", Iteration], bool | None]
 """Called after each iteration; returning False ends the training. `agent.callbacks` has some."""
+
+_ROUNDINGS = 16
+"""So many roundings of the largest lookahead value make a difference that means nothing."""
 
 
 class _Draws(NamedTuple):
@@ -222,7 +226,14 @@ class PGTS:
         # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is good enough.
         if not self._is_enough(seen.certificate):
             observation_N = self.world.observe(seen.state_N)
-            losses |= self.update(self.policy, observation_N, seen.advantage_NA, seen.weight_N, generator=draws.common)
+            losses |= self.update(
+                self.policy,
+                observation_N,
+                seen.advantage_NA,
+                seen.weight_N,
+                generator=draws.common,
+                noise=seen.noise,
+            )
 
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
@@ -275,7 +286,13 @@ class PGTS:
             )
             if float(gap_N @ occupancy_N) > self.tolerance * estimate or self._is_enough(bound):
                 break
-        return Seen(states, weight_N, pi_NA, centred(look.q_BA, pi_NA), depth, look, gap_N, bound)
+        advantage_NA = centred(look.q_BA, pi_NA, rounding=self._rounding(look))
+        return Seen(states, weight_N, pi_NA, advantage_NA, depth, look, gap_N, bound, look.noise)
+
+    def _rounding(self, look: Lookahead) -> float:
+        """Differences of lookahead values that rounding explains, in reward units."""
+        eps = max(torch.finfo(dtype).eps for dtype in (look.q_BA.dtype, self.critic.dtype))
+        return _ROUNDINGS * eps * float(look.q_BA[look.q_BA.isfinite()].abs().amax())
 
     def _taken(self, experience: Rollout) -> Seen | None:
         """The advantages of the actions taken, by the critic as it was when they were; None where a lookahead is
@@ -290,7 +307,7 @@ class PGTS:
         advantage_NA = score_function(experience.action_TB[alive_TB], advantage_TB[alive_TB], pi_NA)
         weight_N = experience.visit_weight(self.update.state_weight)
         unknown_N = torch.full_like(weight_N, torch.nan)
-        return Seen(states, weight_N, pi_NA, advantage_NA, 0, None, unknown_N, math.inf)
+        return Seen(states, weight_N, pi_NA, advantage_NA, 0, None, unknown_N, math.inf, 0.0)
 
     @property
     def gamma(self) -> float:

@@ -27,7 +27,7 @@ StateWeight = Literal["occupancy", "visits", "uniform"]
 class FixedHorizon:
     """Every episode runs for `length` steps or until it terminates; a visit counts by its discounts so far."""
 
-    length: int = 50
+    length: int = 100
 
     def __post_init__(self) -> None:
         if self.length < 1:

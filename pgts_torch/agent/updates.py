@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, final
+from typing import Any, ClassVar, Literal, final
 
 import torch
 from jaxtyping import Float, Int
@@ -13,7 +13,7 @@ from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.rollout import StateWeight
 from pgts_torch.errors import PgtsError
 from pgts_torch.search.lookahead import check_finite
-from pgts_torch.tabular.ascent import mirror_step, projected_step, softmax_direction
+from pgts_torch.tabular.ascent import centred, floored, normalised, projected_step, softmax_direction
 
 
 class Update(ABC):
@@ -36,6 +36,7 @@ class Update(ABC):
         weight_N: Float[Tensor, "N"],
         *,
         generator: torch.Generator,
+        noise: float = 0.0,
     ) -> dict[str, float]:
         """Move pi(.|o) along the advantages of all actions, in place; losses and the like, by name.
 
@@ -43,6 +44,7 @@ class Update(ABC):
             observation_N: what the policy sees of N visited states.
             advantage_NA: (T^m Q)(s, a) - <pi, T^m Q> (`advantages.centred`), or sampled ones.
             weight_N: w(s).
+            noise: the standard error of the advantages, in reward units: the least that normalised steps divide by.
         """
 
     def state_dict(self) -> dict[str, Any]:
@@ -88,6 +90,7 @@ class TabularUpdate(Update):
         weight_N: Float[Tensor, "N"],
         *,
         generator: torch.Generator,
+        noise: float = 0.0,
     ) -> dict[str, float]:
         """Nothing is drawn, and there is no loss.
 
@@ -97,7 +100,7 @@ class TabularUpdate(Update):
         """
         step_NA = self.step_size * weight_N[:, None] * advantage_NA
         check_finite("advantage", "the step along the advantages", step_NA, observation_N)
-        self.step(policy, observation_N, advantage_NA, weight_N)
+        self.step(policy, observation_N, advantage_NA, weight_N, noise)
         return {}
 
     @abstractmethod
@@ -107,6 +110,7 @@ class TabularUpdate(Update):
         state_N: Int[Tensor, "N"],
         q_NA: Float[Tensor, "N A"],
         weight_N: Float[Tensor, "N"],
+        noise: float = 0.0,
     ) -> None:
         """Move pi(.|s) at N distinct states along q(s, .), or along q(s, .) less anything that all actions share."""
 
@@ -118,7 +122,7 @@ class ProjectedUpdate(TabularUpdate):
 
     policies = (SimplexPolicy,)
 
-    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
+    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         assert isinstance(policy, SimplexPolicy)
         _replace(policy.probs_SA, state_N, projected_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size))
 
@@ -130,7 +134,7 @@ class SoftmaxUpdate(TabularUpdate):
 
     policies = (SoftmaxPolicy,)
 
-    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
+    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         assert isinstance(policy, SoftmaxPolicy)
         step_NA = self.step_size * softmax_direction(policy.probs(state_N), q_NA, weight_N)
         _replace(policy.logits_SA, state_N, policy.logits_SA[state_N] + step_NA)
@@ -139,18 +143,47 @@ class SoftmaxUpdate(TabularUpdate):
 @final
 @dataclass(frozen=True)
 class MirrorUpdate(TabularUpdate):
-    """A KL step at visited states: pi(a|s) <- pi(a|s) exp(eta w(s) q(s, a)) / Z (Protopapas and Barakat 2024)."""
+    """A KL step at visited states, in units of what the advantages amount to (Protopapas and Barakat 2024).
+
+        pi(a|s) <- pi(a|s) exp(eta w(s) A(s, a) / s) / Z,        s = sqrt(mean over visited states of sum_a pi A^2)
+
+    So neither a constant added to all rewards of a continuing task nor their scale matters; a factor of 2^k leaves
+    every bit as it is. Where all advantages are 0 nothing moves.
+
+    Args:
+        normalize: "rms": s as above, and at least the standard error of a sampled lookahead; "none": s = 1, the paper's
+            step in reward units.
+        floor: the least that log pi(a|s) may be below its largest in a row that moves, so that a policy which was sure
+            too early can come back; None: no limit.
+    """
 
     policies = (SoftmaxPolicy, SimplexPolicy)
 
-    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor) -> None:
+    step_size: float = 1.0
+    state_weight: StateWeight = "uniform"
+    normalize: Literal["rms", "none"] = "rms"
+    floor: float | None = 12.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.normalize not in ("rms", "none"):
+            raise PgtsError(f"normalize is {self.normalize!r}; it must be rms or none")
+        if self.floor is not None and not 0 < self.floor < math.inf:
+            raise PgtsError(f"floor is {self.floor}; it must be finite and above 0, or None")
+
+    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
+        pi_NA = policy.probs(state_N)
+        log_NA = policy.logits_SA[state_N] if isinstance(policy, SoftmaxPolicy) else pi_NA.log()
+        advantage_NA = centred(q_NA, pi_NA)
+        if self.normalize == "rms":
+            advantage_NA = normalised(advantage_NA, pi_NA, noise=noise)
+        next_NA = floored(log_NA, self.step_size * weight_N[:, None] * advantage_NA, self.floor)
+        moves_N1 = (advantage_NA != 0).any(-1, keepdim=True)
         if isinstance(policy, SoftmaxPolicy):
-            advantage_NA = q_NA - q_NA.amax(-1, keepdim=True)
-            step_NA = self.step_size * weight_N[:, None] * advantage_NA
-            _replace(policy.logits_SA, state_N, policy.logits_SA[state_N] + step_NA)
+            _replace(policy.logits_SA, state_N, torch.where(moves_N1, next_NA, log_NA))
         else:
             assert isinstance(policy, SimplexPolicy)
-            _replace(policy.probs_SA, state_N, mirror_step(policy.probs_SA[state_N], q_NA, weight_N, self.step_size))
+            _replace(policy.probs_SA, state_N, torch.where(moves_N1, next_NA.softmax(-1), pi_NA))
 
 
 def _replace(table_SA: Float[Tensor, "S A"], state_N: Int[Tensor, "N"], row_NA: Float[Tensor, "N A"]) -> None:

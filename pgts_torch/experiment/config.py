@@ -228,18 +228,26 @@ class Config(Section):
         return description
 
 
+TABLE_OPTIONS = ("step_size", "normalize", "floor")
+"""Options of the mirror update that only tables have."""
+
+MIRROR_OF_NETWORKS = MirrorUpdateConfig.model_fields.keys() - {"type", "state_weight", *TABLE_OPTIONS}
+"""Those that only networks have."""
+
+
 def _check_mirror(update: MirrorUpdateConfig, policy: Any) -> None:
     is_table = policy.type in TABLES
-    if is_table and isinstance(policy.init, BiasedInitConfig) and policy.init.probability == 1:
+    floor_less = update.floor == "never"
+    if is_table and floor_less and isinstance(policy.init, BiasedInitConfig) and policy.init.probability == 1:
         raise conflict(
-            "update.type is mirror, which leaves probabilities of 0 at 0; a policy with "
+            "update.floor is never, so that a mirror step leaves probabilities of 0 at 0; a policy with "
             "policy.init.probability 1 would never move",
-            "update.type",
+            "update.floor",
             "policy.init.probability",
         )
     for name in MirrorUpdateConfig.model_fields:
         value = getattr(update, name)
-        if name in ("type", "state_weight") or value is None or (name == "step_size") == is_table:
+        if name in ("type", "state_weight") or value is None or (name in TABLE_OPTIONS) == is_table:
             continue
         raise conflict(
             "update.{name} is {value}, which the mirror update of a {kind} does not heed; policy.type is {policy}",
@@ -263,7 +271,7 @@ def with_types(data: dict[str, Any]) -> dict[str, Any]:
     data = _typed(data, "policy", [SoftmaxConfig, MLPConfig, CNNConfig])
     policy, sampled = _type(data, "policy"), _type(data, "estimator") == "sampled"
     tables, networks = policy not in NETWORKS, policy not in TABLES
-    for_tables: list[type[Section]] = [ProjectedUpdateConfig if policy == "simplex" else SoftmaxUpdateConfig]
+    for_tables: list[type[Section]] = [ProjectedUpdateConfig if policy == "simplex" else MirrorUpdateConfig]
     for_networks: list[type[Section]] = [PPOUpdateConfig] if sampled else [CMPOUpdateConfig, PPOUpdateConfig]
     if policy in NETWORKS:  # also where states are numbered
         data = data | {"critic": {"type": "network"} | (data.get("critic") or {})}
@@ -276,6 +284,10 @@ def _typed(data: dict[str, Any], name: str, kinds: Sequence[type[Section]]) -> d
     if not isinstance(section, dict) or "type" in section:
         return data
     known = [{field.alias or key for key, field in kind.model_fields.items()} for kind in kinds]
+    known = [
+        keys - MIRROR_OF_NETWORKS if kind is MirrorUpdateConfig else keys
+        for keys, kind in zip(known, kinds, strict=True)
+    ]
     first = next((n for n, keys in enumerate(known) if section.keys() <= keys), 0)
     kind = kinds[first].model_fields["type"].default if section else "auto"
     return data | {name: {"type": kind} | section}

@@ -164,7 +164,7 @@ class FixedHorizonConfig(Section):
 
     type: Literal["fixed"] = "fixed"
 
-    length: Count = 50
+    length: Count = 100
     """Steps of a rollout."""
 
 
@@ -230,6 +230,9 @@ class TabularCriticConfig(Section):
 
     step_size: Share | Literal["mean"] = 0.5
     """How far it is moved; mean: so that it is the mean of all targets so far."""
+
+    initial: float | Literal["mean"] = "mean"
+    """The value of what was never visited, in reward units; mean: that of all visits of the iteration."""
 
 
 class RolloutCriticConfig(Section):
@@ -544,16 +547,24 @@ class CMPOUpdateConfig(Section):
 
 
 class MirrorUpdateConfig(Section):
-    """Mirror ascent with the KL divergence; for all policies."""
+    """Mirror ascent with the KL divergence; for all policies. The steps of tables do not depend on the scale of the
+    rewards."""
 
     type: Literal["mirror"] = "mirror"
 
     state_weight: StateWeight | None = None
-    """What a visited state counts for: its discounted occupancy, its share of all visits, or 1; null: occupancy for
+    """What a visited state counts for: its discounted occupancy, its share of all visits, or 1; null: 1 (uniform) for
     tables, visits for networks."""
 
     step_size: Positive | None = None
-    """eta, by which the weighted lookahead values are multiplied; null: 0.1. Only for tables."""
+    """eta, by which the weighted advantages are multiplied; null: 1. Only for tables, as the next two."""
+
+    normalize: Literal["rms", "none"] | None = None
+    """rms: advantages are divided by their root mean square, or by the standard error of the lookahead where that is
+    larger; none: they count in reward units, as in the paper; null: rms."""
+
+    floor: Clip | None = None
+    """The most that the log of a probability may fall below the largest one of its state; null: 12."""
 
     temperature: Positive | None = None
     """By which the lookahead values are divided; null: 1. Only for networks, as all that follow."""

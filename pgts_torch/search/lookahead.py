@@ -96,6 +96,11 @@ class Lookahead:
         )
 
     @property
+    def noise(self) -> float:
+        """Root mean square of the standard errors, in reward units; those that were not estimated count as 0."""
+        return float(self.stderr_BA.double().nan_to_num(0.0).square().mean().sqrt())
+
+    @property
     def nodes(self) -> int:
         """All nodes of all levels."""
         return sum(self.nodes_per_level)

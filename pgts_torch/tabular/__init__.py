@@ -2,17 +2,30 @@
 
 from pgts_torch.tabular import ascent, exact, stationary
 from pgts_torch.tabular.mdp import TabularMDP
-from pgts_torch.tabular.zoo import deep_sea, grid, ladder, mirage, random_mdp, tightrope
+from pgts_torch.tabular.zoo import (
+    combination_lock,
+    corridor,
+    deep_sea,
+    grid,
+    ladder,
+    mirage,
+    random_mdp,
+    river_swim,
+    tightrope,
+)
 
 __all__ = [
     "TabularMDP",
     "ascent",
+    "combination_lock",
+    "corridor",
     "deep_sea",
     "exact",
     "grid",
     "ladder",
     "mirage",
     "random_mdp",
+    "river_swim",
     "stationary",
     "tightrope",
 ]

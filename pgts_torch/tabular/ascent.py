@@ -57,6 +57,52 @@ def ascend(
     return Ascent(torch.tensor(returns, dtype=torch.float64), pi_SA)
 
 
+def centred(q_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"], *, rounding: float = 0.0) -> Float[Tensor, "N A"]:
+    """Advantages of all actions, none on the average of the policy:
+
+        A(s, a) = q(s, a) - <pi(.|s), q(s, .)>,        so that sum_a pi(a|s) A(s, a) = 0
+
+    The largest value of a state is taken off first. So actions of equal values have advantages of exactly 0, the
+    rounding is that of the differences and not of q, and q times 2^k gives exactly 2^k times the advantages.
+
+    Args:
+        q_NA: (T^m Q)(s, .); -inf where an action is not allowed, whose probability must be 0.
+        pi_NA: the policy.
+        rounding: advantages of at most this size are 0.
+    """
+    below_NA = q_NA - q_NA.amax(-1, keepdim=True)
+    share_NA = torch.where(pi_NA > 0, pi_NA * below_NA, 0.0)
+    advantage_NA = below_NA - share_NA.sum(-1, keepdim=True)
+    return torch.where(advantage_NA.abs() > rounding, advantage_NA, 0.0)
+
+
+def normalised(
+    advantage_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"], *, noise: float = 0.0
+) -> Float[Tensor, "N A"]:
+    """Advantages in units of their root mean square, or of their noise where that is larger:
+
+        A(s, a) / max(noise, sqrt(mean_s sum_a pi(a|s) A(s, a)^2))
+
+    0 where all are 0. The largest |A| is divided by first, so that squares neither overflow nor vanish, and a factor of
+    2^k on advantages and noise changes no bit.
+    """
+    largest = advantage_NA[advantage_NA.isfinite()].abs().amax()
+    if not largest > 0:
+        return torch.zeros_like(advantage_NA)
+    unit_NA = advantage_NA / largest
+    square_NA = torch.where(pi_NA > 0, pi_NA * unit_NA.square(), 0.0)
+    size = square_NA.sum(-1).mean().sqrt().clamp(min=float(noise / largest))
+    return unit_NA / torch.where(size > 0, size, 1.0)  # 0: only actions that the policy never takes are better
+
+
+def floored(log_NA: Float[Tensor, "N A"], step_NA: Float[Tensor, "N A"], floor: float | None) -> Float[Tensor, "N A"]:
+    """log pi + step, the largest of each row at 0 and the others at -floor or above; None: as low as they are. Where
+    the step is -inf the action is not allowed, and stays at -inf."""
+    next_NA = log_NA + step_NA
+    next_NA = next_NA - next_NA.amax(-1, keepdim=True)
+    return next_NA if floor is None else torch.where(step_NA == -math.inf, -math.inf, next_NA.clamp(min=-floor))
+
+
 def project_simplex(x_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
     """The nearest distribution to each row, in the Euclidean norm.
 

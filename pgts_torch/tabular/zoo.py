@@ -191,6 +191,84 @@ def deep_sea(
     return TabularMDP.from_transitions(P, gamma, start=start, action_names=names, shape=(n, n))
 
 
+def combination_lock(
+    n: int = 12, num_actions: int = 4, *, seed: int = 0, gamma: float = 0.99, start: Start = 0
+) -> TabularMDP:
+    """A lock of n dials: in each state one action, drawn at random, goes on to the next and every other one back to
+    the first. The right action in the last state earns 1 and ends the episode.        [Kakade 2003]
+
+    A uniform policy opens it once in num_actions^n attempts. J* = gamma^(n-1) from state 0.
+    """
+    _check_size("n", n, 1)
+    _check_size("num_actions", num_actions, 2)
+    right_S = numpy_stream(seed, "combination_lock").integers(0, num_actions, size=n)
+    P = [
+        [
+            [(1.0, min(s + 1, n - 1), float(s == n - 1), s == n - 1) if a == right else (1.0, 0, 0.0, False)]
+            for a in range(num_actions)
+        ]
+        for s, right in enumerate(right_S.tolist())
+    ]
+    return TabularMDP.from_transitions(P, gamma, start=start)
+
+
+def river_swim(n: int = 12, *, gamma: float = 0.99, start: Start = 0) -> TabularMDP:
+    """A chain against the current: 'left' goes one state left, 'right' goes right with 0.3, stays with 0.6 and drifts
+    left with 0.1. 'Left' earns 0.005 in the first state, 'right' 1 in the last.        [Strehl and Littman 2008]
+
+    At the ends 'right' goes right or drifts left with 0.3 and 0.7, in place of staying with 0.7 and 0.3. Strehl and
+    Littman have 6 states, start in the second or third, and pay 10,000 times as much in ten thousandths: 5 and 10,000.
+    """
+    _check_size("n", n, 2)
+    P: list[list[list[Transition]]] = []
+    for s in range(n):
+        left, right = max(s - 1, 0), min(s + 1, n - 1)
+        drift, stay, swim = (0.0, 0.7, 0.3) if s == 0 else (0.7, 0.3, 0.0) if s == n - 1 else (0.1, 0.6, 0.3)
+        reward = float(s == n - 1)
+        swims = [(drift, left, reward, False), (stay, s, reward, False), (swim, right, reward, False)]
+        P.append([[(1.0, left, 0.005 * (s == 0), False)], swims])
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=("left", "right"))
+
+
+def corridor(
+    width: int = 3, length: int = 25, *, slip: float = 0.2, gamma: float = 0.99, start: Start | None = None
+) -> TabularMDP:
+    """A slippery corridor without walls: whoever steps off its long sides is back at the start. Reaching the last
+    column earns 1 and ends the episode. State `length * row + column`; actions left, right, up, down.
+
+    An action moves one cell as intended with probability 1 - slip, and to either side at right angles with slip / 2
+    each, as on the ice of Gymnasium's FrozenLake, whose holes are here all along the way. A step against the end of the
+    first column stays. The length is what a lookahead must see or what must be learned column by column.
+
+    Args:
+        start: default the middle of the first column.
+    """
+    _check_size("width", width, 1)
+    _check_size("length", length, 2)
+    if not 0 <= slip <= 1:
+        raise PgtsError(f"slip is {slip}; it must be in [0, 1]")
+    home = length * (width // 2)
+    moves = ((0, -1), (0, 1), (-1, 0), (1, 0))
+
+    def after(row: int, column: int, move: tuple[int, int]) -> tuple[int, float, bool]:
+        row, column = row + move[0], max(column + move[1], 0)
+        if not 0 <= row < width:
+            return home, 0.0, False
+        return length * row + min(column, length - 1), float(column >= length - 1), column >= length - 1
+
+    P: list[list[list[Transition]]] = []
+    for row in range(width):
+        for column in range(length):
+            P.append([])
+            for intended, move in enumerate(moves):
+                sideways = moves[2:] if intended < 2 else moves[:2]
+                shares = [(1 - slip, move), *((slip / 2, side) for side in sideways)]
+                P[-1].append([(share, *after(row, column, step)) for share, step in shares])
+    names = ("left", "right", "up", "down")
+    start = home if start is None else start
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=names, shape=(width, length))
+
+
 def _sink(n: int, row: int, column: int, goes_right: bool, cost: float, fails: float) -> list[Transition]:
     """What may follow in one cell of the deep sea."""
     ends = row == n - 1

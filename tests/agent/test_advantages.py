@@ -1,24 +1,18 @@
 """Advantages of a lookahead: none on the average of the policy, whatever constant or scale the rewards have."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
 from pgts_torch import PGTS
-from pgts_torch.agent.advantages import centred
 from pgts_torch.seeding import stream
-from pgts_torch.tabular import TabularMDP, random_mdp
+from pgts_torch.tabular import random_mdp
+from pgts_torch.tabular.ascent import centred
 from tests.agent.helpers import copies
+from tests.support import rewarded
 
 UPDATES = {"softmax": "mirror", "simplex": "projected", "mlp": "ppo"}
-
-
-def rewarded(mdp: TabularMDP, *, factor: float = 1.0, constant: float = 0.0) -> TabularMDP:
-    """The MDP with other rewards."""
-    outcomes = replace(mdp.outcomes, reward_NA=mdp.outcomes.reward_NA * factor + constant)
-    return replace(mdp, outcomes=outcomes)
 
 
 def values(seed: int = 0):
@@ -46,6 +40,15 @@ def test_actions_of_equal_values_have_no_advantage_at_all():
 def test_a_power_of_two_scales_advantages_to_the_last_bit(power):
     q_NA, pi_NA = values(1)
     assert torch.equal(centred(math.ldexp(1.0, power) * q_NA, pi_NA), math.ldexp(1.0, power) * centred(q_NA, pi_NA))
+
+
+def test_what_rounding_explains_is_no_advantage():
+    q_NA, pi_NA = values()
+    advantage_NA = centred(q_NA, pi_NA)
+    bound = float(advantage_NA.abs().median())
+    kept_NA = centred(q_NA, pi_NA, rounding=bound)
+    assert torch.equal(kept_NA, advantage_NA.where(advantage_NA.abs() > bound, 0.0))
+    assert 0 < int((kept_NA == 0).sum()) < kept_NA.numel()
 
 
 def test_an_action_that_is_not_allowed_does_not_spoil_the_others():

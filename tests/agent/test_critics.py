@@ -1,6 +1,7 @@
 """Estimates of values, each held to the exact ones."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -126,7 +127,7 @@ def test_tabular_critics_converge_to_the_values_of_a_policy_that_stands_still(ta
     # its bootstrapped targets: 0.02 of the start after 40. The rest is the spread of about 1000 targets.
     mdp = random_mdp(6, 2, gamma=0.5, start=None)
     pi_SA = uniform_policy(mdp)
-    critic = TabularCritic(6, 2, target=target, method=method, step_size=0.2)
+    critic = TabularCritic(6, 2, target=target, method=method, step_size=0.2, initial=0.0)
     start = error(critic, mdp, pi_SA)
     losses = [fit(critic, mdp, pi_SA, horizon, episodes=400, seed=seed)["value"] for seed in range(40)]
     assert error(critic, mdp, pi_SA) < 0.05 < 0.06 * start
@@ -149,29 +150,67 @@ def test_a_terminal_outcome_is_not_bootstrapped(method):
 
 
 @pytest.mark.parametrize("target", ["v", "q"])
-def test_what_was_never_visited_keeps_the_value_0(target):
+def test_what_was_never_visited_keeps_an_initial_number(target):
     mdp = ladder(5)
     pi_SA = right_with(0.5, 0.0, 0.5, 0.5, 0.5)
-    critic = TabularCritic(5, 2, target=target, step_size=1.0)
-    critic.load_state_dict(
-        {name: value + 1 for name, value in critic.state_dict().items()}
-        | {"count_C": torch.zeros(5 if target == "v" else 10)}
-    )
-    fit(critic, mdp, pi_SA, FixedHorizon(30), episodes=20)
-    ones = torch.ones(3, dtype=torch.float64) if target == "v" else torch.ones(3, 2, dtype=torch.float64)
-    asked = critic.v if target == "v" else critic.q
-    assert torch.equal(asked(torch.tensor([2, 3, 4])), ones)
-    assert not (asked(torch.tensor([0])) == 1).any()
+    for initial in (0.0, 7.5):
+        critic = TabularCritic(5, 2, target=target, initial=initial)
+        fit(critic, mdp, pi_SA, FixedHorizon(30), episodes=20)
+        asked = critic.v if target == "v" else critic.q
+        assert (asked(torch.tensor([2, 3, 4])) == initial).all()
+    assert not (asked(torch.tensor([0])) == 7.5).any()
 
-    fresh = TabularCritic(5, 2, target=target)
-    fit(fresh, mdp, pi_SA, FixedHorizon(30), episodes=20)
-    asked = fresh.v if target == "v" else fresh.q
-    assert (asked(torch.tensor([2, 3, 4])) == 0).all()
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_what_was_never_visited_is_worth_the_mean_of_the_targets(target, method):
+    mdp = random_mdp(30, 2, branching=2, seed=4, gamma=0.9)
+    critic = TabularCritic(30, 2, target=target, method=method, step_size=1.0)
+    made = experience(mdp, uniform_policy(mdp), FixedHorizon(3), episodes=6)
+    critic.fit(following(uniform_policy(mdp)), made, generator=stream(0, "critic"))
+    count_C, value_C = critic.state_dict()["count_C"], critic.state_dict()["value_C"]
+    unseen = count_C == 0
+    assert 3 < int(unseen.sum()) < len(count_C) - 3
+    # With a step of 1 each visited cell holds the mean of its targets.
+    mean = (count_C * value_C).sum() / count_C.sum()
+    torch.testing.assert_close(value_C[unseen], mean.expand(int(unseen.sum())))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_a_constant_in_all_rewards_adds_the_same_to_all_values_seen_or_not(target, method):
+    mdp = random_mdp(30, 2, branching=2, seed=4, gamma=0.9)
+
+    def values(factor: float, constant: float) -> torch.Tensor:
+        critic = TabularCritic(30, 2, target=target, method=method)
+        for seed in range(3):
+            made = experience(mdp, uniform_policy(mdp), FixedHorizon(3), episodes=4, seed=seed)
+            made = replace(made, reward_TB=factor * made.reward_TB + constant)
+            critic.fit(following(uniform_policy(mdp)), made, generator=stream(0, "critic"))
+        return critic.state_dict()["value_C"]
+
+    unseen = values(1.0, 0.0)
+    if method == METHODS[-1]:
+        torch.testing.assert_close(values(1.0, -3.0), unseen - 30)
+    assert torch.equal(values(2.0**-17, 0.0), 2.0**-17 * unseen)
+
+
+def test_where_nothing_is_known_of_the_end_what_was_never_visited_is_worth_0():
+    mdp = ladder(5, gamma=1.0)
+    critic = TabularCritic(5, 2, method=TDLambda(0.0))
+    fit(critic, mdp, right_with(*[1.0] * 5), FixedHorizon(1), episodes=2)
+    assert critic.v(torch.arange(1, 5)).tolist() == [0.0] * 4
+
+
+@pytest.mark.parametrize("initial", [float("nan"), float("inf"), "median"])
+def test_an_initial_value_that_is_none_is_refused(initial):
+    with pytest.raises(PgtsError, match="it must be a finite number or 'mean'"):
+        TabularCritic(5, 2, initial=initial)
 
 
 def test_a_step_moves_each_value_by_its_share_toward_the_mean_of_its_targets():
     made = by_hand()
-    critic = TabularCritic(4, 1, method=TDLambda(0.0), step_size=0.25)
+    critic = TabularCritic(4, 1, method=TDLambda(0.0), step_size=0.25, initial=0.0)
     value_S = torch.tensor([8.0, 10.0, 10.0, 10.0], dtype=torch.float64)
     critic.load_state_dict({"value_C": value_S, "count_C": torch.zeros(4)})
     loss = critic.fit(following(torch.ones(4, 1, dtype=torch.float64)), made, generator=stream(0, "critic"))

@@ -8,7 +8,7 @@ import torch
 from pgts_torch import PGTS
 from pgts_torch.agent.critics import TabularCritic
 from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
-from pgts_torch.agent.updates import SoftmaxUpdate
+from pgts_torch.agent.updates import MirrorUpdate, SoftmaxUpdate
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact, grid, ladder
@@ -321,7 +321,7 @@ def test_parts_may_be_given_as_objects():
 
 
 def test_the_defaults_update_every_kind_of_policy():
-    assert type(make().update).__name__ == "SoftmaxUpdate"
+    assert make().update == MirrorUpdate(1.0, "uniform", normalize="rms", floor=12.0)
     assert type(make(policy="simplex").update).__name__ == "ProjectedUpdate"
 
 

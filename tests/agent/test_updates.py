@@ -1,5 +1,7 @@
 """How policies move: as the exact formulas say, and only where they are told to."""
 
+import math
+
 import pytest
 import torch
 
@@ -9,11 +11,17 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.seeding import stream
 from pgts_torch.tabular.ascent import mirror_step, projected_step, softmax_step
 
+
+def in_reward_units(**options) -> MirrorUpdate:
+    """The mirror step of the exact formula."""
+    return MirrorUpdate(normalize="none", floor=None, **options)
+
+
 CASES = [
     (ProjectedUpdate, SimplexPolicy, projected_step),
     (SoftmaxUpdate, SoftmaxPolicy, softmax_step),
-    (MirrorUpdate, SimplexPolicy, mirror_step),
-    (MirrorUpdate, SoftmaxPolicy, mirror_step),
+    (in_reward_units, SimplexPolicy, mirror_step),
+    (in_reward_units, SoftmaxPolicy, mirror_step),
 ]
 STATES = torch.tensor([5, 0, 3])
 
@@ -111,7 +119,7 @@ def test_a_policy_that_an_update_cannot_move_is_refused(update, kind, fits):
 def test_a_policy_that_an_update_can_move_is_taken(update, kind, step):
     policy = kind(3, 2)
     update().check(policy)
-    assert isinstance(policy, update.policies)
+    assert isinstance(policy, update().policies)
 
 
 @pytest.mark.parametrize("update", [ProjectedUpdate, SoftmaxUpdate, MirrorUpdate])
@@ -121,3 +129,59 @@ def test_steps_and_weights_that_make_no_sense_are_refused(update):
             update(step_size=step_size)
     with pytest.raises(PgtsError, match="state_weight is 'all'"):
         update(state_weight="all")
+
+
+def moved(update: MirrorUpdate, advantage: list[list[float]], logits: list[list[float]], noise: float = 0.0):
+    """By how much the step changes the differences of the logits to the first action."""
+    policy = SoftmaxPolicy(len(logits), len(logits[0]))
+    policy.load_state_dict({"logits_SA": torch.tensor(logits, dtype=torch.float64)})
+    before_SA = policy.logits_SA.clone()
+    advantage_NA = torch.tensor(advantage, dtype=torch.float64)
+    update(policy, torch.arange(len(logits)), advantage_NA, torch.ones(len(logits)), generator=None, noise=noise)
+    change_SA = policy.logits_SA - before_SA
+    return (change_SA - change_SA[:, :1])[:, 1:].tolist()
+
+
+def test_a_normalised_step_is_in_units_of_the_root_mean_square_under_the_policy():
+    # State 0: pi = 1/2, A = -+ 3, mean square 9. State 1: pi = 1/4, 3/4, A = 3, -1, mean square 3. Root mean: sqrt 6.
+    logits = [[0.0, 0.0], [0.0, math.log(3)]]
+    (first,), (second,) = moved(MirrorUpdate(step_size=2.0), [[3.0, -3.0], [3.0, -1.0]], logits)
+    assert first == pytest.approx(-6 * 2 / math.sqrt(6))
+    assert second == pytest.approx(-4 * 2 / math.sqrt(6))
+    assert first != pytest.approx(-6 * 2 / 3)  # what each state for itself would make of it
+
+
+@pytest.mark.parametrize(("noise", "size"), [(0.0, 3.0), (2.0, 3.0), (30.0, 30.0)])
+def test_noise_that_is_larger_than_the_advantages_makes_the_step_shorter(noise, size):
+    ((step,),) = moved(MirrorUpdate(), [[3.0, -3.0]], [[0.0, 0.0]], noise)
+    assert step == pytest.approx(-6 / size)
+
+
+def test_no_probability_of_a_row_that_moves_falls_below_the_floor_and_what_is_below_comes_back():
+    update = MirrorUpdate(floor=3.0)
+    policy = SimplexPolicy(2, 3)
+    sure = torch.tensor([[1.0, 0.0, 0.0]] * 2, dtype=torch.float64)
+    policy.load_state_dict({"probs_SA": sure})
+    advantage_NA = torch.tensor([[0.0, 0.0, 1e-3], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    update.step(policy, torch.arange(2), advantage_NA, torch.ones(2))
+    assert policy.probs_SA[0].log().tolist() == pytest.approx([-math.log1p(2 * math.exp(-3)) - x for x in (0, 3, 3)])
+    assert torch.equal(policy.probs_SA[1], sure[1])
+    MirrorUpdate(floor=None).step(policy, torch.arange(2), advantage_NA.flip(0), torch.ones(2))
+    assert torch.equal(policy.probs_SA[1], sure[1])  # without a floor a mirror step leaves zeros at zero
+
+
+def test_an_action_that_is_not_allowed_stays_so():
+    policy = SimplexPolicy(1, 3)
+    policy.load_state_dict({"probs_SA": torch.tensor([[0.5, 0.5, 0.0]], dtype=torch.float64)})
+    advantage_NA = torch.tensor([[1.0, -1.0, -math.inf]], dtype=torch.float64)
+    MirrorUpdate()(policy, torch.arange(1), advantage_NA, torch.ones(1), generator=None)
+    assert policy.probs_SA[0, 2] == 0
+    assert policy.probs_SA[0, 0] > policy.probs_SA[0, 1] > 0
+
+
+def test_options_of_the_mirror_step_that_make_no_sense_are_refused():
+    for floor in (0.0, -1.0, math.inf, math.nan):
+        with pytest.raises(PgtsError, match=f"floor is {floor}; it must be finite and above 0, or None"):
+            MirrorUpdate(floor=floor)
+    with pytest.raises(PgtsError, match="normalize is 'max'; it must be rms or none"):
+        MirrorUpdate(normalize="max")

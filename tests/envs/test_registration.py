@@ -1,4 +1,4 @@
-"""The five environments as Gymnasium sees them, and what importing the package costs."""
+"""The environments as Gymnasium sees them, and what importing the package costs."""
 
 import importlib
 import importlib.metadata
@@ -23,6 +23,9 @@ TIME_LIMITS = {
     "pgts/Random-v0": 100,
     "pgts/Grid-v0": 200,
     "pgts/DeepSea-v0": None,
+    "pgts/CombinationLock-v0": 100,
+    "pgts/RiverSwim-v0": 200,
+    "pgts/Corridor-v0": 200,
 }
 IDS = list(TIME_LIMITS)
 

@@ -25,7 +25,7 @@ from pgts_torch.agent.networks import CNN, MLP
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.world import TabularWorld
 from pgts_torch.experiment import strict_yaml
-from pgts_torch.experiment.config import Config, dump
+from pgts_torch.experiment.config import TABLE_OPTIONS, Config, dump
 from pgts_torch.experiment.loading import MAX_BYTES, MAX_MISTAKES, ConfigError, load
 from pgts_torch.experiment.schema import Option, Schema
 from pgts_torch.experiment.sections import (
@@ -132,8 +132,8 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ("env: {kwargs: {n: [1, .nan]}}", "env.kwargs holds nan; numbers must be finite"),
         ("env: {kwargs: {1: 2}}", "env.kwargs has the key '1', which cannot be the name of an argument"),
         ("env: {kwargs: {gamma: 0.9}}", "env.kwargs must not have the key gamma: env.gamma sets it"),
-        ("update: {step_size: 0}", "update.step_size is 0; it must be a number > 0"),
-        ("update: {step_size: .inf}", "update.step_size is .inf; it must be a number > 0"),
+        ("update: {step_size: 0}", "update.step_size is 0; it must be a number > 0 or null"),
+        ("update: {type: softmax, step_size: .inf}", "update.step_size is .inf; it must be a number > 0"),
         (
             "update: {type: adam}",
             "update.type is 'adam'; it must be auto, cmpo, gradient, mirror, ppo, projected or softmax",
@@ -193,8 +193,8 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
             "update.type is softmax, which needs policy.type softmax; policy.type is simplex",
         ),
         (
-            "{policy: {type: simplex, init: {type: biased, probability: 1}}, update: {type: mirror}}",
-            "update.type is mirror, which leaves probabilities of 0 at 0; "
+            "{policy: {type: simplex, init: {type: biased, probability: 1}}, update: {type: mirror, floor: never}}",
+            "update.floor is never, so that a mirror step leaves probabilities of 0 at 0; "
             "a policy with policy.init.probability 1 would never move",
         ),
         (
@@ -444,6 +444,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a whole number in [1, 1024]": st.integers(1, 1024),
     "a whole number in [2, 10000] or null": st.none() | st.integers(2, 10_000),
     "a number or null": st.none() | st.floats(allow_nan=False, allow_infinity=False),
+    "a number or mean": st.just("mean") | st.floats(allow_nan=False, allow_infinity=False),
     "a number > 0": st.floats(0, exclude_min=True, allow_infinity=False),
     "a whole number >= 0 or adaptive": st.just("adaptive") | st.integers(0, 2**63 - 1),
     "a whole number >= 1 or null": st.none() | st.integers(1, 2**63 - 1),
@@ -507,7 +508,11 @@ def configurations(draw: st.DrawFn) -> Config:
     if is_table or types["critic.type"] != "network":
         given["env.observation_key"] = None
     if types["update.type"] == "mirror":
-        ignored = [key for key in given if key.startswith("update.") and (key == "update.step_size") != is_table]
+        ignored = [
+            key
+            for key in given
+            if key.startswith("update.") and (key.removeprefix("update.") in TABLE_OPTIONS) != is_table
+        ]
         given |= {key: None for key in ignored if key not in ("update.type", "update.state_weight")}
     if given["eval.every"] is None:
         given |= {"eval.stop_at_return": None, "eval.keep_best": False}
@@ -697,7 +702,7 @@ def test_the_environment_chooses_what_is_not_configured() -> None:
         ({"policy.channels": "[8]"}, ("cnn", "network", "auto")),
         ({"critic.step_size": "0.1"}, ("auto", "tabular", "auto")),
         ({"critic.learning_rate": "0.1"}, ("auto", "network", "auto")),
-        ({"update.step_size": "0.1"}, ("auto", "auto", "softmax")),
+        ({"update.step_size": "0.1"}, ("auto", "auto", "mirror")),
         ({"policy.type": "simplex", "update.step_size": "0.1"}, ("simplex", "auto", "projected")),
         ({"update.learning_rate": "0.1"}, ("auto", "auto", "cmpo")),
         ({"update.clip_range": "0.1"}, ("auto", "auto", "ppo")),

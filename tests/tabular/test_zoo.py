@@ -7,7 +7,18 @@ import pytest
 import torch
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder, random_mdp, tightrope
+from pgts_torch.tabular import (
+    TabularMDP,
+    combination_lock,
+    corridor,
+    deep_sea,
+    exact,
+    grid,
+    ladder,
+    random_mdp,
+    river_swim,
+    tightrope,
+)
 from tests.support import ZOO, always, outcomes_of, uniform_policy, zoo
 
 LEFT, RIGHT, UP, DOWN = range(4)
@@ -246,3 +257,68 @@ def test_the_mapping_seed_of_deep_sea_draws_which_action_is_right():
 def test_a_zoo_mdp_that_cannot_exist_is_refused_with_the_value(make, message):
     with pytest.raises(PgtsError, match=message):
         make()
+
+
+# Combination lock
+
+
+def test_one_action_of_each_state_of_a_combination_lock_goes_on_and_all_others_go_back():
+    mdp = combination_lock(6, 3, seed=4)
+    onward = [next(a for a in range(3) if s == 5 or (1.0, s + 1) in [*successors(mdp, s, a)]) for s in range(6)]
+    for s in range(5):
+        assert [successors(mdp, s, a) for a in range(3) if a != onward[s]] == [[(1.0, 0)]] * 2
+    assert list(rewards(mdp).values()) == [1.0]
+    ((s, right),) = rewards(mdp)
+    assert (s, float(mdp.outcomes.discount_NAK[s, right].max())) == (5, 0.0)
+    assert len({tuple(map(tuple, rewards(combination_lock(9, 4, seed=seed)))) for seed in range(9)}) > 1
+
+
+def test_a_combination_lock_is_worth_the_discount_of_its_length_and_by_chance_nearly_nothing():
+    mdp = combination_lock()
+    assert exact.optimal(mdp).J == pytest.approx(0.99**11)
+    assert 0 < exact.evaluate(mdp, uniform_policy(mdp)).J < 100 * 4.0**-12
+
+
+def successors(mdp: TabularMDP, s: int, a: int) -> list[tuple[float, int]]:
+    """(probability, next state) of what may follow."""
+    return sorted((p, child) for (child, _), p in outcomes_of(mdp, s, a).items())
+
+
+# River swim
+
+
+def test_river_swim_is_the_one_of_strehl_and_littman():
+    mdp = river_swim(6)
+    assert [successors(mdp, s, LEFT) for s in range(6)] == [[(1.0, max(s - 1, 0))] for s in range(6)]
+    assert [successors(mdp, s, RIGHT) for s in (0, 2, 5)] == [
+        [(0.3, 1), (0.7, 0)],
+        [(0.1, 1), (0.3, 3), (0.6, 2)],
+        [(0.3, 5), (0.7, 4)],
+    ]
+    assert rewards(mdp) == {(0, LEFT): 0.005, (5, RIGHT): 1.0}
+
+
+# Corridor
+
+
+def test_a_step_in_the_corridor_slips_to_either_side_and_off_the_long_sides_one_is_back_at_the_start():
+    mdp = corridor(3, 25)
+    assert (mdp.start_S.argmax(), mdp.shape) == (25, (3, 25))
+    assert successors(mdp, 25 + 7, RIGHT) == [(0.1, 7), (0.1, 57), (0.8, 33)]
+    assert successors(mdp, 7, RIGHT) == [(0.1, 25), (0.1, 32), (0.8, 8)]
+    assert successors(mdp, 7, UP) == [(0.1, 6), (0.1, 8), (0.8, 25)]
+    assert successors(mdp, 25, LEFT) == [(0.1, 0), (0.1, 50), (0.8, 25)]
+    assert successors(mdp, 25 + 23, RIGHT) == [(0.1, 23), (0.1, 73), (0.8, 49)]
+    assert float(mdp.outcomes.discount_NAK[48, RIGHT].min()) == 0.0
+
+
+def test_a_corridor_pays_at_its_end_alone():
+    reward_SA = corridor(3, 5).outcomes.reward_NA.view(3, 5, 4)
+    assert not reward_SA[:, :3].any()
+    torch.testing.assert_close(reward_SA[:, 3], torch.tensor([[0.0, 0.8, 0.1, 0.1]] * 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("slip", [-0.1, 1.5, math.nan])
+def test_a_corridor_does_not_slip_more_than_always(slip):
+    with pytest.raises(PgtsError, match="slip is"):
+        corridor(slip=slip)

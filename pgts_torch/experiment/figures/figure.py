@@ -70,7 +70,7 @@ class Figure:
     parameters: Sequence[Parameter]
     claims: Callable[[bool], list[Claim]]
     gamma: float = 0.9
-    critic: Description = field(default_factory=lambda: {"type": "tabular"})
+    critic: Description = field(default_factory=lambda: {"type": "tabular", "initial": 0.0})
     horizon: Description = field(default_factory=lambda: {"type": "fixed", "length": 40})
     num_envs: int = 32
 

@@ -1,0 +1,74 @@
+"""Do the defaults of tables learn what they have not been chosen on?
+
+Each problem with defaults only (gamma 0.99), at depth 16 and with an adaptive depth; before: with what the defaults
+were, a softmax gradient step of 0.1 weighted by the occupancy, episodes of 50 steps, unvisited states worth 0.
+"""
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pgts_torch import PGTS
+from pgts_torch.tabular import exact
+
+GAMMA, ENOUGH = 0.99, 0.95
+DEPTHS: tuple[int | Literal["adaptive"], ...] = (16, "adaptive")
+BEFORE: dict[str, Any] = {
+    "update": {"type": "softmax", "step_size": 0.1, "state_weight": "occupancy"},
+    "horizon": {"type": "fixed", "length": 50},
+    "critic": {"type": "tabular", "initial": 0.0},
+}
+
+BEFORE_SEEDS = 3
+"""So many seeds are enough to see how it was."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """An environment, and how many steps it gets."""
+
+    name: str
+    id: str
+    kwargs: dict[str, Any]
+    steps: int = 50_000
+
+
+TASKS = (
+    Task("FrozenLake 4x4", "FrozenLake-v1", {}),
+    Task("FrozenLake 8x8", "FrozenLake8x8-v1", {}),
+    Task("CliffWalking", "CliffWalking-v1", {}),
+    Task("CliffWalking, slippery", "CliffWalking-v1", {"is_slippery": True}),
+    Task("combination lock", "pgts/CombinationLock-v0", {}),
+    Task("river swim", "pgts/RiverSwim-v0", {}),
+    Task("slippery corridor", "pgts/Corridor-v0", {}),
+    Task("Taxi", "Taxi-v4", {}, 200_000),
+    Task("Taxi, rainy", "Taxi-v4", {"is_rainy": True}, 200_000),
+)
+
+
+def share(task: Task, depth: int | Literal["adaptive"], seed: int, options: dict[str, Any]) -> float:
+    """(J - J_uniform) / (J* - J_uniform) after training."""
+    model = PGTS(task.id, depth=depth, gamma=GAMMA, seed=seed, env_kwargs=task.kwargs, **options)
+    uniform = exact.evaluate(model.mdp, model.policy_table()).J
+    model.learn(task.steps)
+    return (exact.evaluate(model.mdp, model.policy_table()).J - uniform) / (exact.optimal(model.mdp).J - uniform)
+
+
+def shown(shares: Sequence[float]) -> str:
+    """How many are enough; median and least."""
+    enough = sum(value >= ENOUGH for value in shares)
+    return f"{enough} of {len(shares)} ({statistics.median(shares):.3f}, {min(shares):.3f})"
+
+
+def table(seeds: Sequence[int], *, short: bool = False) -> None:
+    """Print the table in Markdown, row by row; short: two problems at depth 16, and a fifth of the steps."""
+    print(f"At least {ENOUGH:.0%} of the way from the uniform policy to J*: in how many seeds (median, least).\n")
+    print("| problem | steps | depth | defaults before | defaults |")
+    print("|---|---|---|---|---|", flush=True)
+    for task in (TASKS[0], TASKS[2]) if short else TASKS:
+        for depth in DEPTHS[:1] if short else DEPTHS:
+            made = Task(task.name, task.id, task.kwargs, task.steps // 5) if short else task
+            before = [share(made, depth, seed, BEFORE) for seed in seeds[:BEFORE_SEEDS]]
+            now = [share(made, depth, seed, {}) for seed in seeds]
+            print(f"| {made.name} | {made.steps:,} | {depth} | {shown(before)} | {shown(now)} |", flush=True)
