@@ -18,14 +18,14 @@ class OutcomeSampler:
     possible outcome on, so that a row which sums to a little less than 1 has no gap at its end.
 
     Pairs (s, a) and outcomes are named by their position in the flattened tables: `pair = s * A + a`, and an outcome
-    indexes `child_SAK` and `discount_SAK` by `take`. K is padded to a power of two.
+    indexes `reward_SAK`, `child_SAK` and `discount_SAK` by `take`. K is padded to a power of two.
     """
 
     def __init__(self, mdp: TabularMDP) -> None:
         outcomes = mdp.outcomes
         self.num_actions = mdp.num_actions
         self.width = 1 << (outcomes.num_outcomes - 1).bit_length()
-        self.reward_SA = outcomes.reward_NA.numpy()
+        self.reward_SAK = _pad(mdp.outcome_reward_SAK.numpy(), self.width, 0.0)
         self.discount_SAK = _pad(outcomes.discount_NAK.numpy(), self.width, 0.0)
         self.child_SAK = _pad(outcomes.child_NAK.numpy(), self.width, 0)
         self.cumulative_SAK = _pad(_distribution_function(outcomes.prob_NAK.numpy()), self.width, 1.0)

@@ -20,9 +20,8 @@ RENDER_FPS = 4
 class TabularEnv(gymnasium.Env):
     """A tabular MDP to act in: the observation is the state's number.
 
-    The reward of a step is the expected r(s, a) of the table, whichever outcome is drawn. `info["discount"]` is the
-    discount of the drawn outcome, as `metadata["discounts"]` declares, and `terminated` says that it is 0. There is no
-    time limit inside; registration adds one as a wrapper.
+    A step pays the reward of the drawn outcome. `info["discount"]` is its discount, as `metadata["discounts"]` declares,
+    and `terminated` says that it is 0. There is no time limit inside; registration adds one as a wrapper.
 
     Args:
         mdp: the MDP; kept as `mdp`.
@@ -87,7 +86,7 @@ class TabularEnv(gymnasium.Env):
         self._ended = discount == 0
         self.last_action = int(action)
         self.num_steps += 1
-        return self._state, float(self._sampler.reward_SA.take(pair)), self._ended, False, {"discount": discount}
+        return self._state, float(self._sampler.reward_SAK.take(outcome)), self._ended, False, {"discount": discount}
 
     def render(self) -> RenderFrame | list[RenderFrame] | None:
         """A text or a picture [height, width, 3], as `render_mode` says."""

@@ -122,7 +122,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         outcome_B = self._sampler.outcomes(self.np_random, pair_B)
         self._state_B = self._sampler.child_SAK.take(outcome_B)
         self._elapsed_B += 1
-        reward_B = self._sampler.reward_SA.take(pair_B)
+        reward_B = self._sampler.reward_SAK.take(outcome_B)
         discount_B = self._sampler.discount_SAK.take(outcome_B)
         stepped_B = ~self._over_B
         if self._over_B.any():
