@@ -20,8 +20,8 @@ RENDER_FPS = 4
 class TabularEnv(gymnasium.Env):
     """A tabular MDP to act in: the observation is the state's number.
 
-    A step pays the reward of the drawn outcome. `info["discount"]` is its discount, as `metadata["discounts"]` declares,
-    and `terminated` says that it is 0. There is no time limit inside; registration adds one as a wrapper.
+    A step pays the reward of the drawn outcome. `info["discount"]` is its discount, as `metadata["discounts"]` says, and
+    `terminated` says that it is 0. There is no time limit inside; registration adds one as a wrapper.
 
     Args:
         mdp: the MDP; kept as `mdp`.
