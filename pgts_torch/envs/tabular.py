@@ -20,7 +20,7 @@ RENDER_FPS = 4
 class TabularEnv(gymnasium.Env):
     """A tabular MDP to act in: the observation is the state's number.
 
-    A step pays the reward of the drawn outcome. `info["discount"]` is its discount, as `metadata["discounts"]` says, and
+    A step pays the reward of the drawn outcome. `info["discount"]` is its discount (`metadata["discounts"]`), and
     `terminated` says that it is 0. There is no time limit inside; registration adds one as a wrapper.
 
     Args:
