@@ -337,6 +337,7 @@ class _Recorder:
             seconds=seconds,
             deterministic=deterministic,
             sampled=sampled,
+            parts=", ".join(type(part).__name__ for part in (algorithm.policy, algorithm.critic, algorithm.update)),
             notes=tuple(filter(None, (self._advice(exactly), greedy_is_worse(deterministic, sampled)))),
         )
 

@@ -33,6 +33,7 @@ class Summary:
     ended_by: what ended the training: the certificate came down to `search.stop_at`, greedy episodes reached
         `eval.stop_at_return`, or neither before `total_steps`.
     notes: what the user should know of a run that learned little (`experiment.advice`).
+    parts: the classes of policy, critic and update, also where the environment chose them.
     """
 
     run: str
@@ -53,6 +54,7 @@ class Summary:
     sampled: Evaluation
     certificate_confidence: float = 1.0
     notes: tuple[str, ...] = ()
+    parts: str = ""
 
 
 def from_json(content: Mapping[str, Any]) -> Summary:
@@ -98,6 +100,7 @@ def rows(summary: Summary) -> dict[str, str]:
         "greedy episodes, return": _score_text(summary.deterministic),
         "sampled episodes, return": _score_text(summary.sampled),
         **({"note": "; ".join(summary.notes)} if summary.notes else {}),
+        **({"policy, critic, update": summary.parts} if summary.parts else {}),
         "search": summary.search,
         "training ended by": ended,
         "environment steps": f"{summary.env_steps} in {summary.iterations} iterations",

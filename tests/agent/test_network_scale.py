@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from gymnasium.wrappers import TransformReward
 
 from pgts_torch import PGTS
 
@@ -76,6 +77,18 @@ def test_rewards_times_a_power_of_two_leave_every_bit_of_the_policy(depth: int, 
     for power in (-40, 40):
         assert same(trained(lambda: Cart(2.0**power), depth=depth, critic=critic), plain)  # noqa: B023
     assert not same(trained(lambda: Cart(-1.0), depth=depth, critic=critic), plain)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "FrozenLake-v1"])
+def test_dynamics_and_tables_behind_a_wrapper_of_rewards_know_no_unit_either(env_id: str):
+    def scaled(unit: float) -> PGTS:
+        return trained(lambda: TransformReward(gymnasium.make(env_id), lambda r: unit * float(r)), depth=2)
+
+    plain = scaled(1.0)
+    assert type(plain.world).__name__ == ("DynamicsWorld" if env_id == "CartPole-v1" else "TabularWorld")
+    assert same(scaled(2.0**-30), plain)
+    assert same(scaled(2.0**30), plain)
+    assert not same(scaled(-1.0), plain)
 
 
 def test_values_are_in_the_unit_of_the_rewards():

@@ -155,8 +155,8 @@ def test_two_reports_of_a_run_are_the_same(finished, shown, tmp_path):
 def test_keys_that_differ_from_the_defaults_are_marked(shown):
     settings = {setting["key"]: setting for setting in shown[1]["config"]}
     changed = {key for key, setting in settings.items() if not setting["is_default"]}
-    assert {"total_steps", "env.kwargs.n", "policy.init.type", "update.step_size", "run.dir"} <= changed
-    assert not {"seed", "env.id", "policy.type", "critic.method.lambda", "policy.init.probability"} & changed
+    assert {"total_steps", "env.kwargs.n", "policy.type", "policy.init.type", "update.step_size", "run.dir"} <= changed
+    assert not {"seed", "env.id", "critic.method.lambda", "policy.init.probability"} & changed
     assert (settings["update.step_size"]["value"], settings["update.step_size"]["default"]) == (2.0, 0.1)
 
 

@@ -178,6 +178,14 @@ def test_a_table_in_an_environment_without_numbered_states_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_summary_says_what_the_environment_chose(tmp_path):
+    few = ["--total_steps", "20", "--rollout.num_envs", "2", "--rollout.horizon.length", "5", "--search.depth", "0"]
+    quiet = ["--run.tensorboard", "false", "--eval.episodes", "1", "--run.dir", str(tmp_path / "run")]
+    summary = run.train(load(None, ["--env.id", "CartPole-v1", *few, *quiet]))
+    assert summary.parts == "NetworkPolicy, NetworkCritic, CMPOUpdate"
+    assert "policy, critic, update      NetworkPolicy, NetworkCritic, CMPOUpdate" in describe(summary)
+
+
 def test_the_environment_chooses_the_parts_that_PGTS_chooses():
     for env_id in ("CartPole-v1", "FrozenLake-v1"):
         configured, own = run.build(load(None, ["--env.id", env_id])), PGTS(env_id)

@@ -1,0 +1,84 @@
+"""The defaults of networks: CartPole, Acrobot and a sparse puzzle seen as an image, beside the default of before."""
+
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import key_and_door
+
+from pgts_torch import PGTS
+from pgts_torch.agent.evaluate import evaluate
+
+MOST_STEPS = 50_000
+EVERY = 4_000
+"""Environment steps from one look at the policy to the next."""
+
+EPISODES = 100
+"""Fresh episodes that a policy must stand which seemed to be good enough in a look of 20."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """An environment, the mean return of greedy episodes that counts as learned, and in how many of ten seeds."""
+
+    env_id: str
+    target: float
+    wanted: int
+
+
+TASKS = (Task("CartPole-v1", 475, 10), Task("Acrobot-v1", -100, 10), Task(key_and_door.ID, 0.95, 8))
+
+FORMS: dict[str, dict[str, Any]] = {"before": {"update": "ppo"}, "after": {}}
+"""Options of `PGTS`. Before this version the default update was PPO, whose options are as they were."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The return of greedy episodes at the end, after how many steps it was reached (None: it was not), and seconds."""
+
+    value: float
+    steps: int | None
+    seconds: float
+
+
+def trained(task: Task, options: dict[str, Any], seed: int, most_steps: int) -> Outcome:
+    """Train until the target is reached in a look and then in fresh episodes, or the steps are used up."""
+    began, model = time.perf_counter(), PGTS(task.env_id, seed=seed, **options)
+    for total in [*range(EVERY, most_steps, EVERY), most_steps]:
+        model.learn(total)
+        if evaluate(model, episodes=20, seed=seed).episodic_return.mean < task.target and total < most_steps:
+            continue
+        value = evaluate(model, episodes=EPISODES, seed=10_000 + seed).episodic_return.mean
+        if value >= task.target:
+            return Outcome(value, model.num_env_steps, time.perf_counter() - began)
+    return Outcome(value, None, time.perf_counter() - began)
+
+
+def row(task: Task, form: str, outcomes: list[Outcome]) -> str:
+    steps = [each.steps for each in outcomes if each.steps is not None]
+    needed = f"{statistics.median(steps):,.0f} ({min(steps):,} to {max(steps):,})" if steps else "-"
+    values = [each.value for each in outcomes]
+    return (
+        f"| {task.env_id} | {form} | {len(steps)} of {len(outcomes)} | {needed} "
+        f"| {statistics.median(values):.4g} ({min(values):.4g} to {max(values):.4g}) "
+        f"| {statistics.median(each.seconds for each in outcomes):.0f} |"
+    )
+
+
+def lines(
+    seeds: list[int], *, short: bool, tasks: tuple[Task, ...] = TASKS, forms: tuple[str, ...] = tuple(FORMS)
+) -> Iterator[str]:
+    yield "| environment | default | learned | steps: median (range) | greedy return: median (range) | seconds |"
+    yield "|---|---|---|---|---|---|"
+    for task in tasks:
+        for form in forms:
+            most = EVERY if short else MOST_STEPS
+            yield row(task, form, [trained(task, FORMS[form], seed, most) for seed in seeds])
+
+
+def table(seeds: list[int], *, short: bool) -> None:
+    """Print the table, a line as soon as it is known. Short: two seeds, few steps."""
+    for line in lines(seeds, short=short):
+        print(line, flush=True)
