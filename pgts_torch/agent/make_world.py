@@ -34,7 +34,7 @@ from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import adapter_for
 from pgts_torch.models.trial import dynamics_contradiction
 from pgts_torch.models.walks import Setup
-from pgts_torch.models.wrappers import check_transforms, transforms_of, wrappers_of
+from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_of, wrappers_of
 from pgts_torch.seeding import SharedGenerators, numpy_stream
 from pgts_torch.tabular.mdp import check_gamma
 
@@ -131,9 +131,20 @@ class _Sought:
         return list(range(int(self.copies.single_action_space.n)))  # type: ignore[attr-defined]  # checked before
 
     @cached_property
+    def new(self) -> gymnasium.Env:
+        """One that is only looked at."""
+        return self.fresh()
+
+    @cached_property
+    def others(self) -> list[set[str]]:
+        """The attributes in which each copy differs from a new instance, in whatever state it is."""
+        held = attributes(self.new)
+        return [different(held, attributes(copy)) for copy in self.envs.envs]
+
+    @cached_property
     def own_to_each(self) -> frozenset[str]:
-        """The attributes in which new instances differ."""
-        return frozenset(own_to_each(self.fresh))
+        """The attributes in which new instances differ; more of them are made only where the copies do."""
+        return frozenset(own_to_each(self.fresh)) if any(self.others) else frozenset()
 
 
 def _first_model(
@@ -162,27 +173,23 @@ def _first_model(
 
 def _check_wrappers(sought: _Sought) -> None:
     """MissingModel unless the wrappers change nothing, or single answers, each by itself."""
-    env = sought.fresh()
-    transforms_of(env)
+    if transforms_of(sought.envs.envs[0]) == Transforms():
+        return
     with _told_where_it_stops_a_training():
-        check_transforms(env, sought.actions, sought.random)
+        check_transforms(sought.fresh(), sought.actions, sought.random)
 
 
 def _check_alike(sought: _Sought) -> None:
     """MissingModel if a copy is not what making another one gives, in whatever state it is: a model is made of that."""
-    new, of_state = sought.fresh(), set[str]()
-    kinds, held = _kinds(new), attributes(new)
-    for k, copy in enumerate(sought.envs.envs):
-        if _kinds(copy) != kinds:
-            raise MissingModel(f"the copies of {sought.name} are of different classes, and a model is of one of them")
-        own = attributes(copy)
-        names = different(held, own)
-        if names and not of_state:
-            of_state = _changing(sought) | sought.own_to_each
-        if names := names - of_state:
-            raise MissingModel(
-                f"copy {k} of {sought.name} has {told(min(names), own, held)}, and a model is of all: make them alike"
-            )
+    if any(_kinds(copy) != _kinds(sought.new) for copy in sought.envs.envs):
+        raise MissingModel(f"the copies of {sought.name} are of different classes, and a model is of one of them")
+    if not any(sought.others):
+        return
+    of_state = _changing(sought) | sought.own_to_each
+    for k, others in enumerate(sought.others):
+        if names := others - of_state:
+            what = told(min(names), attributes(sought.envs.envs[k]), attributes(sought.new))
+            raise MissingModel(f"copy {k} of {sought.name} has {what}, and a model is of all: make them alike")
 
 
 def _changing(sought: _Sought) -> set[str]:
@@ -233,12 +240,13 @@ def _table(sought: _Sought) -> TabularWorld | None:
 
 def _dynamics(sought: _Sought) -> DynamicsWorld | None:
     """The dynamics of classic control in torch; None elsewhere."""
-    env = sought.fresh()
+    env = sought.envs.envs[0]
     kind = next((kind for kind in CLASSIC if type(env.unwrapped) is kind.env_class), None)
     if kind is None:
         return None
     if why := kind.obstacle(env) or _own(sought, kind.constants):
         raise MissingModel(f"the dynamics in torch of {kind.env_class.__name__} are not used: {why}")
+    env = sought.fresh()
     if why := dynamics_contradiction(kind(env, gamma=sought.gamma), env, sought.random):
         raise MissingModel(f"the dynamics in torch of {kind.env_class.__name__} are not used: {why}")
     model = kind(env, gamma=sought.gamma, action_repeat=sought.action_repeat, device=sought.device)
@@ -247,7 +255,7 @@ def _dynamics(sought: _Sought) -> DynamicsWorld | None:
 
 def _simulator(sought: _Sought) -> SimulatedWorld:
     """A simulator that is restored from snapshots."""
-    key, env = sought.observation_key, sought.fresh()
+    key, env = sought.observation_key, sought.envs.envs[0]
     adapter = adapter_for(env)
     if adapter.restored is not None and (why := _own(sought, sought.own_to_each)):
         raise MissingModel(f"{sought.name} cannot be restored: {why}, which is in no snapshot")

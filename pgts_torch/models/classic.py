@@ -28,6 +28,7 @@ from pgts_torch.models.numbering import Merge
 from pgts_torch.models.provenance import overridden
 from pgts_torch.models.rewards import value_range
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.steps import number_of
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.models.wrappers import transforms_of
 
@@ -150,7 +151,7 @@ class ClassicModel(TensorModel, ExactModel):
         reward_N, terminated_N, following = self._move(state_ND.unbind(-1), effect)
         if self.transforms.rewards:
             distinct, index_N = reward_N.unique(return_inverse=True)
-            paid = [float(self.transforms.reward(reward)) for reward in distinct.tolist()]
+            paid = [number_of("reward", self.transforms.reward(reward)) for reward in distinct.tolist()]
             reward_N = torch.tensor(paid, dtype=self.dtype, device=self.device)[index_N]
         discount_N = torch.full_like(reward_N, self.gamma).masked_fill_(terminated_N, 0.0)
         return reward_N, discount_N, torch.stack(list(following), -1)
@@ -177,7 +178,7 @@ class ClassicModel(TensorModel, ExactModel):
             return self._reward_range()
         if not self.pays_ends_only:
             return -math.inf, math.inf
-        ends = [float(self.transforms.reward(end)) for end in self._reward_range()]
+        ends = [number_of("reward", self.transforms.reward(end)) for end in self._reward_range()]
         return min(ends), max(ends)
 
     def _constants_of(self, base: Any) -> dict[str, Any]:

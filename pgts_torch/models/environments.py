@@ -68,9 +68,14 @@ def spec_like(env: gymnasium.Env) -> EnvSpec:
     name = env_name(env)
     if env.spec is None:
         raise PgtsError(f"{name} has no spec to make another instance from: give a function that makes one")
-    made = make_env(env.spec)
-    kinds = [[type(layer) for layer in (*wrappers_of(one), one.unwrapped)] for one in (env, made)]
     way_out = "give a function that makes it as it is"
+    try:
+        made = make_env(env.spec)
+    except PgtsError as error:
+        raise PgtsError(
+            f"{name} was given as an instance that its spec cannot make again ({error}): {way_out}"
+        ) from error
+    kinds = [[type(layer) for layer in (*wrappers_of(one), one.unwrapped)] for one in (env, made)]
     if kinds[0] != kinds[1]:
         given, other = (" in ".join(kind.__name__ for kind in reversed(each)) for each in kinds)
         raise PgtsError(f"{name} was given as an instance, {given}, of whose spec comes {other}: {way_out}")

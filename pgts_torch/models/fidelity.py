@@ -1,6 +1,7 @@
 """Whether a simulator can serve as a model: what a search relies on, tried out, and what a call costs."""
 
 import functools
+import itertools
 import random
 import time
 from collections.abc import Callable, Sequence
@@ -170,15 +171,17 @@ def why_not(setup: Setup, *, seconds: float = 0.4) -> str:
     it is told where it stops a training.
     """
     try:
+        _nothing_beside(setup)
         longest = int(np.clip(seconds / (_STEPS_IN_ALL * _seconds_of_a_step(setup)), 2, _LONG_LENGTH))
         few = setup.actions[: max(2, min(longest, _ACTIONS_TRIED))]
         short = replace(setup, longest=longest, actions=few)
-        _nothing_beside(setup)
-        many = _SHORT_WALKS if setup.alike else _WALKS_APART
+        # Making one may take long: where all are alike one walks, one draws and one walks again, in turn.
+        three = itertools.cycle([setup.make() for _ in range(3)]) if setup.alike else None
+        many, turns = (_WALKS_APART, short) if three is None else (_SHORT_WALKS, replace(short, make=three.__next__))
         for count, length in ((many, min(longest, _SHORT_LENGTH)), (1, longest)):
-            walks = walks_of(short, count, length)
-            _chance(short, walks)
-            _restore(walks, replays(short, walks))
+            walks = walks_of(turns, count, length)
+            _chance(turns, walks)
+            _restore(walks, replays(turns, walks))
         _untouched(short, min(longest, _SHORT_LENGTH), width=max(1, min(_WIDTH, longest // _WIDTH)))
     except _Missing as missing:
         return str(missing)

@@ -13,6 +13,7 @@ from pgts_torch.errors import MissingModel
 from pgts_torch.models.environments import base_actions
 from pgts_torch.models.provenance import origin, overridden
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.steps import number_of
 from pgts_torch.models.tabular import tabular_truth
 from pgts_torch.models.trial import counted_starts, table_contradiction
 from pgts_torch.models.wrappers import Transforms, transforms_of
@@ -25,7 +26,10 @@ _STARTS = "initial_state_distrib"
 def publishes_table(env: gymnasium.Env) -> bool:
     """Whether there is an `mdp` or something called P."""
     base: Any = env.unwrapped
-    return isinstance(getattr(base, "mdp", None), TabularMDP) or getattr(base, "P", None) is not None
+    try:
+        return isinstance(getattr(base, "mdp", None), TabularMDP) or getattr(base, "P", None) is not None
+    except Exception:  # a property of another meaning
+        return False
 
 
 def table_of(env: gymnasium.Env, *, gamma: float, generator: np.random.Generator) -> tuple[TabularMDP, bool]:
@@ -91,7 +95,7 @@ def _published(env: gymnasium.Env, gamma: float, transforms: Transforms, generat
         positions = [_position(base, action) for action in base_actions(env)]
         P: Any = {
             s: [
-                [(p, child, float(transforms.reward(reward)), end) for p, child, reward, end in base.P[s][a]]
+                [(p, child, number_of("reward", transforms.reward(r)), end) for p, child, r, end in base.P[s][a]]
                 for a in positions
             ]
             for s in range(len(base.P))
@@ -117,7 +121,7 @@ def _transformed(mdp: TabularMDP, positions: Sequence[int], transforms: Transfor
     order, old = torch.tensor(positions), mdp.outcomes
     reward_SA = old.reward_NA[:, order]
     if transforms.rewards:
-        reward_SA = reward_SA.clone().apply_(lambda reward: float(transforms.reward(reward)))
+        reward_SA = reward_SA.clone().apply_(lambda reward: number_of("reward", transforms.reward(reward)))
     prob_SAK, discount_SAK, child_SAK = (x[:, order] for x in (old.prob_NAK, old.discount_NAK, old.child_NAK))
     outcomes = Outcomes(reward_SA, prob_SAK, discount_SAK, child_SAK, old.num_children)
     return replace(mdp, outcomes=outcomes, action_names=tuple(mdp.action_names[a] for a in positions))

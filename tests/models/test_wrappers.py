@@ -16,7 +16,7 @@ from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.world import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import MissingModel
 from pgts_torch.models import SimulatorModel
-from tests.agent.test_make_world import FIRST, Cells, Walk, agrees, reached, refusal_of, row_of_cells, world_of
+from tests.agent.cells import FIRST, Cells, Walk, agrees, reached, refusal_of, row_of_cells, world_of
 
 
 def cart() -> gymnasium.Env:
@@ -161,6 +161,15 @@ def test_wrappers_that_change_nothing_are_looked_through():
 # Applied
 
 
+class ThreeOfTwo(gymnasium.ActionWrapper):
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self.action_space = spaces.Discrete(3)
+
+    def action(self, action: Any) -> Any:
+        return (1, 0, 1)[action]
+
+
 @pytest.mark.parametrize(
     ("make", "kind"),
     [
@@ -174,6 +183,8 @@ def test_wrappers_that_change_nothing_are_looked_through():
         (lambda: wrappers.TransformObservation(Walk(), lambda seen: 2 * seen, spaces.Box(-9, 9, (1,))), SimulatedWorld),
         (lambda: wrappers.TransformAction(Walk(), lambda action: 1 - action, None), SimulatedWorld),
         (lambda: wrappers.TransformAction(cart(), lambda action: 1 - action, None), DynamicsWorld),
+        (lambda: ThreeOfTwo(cart()), DynamicsWorld),
+        (lambda: ThreeOfTwo(Cells(row_of_cells(), starts=FIRST)), TabularWorld),
         (lambda: wrappers.TransformReward(Cells(row_of_cells(), starts=FIRST), tenth), TabularWorld),
         (lambda: wrappers.TransformAction(Cells(row_of_cells(), starts=FIRST), lambda a: 1 - a, None), TabularWorld),
         (lambda: wrappers.TransformReward(gymnasium.make("pgts/Ladder-v0"), lambda r: r - 1), TabularWorld),
