@@ -89,7 +89,7 @@ class Stopped(Exception):
         self.signal = signal
 
 
-def check_count(name: str, value: int) -> None:
-    """PgtsError unless it is a whole number of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise PgtsError(f"{name} is {value!r}; it must be a whole number of at least 1")
+def check_count(name: str, value: int, *, least: int = 1) -> None:
+    """PgtsError unless it is a whole number of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise PgtsError(f"{name} is {value!r}; it must be a whole number of at least {least}")

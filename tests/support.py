@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -134,3 +135,14 @@ def tree_lookahead(mdp: TabularMDP, q_SA: Tensor, depth: int) -> Tensor:
     followers = [[outcomes_of(mdp, s, a) for a in range(mdp.num_actions)] for s in range(mdp.num_states)]
     table = [[value(s, a, depth) for a in range(mdp.num_actions)] for s in range(mdp.num_states)]
     return torch.tensor(table, dtype=torch.float64)
+
+
+def same_values(first: Any, second: Any) -> bool:
+    """Whether nested plain values and tensors are alike in every bit; NaN is like NaN."""
+    if isinstance(first, Tensor):
+        return torch.equal(first, second) and first.dtype == second.dtype
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same_values(first[key], second[key]) for key in first)
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(same_values, first, second))
+    return first == second or (first != first and second != second)

@@ -86,16 +86,25 @@ class EvalCallback:
     def _evaluated(self, algorithm: PGTS) -> Evaluation:
         return evaluate(algorithm, episodes=self.episodes, deterministic=self.deterministic, seed=self.seed)
 
+    def forget(self) -> None:
+        """All evaluations so far: the next one is the best."""
+        self.history, self.best = [], None
+
     def state_dict(self) -> dict[str, Any]:
         """The evaluations so far, as plain values."""
         return {"history": [asdict(made) for made in self.history]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take over what `state_dict` gave."""
+        for made in state["history"]:
+            check_count("env_steps", made["env_steps"])
         self.history = [Evaluated(made["env_steps"], _evaluation(**made["evaluation"])) for made in state["history"]]
         self.best = max(self.history, key=lambda made: made.mean, default=None)
 
 
 def _evaluation(episodes: int, **scores: Mapping[str, Any]) -> Evaluation:
+    check_count("episodes", episodes)
     made = {name: Score(**score) for name, score in scores.items()}
+    if not all(isinstance(score.mean, float) for score in made.values()):
+        raise PgtsError("a mean is no number")
     return Evaluation(episodes, made["episodic_return"], made["discounted_return"], made["episodic_length"])

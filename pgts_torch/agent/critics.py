@@ -217,10 +217,10 @@ class TabularCritic(Critic):
         return {"value_C": self._value_C.cpu().clone(), "count_C": self._count_C.cpu().clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._value_C, self._count_C = (
-            fitting(state, "value_C", self._value_C),
-            fitting(state, "count_C", self._count_C),
-        )
+        value_C, count_C = fitting(state, "value_C", self._value_C), fitting(state, "count_C", self._count_C)
+        if not bool((count_C >= 0).all()):
+            raise PgtsError("count_C has negative counts")
+        self._value_C, self._count_C = value_C, count_C
 
     def _targets(self, rollout: Rollout, v: Callable[[Tensor], Tensor]) -> Float[Tensor, "T B"]:
         next_TB = rollout.next_state_TB

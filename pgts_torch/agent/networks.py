@@ -281,6 +281,9 @@ class Network(nn.Module):
             raise PgtsError(f"{unknown[0]} belongs to another network; this one has {sorted(own)}")
         found = {name: fitting(dict(state), name, like) for name, like in own.items()}
         for name, value in found.items():
+            if name.rpartition(".")[2] in ("count", "square_D") and bool((value < 0).any()):
+                raise PgtsError(f"{name} is negative")
+        for name, value in found.items():
             own[name].copy_(value)
 
 

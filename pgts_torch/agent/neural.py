@@ -206,10 +206,16 @@ class NetworkCritic(Critic):
         wanted = {"network", "optimiser", "mean", "scale", "num_fits"} | ({"target_network"} if self._lags else set())
         if set(state) != wanted:
             raise PgtsError(f"the state of a network critic has {sorted(wanted)}; this one has {sorted(state)}")
+        if not isinstance(state["mean"], float):
+            raise PgtsError(f"mean is {state['mean']!r}; it must be a number")
+        if not (isinstance(state["scale"], float) and state["scale"] >= 0):
+            raise PgtsError(f"scale is {state['scale']!r}; it must be at least 0")
+        check_count("num_fits", state["num_fits"], least=0)
         self.network.take_over(state["network"])
         if self._lags:
             self._target_network.take_over(state["target_network"])
         self._optimiser.load_state_dict(state["optimiser"])
+        self._optimiser.check_fits(self.network.weights)
         self._asked = None
         self._mean, self._scale, self._num_fits = state["mean"], state["scale"], state["num_fits"]
 

@@ -135,6 +135,11 @@ class NetworkUpdate(Update):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._optimiser.load_state_dict(state)
 
+    def check(self, policy: Policy) -> None:
+        super().check(policy)
+        if isinstance(policy, NetworkPolicy):
+            self._optimiser.check_fits(policy.network.weights)
+
     @abstractmethod
     def check_options(self) -> None:
         """PgtsError if an option beside those above is out of range."""

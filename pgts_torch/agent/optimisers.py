@@ -105,15 +105,24 @@ class Optimiser:
             "second_D": self._second_D.cpu().clone(),
         }
 
+    def check_fits(self, parameters: Sequence[Tensor]) -> None:
+        """PgtsError unless the moments, if there are any, are those of these parameters."""
+        size, dtype = sum(each.numel() for each in parameters), parameters[0].dtype
+        if self._first_D is not None and (self._first_D.shape != (size,) or self._first_D.dtype != dtype):
+            found = f"{self._first_D.dtype} of shape {tuple(self._first_D.shape)}"
+            raise PgtsError(f"the moments of the optimiser are {found}; the network has {size} parameters in {dtype}")
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` gave; PgtsError if it is something else."""
         if not state:
             self._num_steps, self._first_D, self._second_D = 0, None, None
             return
         num_steps, first_D = state.get("num_steps"), state.get("first_D")
-        if not isinstance(num_steps, int) or num_steps < 1 or not isinstance(first_D, Tensor) or self.method == "sgd":
+        if type(num_steps) is not int or num_steps < 1 or not isinstance(first_D, Tensor) or self.method == "sgd":
             raise PgtsError(f"{self.method} cannot take over {sorted(state)} with num_steps = {num_steps}")
         second_D = fitting(state, "second_D", first_D)
+        if not bool((second_D >= 0).all()):
+            raise PgtsError("second_D has negative squares")
         self._num_steps, self._first_D, self._second_D = num_steps, first_D.clone(), second_D
 
 

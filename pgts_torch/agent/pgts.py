@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self, final
 
@@ -39,8 +40,9 @@ from pgts_torch.agent.policies import Policy, listed
 from pgts_torch.agent.ranks import checksum, present_ranks
 from pgts_torch.agent.rollout import Horizon, Rollout, rollout
 from pgts_torch.agent.sharing import whole_lookahead, whole_rollout
+from pgts_torch.agent.states import NO_STATE, check_keys, take_over
 from pgts_torch.agent.updates import Update
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.search.engine import Search
@@ -48,6 +50,7 @@ from pgts_torch.search.lookahead import Leaf, Lookahead, check_finite
 from pgts_torch.seeding import SharedGenerators, stream
 from pgts_torch.tabular.ascent import centred
 from pgts_torch.tabular.mdp import TabularMDP
+from pgts_torch.trust import check_imports
 
 Callback = Callable[["PGTS", Iteration], bool | None]
 """Called after each iteration; returning False ends the training. `agent.callbacks` has some."""
@@ -441,6 +444,7 @@ class PGTS:
         *,
         env: EnvSource | VectorEnv | None = None,
         device: torch.device | str | None = None,
+        trust_imports: bool = False,
     ) -> Self:
         """The model that `save` wrote; it trains on exactly as the saved one would have.
 
@@ -450,41 +454,44 @@ class PGTS:
         Args:
             env: the environment, where it was given to the saved model as an object; default its id.
             device: where to load it; default the device it was saved from.
+            trust_imports: import the module that the id of its environment may name, as in "module:Id-v0". Nothing
+                else in a file is executed.
 
         Raises:
-            PgtsError: no such file, damaged, or not ours; or an environment is needed, or is not.
+            PgtsError: no such file, damaged, or not ours; or it names a module that is not trusted; or an environment
+                is needed, or is not.
         """
         content = saving.read(path)
         if content.keys() != {"arguments", "state"}:
             raise PgtsError(f"{path} holds {sorted(map(str, content))}, not a model")
-        arguments, saved_env = content["arguments"], content["arguments"]["env"]
+        arguments = content["arguments"]
+        check_keys(f"{path}: arguments", arguments, {"env"}, others=set(signature(cls).parameters))
+        saved_env = arguments["env"]
         if (env is None) == (saved_env is None):
             raise PgtsError(
                 f"{path} names no environment, for it was given as an object: load it with env=..."
                 if env is None
                 else f"env is {env!r}; {path} has its own, {saved_env}"
             )
+        if not trust_imports:
+            check_imports(path, saved_env, arguments.get("env_kwargs"))
         arguments |= {"env": saved_env if env is None else env}
-        model = cls(**arguments | ({} if device is None else {"device": str(device)}))
-        model.load_state_dict(content["state"])
+        try:
+            model = cls(**arguments | ({} if device is None else {"device": str(device)}))
+        except NO_STATE as error:
+            if isinstance(error, PgtsError):
+                raise
+            raise PgtsError(f"{path}: its arguments make no model: {type(error).__name__}: {error}") from error
+        try:
+            model.load_state_dict(content["state"])
+        except PgtsError as error:
+            raise PgtsError(f"{path}: {error}") from error
         return model
 
     def state_dict(self) -> dict[str, Any]:
         """Policy, critic, update, what the search of each rank remembers, and counters: tensors on the CPU and plain
         values. Of several processes all must ask for it."""
-        search, with_states = self.search, self.world.mdp is not None
-        certificates = self.certificates
-        searches = self.ranks.gather(
-            "searches",
-            lambda: (
-                {}
-                if search is None or certificates is None
-                else {
-                    **search.state_dict(with_states=with_states),
-                    "upper": certificates.state_dict(with_states=with_states),
-                }
-            ),
-        )
+        searches = self.ranks.gather("searches", self._search_state)
         return {
             "searches": dict(enumerate(searches)),
             "policy": self.policy.state_dict(),
@@ -496,18 +503,56 @@ class PGTS:
             "model_check": self.model_check.state_dict(),
         }
 
+    def _search_state(self) -> dict[str, Any]:
+        """What the search of this rank remembers, and its bounds."""
+        if self.search is None or self.certificates is None:
+            return {}
+        with_states = self.world.mdp is not None
+        upper = self.certificates.state_dict(with_states=with_states)
+        return {**self.search.state_dict(with_states=with_states), "upper": upper}
+
     @torch.inference_mode(False)
     @torch.enable_grad()
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave."""
-        self.policy.load_state_dict(state["policy"])
-        self.critic.load_state_dict(state["critic"])
-        self.update.load_state_dict(state["update"])
-        if self.search is not None and self.certificates is not None:
-            own = state["searches"][self.ranks.rank % len(state["searches"])]
-            self.search.load_state_dict(own)
-            self.certificates.load_state_dict(own["upper"])
-        self.num_iterations = state["num_iterations"]
-        self.num_env_steps = state["num_env_steps"]
-        self.num_model_calls = state["num_model_calls"]
-        self.model_check.load_state_dict(state["model_check"])
+        """Take over what `state_dict` gave; or nothing of it, where it is no state of such a model.
+
+        Raises:
+            PgtsError: the part of it that does not fit is named.
+        """
+        counters = ("num_iterations", "num_env_steps", "num_model_calls")
+        parts: dict[str, Policy | Critic | Update] = {
+            "policy": self.policy,
+            "critic": self.critic,
+            "update": self.update,
+        }
+        check_keys("the saved state", state, {"searches", "model_check", *parts, *counters})
+        for name in counters:
+            check_count(name, state[name], least=0)
+        before = {name: part.state_dict() for name, part in parts.items()}
+        try:
+            for name, part in parts.items():
+                take_over(name, state[name], part.load_state_dict, part.state_dict)
+            self.update.check(self.policy)
+            self._load_search(state["searches"])
+            check = self.model_check
+            take_over("model_check", state["model_check"], check.load_state_dict, check.state_dict, is_all=False)
+        except PgtsError:
+            for name, part in parts.items():
+                part.load_state_dict(before[name])
+            raise
+        for name in counters:
+            setattr(self, name, state[name])
+
+    def _load_search(self, searches: Any) -> None:
+        """Take over what the search of this rank remembered."""
+        if not isinstance(searches, Mapping) or set(searches) != set(range(len(searches))) or not searches:
+            raise PgtsError("the saved state of searches is not one of each rank")
+        rank, search, certificates = self.ranks.rank % len(searches), self.search, self.certificates
+        if search is None or certificates is None:
+            return
+
+        def load(state: dict[str, Any]) -> None:
+            search.load_state_dict(state)
+            certificates.load_state_dict(state["upper"])
+
+        take_over(f"searches.{rank}", searches[rank], load, self._search_state, has_bounds=True)

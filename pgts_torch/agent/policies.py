@@ -160,7 +160,10 @@ class SimplexPolicy(TabularPolicy):
         return {"probs_SA": self.probs_SA.cpu().clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.probs_SA = fitting(state, "probs_SA", self.probs_SA)
+        probs_SA = fitting(state, "probs_SA", self.probs_SA)
+        if bool((probs_SA < 0).any() or ((probs_SA.sum(-1) - 1).abs() > 1e-6).any()):
+            raise PgtsError("probs_SA has rows that are no distributions")
+        self.probs_SA = probs_SA
 
 
 def listed(policy: Policy, observation_S: Tensor) -> Float[Tensor, "S A"]:
@@ -170,9 +173,9 @@ def listed(policy: Policy, observation_S: Tensor) -> Float[Tensor, "S A"]:
 
 
 def fitting(state: dict[str, Any], name: str, like: Tensor) -> Tensor:
-    """A copy of state[name] like `like` in dtype and device; PgtsError unless it is a tensor of the same shape."""
+    """A copy of state[name] on the device of `like`; PgtsError unless it is a tensor of the same shape and dtype."""
     value = state.get(name)
-    if not isinstance(value, Tensor) or value.shape != like.shape:
-        found = tuple(value.shape) if isinstance(value, Tensor) else value
-        raise PgtsError(f"{name} is {found}; a tensor of shape {tuple(like.shape)} is needed")
+    if not isinstance(value, Tensor) or value.shape != like.shape or value.dtype != like.dtype:
+        found = f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else value
+        raise PgtsError(f"{name} is {found}; a tensor of {like.dtype} of shape {tuple(like.shape)} is needed")
     return value.to(like, copy=True)  # updates write in place, and the caller's tensor is not theirs

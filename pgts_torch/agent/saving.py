@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from pgts_torch import files
 from pgts_torch.errors import PgtsError
 
 _NAME = b"pgts_torch "
-_MAGIC = _NAME + b"3\n"
+_MAGIC, _MAGIC_0_1 = _NAME + b"4\n", _NAME + b"3\n"
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -46,12 +47,28 @@ def read(path: str | Path) -> dict[str, Any]:
 
 def decode(raw: bytes, path: str | Path) -> dict[str, Any]:
     """What the content of a file holds; `path` is its name in errors, which are those of `read`."""
-    if not raw.startswith(_MAGIC):
+    is_old = raw.startswith(_MAGIC_0_1)
+    if not (is_old or raw.startswith(_MAGIC)):
         raise PgtsError(f"{path} is not a file saved by pgts_torch")
     digest, payload = raw[len(_MAGIC) : len(_MAGIC) + _DIGEST], raw[len(_MAGIC) + _DIGEST :]
     if hashlib.sha256(payload).digest() != digest:
         raise PgtsError(f"{path} is damaged: its checksum does not fit its content")
-    return _parse(payload, path)
+    content = _parse(payload, path)
+    if is_old:
+        warnings.warn(f"{path} was saved by version 0.1; trained on, it follows the defaults of this one", stacklevel=2)
+        _upgrade(content)
+    return content
+
+
+def _upgrade(content: dict[str, Any]) -> None:
+    """What version 0.1 did not save, as in a model that has not seen anything yet."""
+    state = content.get("state")
+    if isinstance(state, dict):
+        state["model_check"] = {"contradictions": 0, "model_calls": 0, "said": [], "frequencies": {}}
+        searches = state.get("searches")
+        for search in searches.values() if isinstance(searches, dict) else ():
+            if isinstance(search, dict) and "choices" in search:
+                search["upper"] = {}
 
 
 def _parse(payload: bytes, path: str | Path) -> dict[str, Any]:

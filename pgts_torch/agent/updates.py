@@ -57,7 +57,7 @@ class Update(ABC):
             raise PgtsError(f"{type(self).__name__} remembers nothing; it cannot take over {sorted(state)}")
 
     def check(self, policy: Policy) -> None:
-        """PgtsError unless this update can move such a policy."""
+        """PgtsError unless this update, and what it remembers, can move such a policy."""
         if not isinstance(policy, self.policies):
             names = " or ".join(kind.__name__ for kind in self.policies)
             raise PgtsError(

@@ -11,8 +11,10 @@ from pgts_torch.agent.evaluate import Evaluation
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.states import check_keys
 from pgts_torch.agent.target_updates import TargetUpdate
 from pgts_torch.agent.updates import TabularUpdate, Update
+from pgts_torch.errors import PgtsError
 
 HARDLY = 0.05
 """A policy of which less than this share of probability is elsewhere than at first has hardly moved."""
@@ -53,8 +55,11 @@ class Movement:
         return {"moved": self.moved, "gap_share": self.gap_share}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave."""
-        self.moved, self.gap_share = state.get("moved"), state.get("gap_share")
+        """Take over what `state_dict` gave; PgtsError if it is something else."""
+        check_keys("movement", state, {"moved", "gap_share"})
+        if not all(isinstance(value, float | None) for value in state.values()):
+            raise PgtsError(f"movement is {state}; it must be numbers")
+        self.moved, self.gap_share = state["moved"], state["gap_share"]
 
 
 def span_of(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:

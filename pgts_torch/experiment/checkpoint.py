@@ -6,7 +6,7 @@ puts the directory in its place. The manifest is sealed by a SHA-256 of its own.
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,12 @@ from typing import Any
 from pgts_torch import files
 from pgts_torch.agent import saving
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.errors import PgtsError
+from pgts_torch.agent.states import NO_STATE, check_keys
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.experiment.ownership import (
     CHECKPOINTS,
     MANIFEST_FILE,
+    METRICS_FILE,
     MODEL_FILE,
     digest,
     read_mark,
@@ -29,7 +31,8 @@ from pgts_torch.experiment.ownership import (
 )
 from pgts_torch.experiment.ownership import checkpoints as listed
 
-_FORMAT = 2
+_FORMAT = 3
+_FORMAT_0_1 = 2
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Notes:
     config: every key of the configuration, dotted, with its value.
     versions: of the packages that numbers depend on.
     world_size: how many processes trained.
-    metrics_bytes: the length of metrics.jsonl when it was taken.
+    files: length and SHA-256 of the metrics, the events and the best model when it was taken, by name.
     finished: whether the training had come to its end.
     progress: what the loop around the algorithm goes on from.
     """
@@ -50,7 +53,7 @@ class Notes:
     config: Mapping[str, Any]
     versions: Mapping[str, str]
     world_size: int
-    metrics_bytes: int
+    files: Mapping[str, Sequence[Any]]
     finished: bool
     progress: Mapping[str, Any]
 
@@ -116,11 +119,37 @@ def read(path: Path) -> tuple[Notes, dict[str, Any]]:
     content = unsealed(manifest)
     if content is None:
         raise Damaged(f"the checkpoint {path} is damaged: the checksum of {MANIFEST_FILE} does not fit")
-    if content["format"] != _FORMAT:
-        raise PgtsError(f"the checkpoint {path} has the format {content['format']}; this version reads {_FORMAT}")
-    if content["files"] != {MODEL_FILE: digest(model)}:
+    if content.get("format") not in (_FORMAT, _FORMAT_0_1):
+        raise PgtsError(f"the checkpoint {path} has the format {content.get('format')}; this version reads {_FORMAT}")
+    if content.get("files") != {MODEL_FILE: digest(model)}:
         raise Damaged(f"the checkpoint {path} is damaged: the checksum of {MODEL_FILE} does not fit")
-    return Notes(**content["notes"]), saving.decode(model, path / MODEL_FILE)
+    try:
+        notes = _notes(content["notes"], is_old=content["format"] == _FORMAT_0_1)
+    except NO_STATE as error:
+        reason = error if isinstance(error, PgtsError) else f"{type(error).__name__}: {error}"
+        raise PgtsError(f"the checkpoint {path} is not of the form that this version writes: {reason}") from error
+    return notes, saving.decode(model, path / MODEL_FILE)
+
+
+_NOTES = {"config": dict, "versions": dict, "files": dict, "progress": dict, "finished": bool}
+
+
+def _notes(content: dict[str, Any], *, is_old: bool) -> Notes:
+    """The notes in a manifest, PgtsError where they cannot be; version 0.1 had no checksum of the files beside it."""
+    if is_old:
+        content["files"] = {METRICS_FILE: [content.pop("metrics_bytes"), None]}
+    counts = ("iterations", "env_steps", "model_calls", "world_size")
+    check_keys("its notes", content, {*_NOTES, *counts})
+    for name in counts:
+        check_count(name, content[name], least=name == "world_size")
+    for name, kind in _NOTES.items():
+        if type(content[name]) is not kind:
+            raise PgtsError(f"{name} is {content[name]!r}; it must be a {kind.__name__}")
+    for name, (size, sha256) in content["files"].items():
+        check_count(f"the length of {name}", size, least=0)
+        if not isinstance(sha256, str | None):
+            raise PgtsError(f"the SHA-256 of {name} is {sha256!r}")
+    return Notes(**content)
 
 
 def newest(run: Path, *, strict: bool = False) -> tuple[Path, Notes, dict[str, Any]] | None:

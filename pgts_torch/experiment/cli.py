@@ -31,6 +31,7 @@ from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.schema import Schema
+from pgts_torch.trust import check_imports
 
 CHECK_FAILED = TRAINING_FAILED = 1
 USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
@@ -94,6 +95,7 @@ def train(arguments: Arguments) -> None:
     parser.add_argument(
         "--any-world-size", action="store_true", help="go on with another number of processes than before"
     )
+    _add_trust(parser, "with --resume: ")
     parser.add_argument("--print-config", action="store_true", help="print the whole configuration as YAML and stop")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     if {"-h", "--help"} & set(arguments):
@@ -109,6 +111,12 @@ def train(arguments: Arguments) -> None:
     if fixed.print_config:
         sys.stdout.write(dump(config))
         return
+    if fixed.trust_imports and fixed.resume is None:
+        parser.error("--trust-imports goes with --resume only: an environment that you name yourself is trusted")
+    if fixed.resume is not None and not fixed.trust_imports:
+        typed = {override.removeprefix("--").partition("=")[0] for override in overrides}
+        saved_id = None if typed & {"env", "env.id"} else config.env.id
+        check_imports(fixed.resume / "config.yaml", saved_id, config.env.kwargs)
     if fixed.config is None and fixed.resume is None and _rank() == 0:
         print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
     from pgts_torch.experiment import run
@@ -160,10 +168,12 @@ def evaluate(arguments: Arguments) -> None:
     parser.add_argument("--episodes", metavar="N", type=whole(1), default=100, help="how many (default: %(default)s)")
     parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the episodes (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
+    _add_trust(parser)
     given = parser.parse_args(arguments)
     from pgts_torch.experiment.evaluate import evaluate_run
 
-    answer = evaluate_run(given.run_dir, episodes=given.episodes, seed=given.seed)
+    options = {"episodes": given.episodes, "seed": given.seed, "trust_imports": given.trust_imports}
+    answer = evaluate_run(given.run_dir, **options)
     print_values({kind: asdict(evaluation) for kind, evaluation in answer.items()}, as_json=given.json)
 
 
@@ -174,10 +184,11 @@ def report(arguments: Arguments) -> None:
     parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run, finished or not")
     parser.add_argument("--out", metavar="FILE", type=html_file, help="where to write (default: RUN_DIR/report.html)")
     parser.add_argument("--json", action="store_true", help="print what the page shows as one JSON object")
+    _add_trust(parser)
     given = parser.parse_args(arguments)
     from pgts_torch.experiment.report.command import write
 
-    answer = write(given.run_dir, given.out)
+    answer = write(given.run_dir, given.out, trust_imports=given.trust_imports)
     print(json.dumps(answer) if given.json else answer["page"])
 
 
@@ -280,6 +291,14 @@ An environment of your own needs two methods:
   def set_state(self, state):
       self.x, self.fuel = state
 and draws from self.np_random only."""
+
+
+def _add_trust(parser: Parser, when: str = "") -> None:
+    parser.add_argument(
+        "--trust-imports",
+        action="store_true",
+        help=f"{when}import the module that the saved id of the environment names, as MODULE:ID (see SECURITY.md)",
+    )
 
 
 def _dispatch(arguments: Arguments) -> int:

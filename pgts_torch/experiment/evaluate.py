@@ -13,10 +13,10 @@ KINDS = {"deterministic": True, "sampled": False}
 """How actions are taken: the most probable one, or drawn from pi."""
 
 
-def evaluate_run(run: str | Path, *, episodes: int, seed: int) -> dict[str, Evaluation]:
+def evaluate_run(run: str | Path, *, episodes: int, seed: int, trust_imports: bool = False) -> dict[str, Evaluation]:
     """Evaluate the last checkpoint of a run: greedily and by drawing actions from the policy."""
     torch.set_num_threads(1)
-    algorithm = PGTS.load(last_checkpoint(Path(run)))
+    algorithm = PGTS.load(last_checkpoint(Path(run)), trust_imports=trust_imports)
     return {
         kind: evaluate(algorithm, episodes=episodes, deterministic=deterministic, seed=seed)
         for kind, deterministic in KINDS.items()

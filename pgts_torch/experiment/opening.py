@@ -14,11 +14,14 @@ from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.ownership import (
+    BEST_FILE,
     CONFIG_FILE,
+    METRICS_FILE,
     VERSIONS_FILE,
     Mark,
     check_folder,
     clear,
+    clear_events,
     listing,
     write_mark,
 )
@@ -82,7 +85,12 @@ def opened(config: Config, lock: RunLock, start: Start | None) -> RunFolder:
     else:
         checkpoint.tidy(path, start.path, keep=config.log.keep)
         print(f"going on from {start.path}", file=sys.stderr)
-        position = {"metrics_bytes": start.notes.metrics_bytes, "after_step": start.notes.env_steps}
+        position = {"metrics_bytes": start.notes.files[METRICS_FILE][0], "after_step": start.notes.env_steps}
+        if config.run.tensorboard and not start.has_events:
+            clear_events(path, mark)
+            position |= {"after_step": None, "rebuild": True}
+        if start.lost_best:
+            (path / BEST_FILE).unlink(missing_ok=True)
     if config.critic.type == "exact":
         print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
     if not keeps_config:

@@ -182,8 +182,8 @@ def _is_partial(name: str) -> bool:
     return own is not None and own[1] in (*_OWN_FILES, MODEL_FILE, MANIFEST_FILE)
 
 
-def is_events(name: str, mark: Mark) -> bool:
-    """Whether a name is that of an event file of the run."""
+def is_events(name: str, mark: Mark = Mark()) -> bool:
+    """Whether a name is that of an event file of a run, or of the one with this mark."""
     return name in mark.events or (name.endswith(EVENTS_SUFFIX) and _EVENTS.fullmatch(name) is not None)
 
 
@@ -202,6 +202,14 @@ def clear(run: Path, mark: Mark) -> list[str]:
         with files.named(f"{run / name} cannot be removed"):
             (run / name).unlink()
     return [name for name in _names(run) if name not in (MARK_FILE, LOCK_FILE)]
+
+
+def clear_events(run: Path, mark: Mark) -> None:
+    """Remove the event files of a run."""
+    for name in _names(run):
+        if is_events(name, mark) and files.kind(run / name) == "file":
+            with files.named(f"{run / name} cannot be removed"):
+                (run / name).unlink()
 
 
 def _is_removable(path: Path, mark: Mark) -> bool:

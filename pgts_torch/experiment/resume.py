@@ -11,13 +11,23 @@ from typing import Any
 from torch import Tensor
 
 from pgts_torch import files
+from pgts_torch.agent import saving
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.loading import load
-from pgts_torch.experiment.ownership import CONFIG_FILE, METRICS_FILE, SUMMARY_FILE, Mark, digest
-from pgts_torch.experiment.tracking import versions
+from pgts_torch.experiment.ownership import (
+    BEST_FILE,
+    CONFIG_FILE,
+    METRICS_FILE,
+    SUMMARY_FILE,
+    Mark,
+    digest,
+    is_events,
+    read_mark,
+)
+from pgts_torch.experiment.tracking import Growing, versions
 
 FREE_SECTIONS = ("run", "log")
 FREE_KEYS = ("name", "eval.every", "eval.episodes", "eval.keep_best")
@@ -31,11 +41,15 @@ class Start:
     """A checkpoint that a training goes on from.
 
     state: for `PGTS.load_state_dict`.
+    has_events: whether the TensorBoard events are as they were then.
+    lost_best: what is wrong with the best model, or nothing.
     """
 
     path: Path
     notes: checkpoint.Notes
     state: Mapping[str, Any]
+    has_events: bool = True
+    lost_best: str = ""
 
     def check(self, algorithm: PGTS) -> None:
         """PgtsError, naming each tensor, where the algorithm has others: its environment is no longer what it was."""
@@ -44,7 +58,7 @@ class Start:
             "critic": algorithm.critic.state_dict(),
             "update": algorithm.update.state_dict(),
         }
-        now, before = dict(_flat("", own)), dict(_flat("", {name: self.state[name] for name in own}))
+        now, before = dict(_flat("", own)), dict(_flat("", {name: self.state.get(name) for name in own}))
         lines = [
             f"{name} has the shape {tuple(here.shape)}; in {self.path} it is {tuple(there.shape)}"
             for name, here in now.items()
@@ -53,6 +67,15 @@ class Start:
         if lines:
             raise PgtsError("\n".join([*lines, f"the environment has changed since; {_ADVICE}"]))
 
+    def load(self, algorithm: PGTS) -> None:
+        """Have the algorithm go on from here; PgtsError, naming the part, where the state is none of such a model."""
+        try:
+            algorithm.load_state_dict(dict(self.state))
+            if not algorithm.num_env_steps == self.notes.env_steps == int(self.path.name):
+                raise PgtsError(f"its model is of step {algorithm.num_env_steps}, its notes of {self.notes.env_steps}")
+        except PgtsError as error:
+            raise PgtsError(f"{self.path}: {error}") from error
+
 
 def find(
     config: Config, run: Path, *, strict: bool = False, world_size: int = 1, any_world_size: bool = False
@@ -60,7 +83,7 @@ def find(
     """Where the training of a configuration begins in its run folder; None: at the beginning.
 
     Args:
-        strict: refuse a last checkpoint that is damaged or of other versions.
+        strict: refuse a last checkpoint that is damaged or of other versions, and lost events or a lost best model.
         world_size: how many processes are to go on.
         any_world_size: whether it may have been another number before.
 
@@ -68,29 +91,41 @@ def find(
         PgtsError: the folder holds a finished run, or one of another configuration, naming what differs, or of another
             number of processes; or no checkpoint in it is intact, or not the one that is asked for.
     """
-    if not (run / CONFIG_FILE).is_file():
-        return None
-    if (run / SUMMARY_FILE).is_file():
+    mark = read_mark(run)
+    if files.kind(run / SUMMARY_FILE) is not None and mark is not None:
         raise PgtsError(f"run.dir {run} holds a finished run; {_ADVICE}")
     try:
         found = checkpoint.newest(run, strict=strict)
     except PgtsError as error:
         raise PgtsError(f"{error}\n{_ADVICE}") from error
-    earlier = flat(load(run / CONFIG_FILE)) if found is None else found[1].config
-    if differing := list(_differing(flat(config), earlier)):
-        lines = (f"{key} is {_shown(now)}; in run.dir {run} it is {_shown(before)}" for key, now, before in differing)
-        raise PgtsError("\n".join([*lines, f"run.dir {run} holds an earlier run of another configuration; {_ADVICE}"]))
     if found is None:
+        if mark is not None and mark.has_checkpoints:
+            raise PgtsError(f"run.dir {run} has lost its checkpoints and cannot go on: bring them back, or {_ADVICE}")
+        if files.kind(run / CONFIG_FILE) is not None:
+            _check_config(config, flat(load(run / CONFIG_FILE)), run)
+            print(f"note: the run in {run} was ended before its first checkpoint; it starts anew", file=sys.stderr)
         return None
     path, notes, content = found
-    _check_metrics(run / METRICS_FILE, notes.metrics_bytes, path)
-    _check_versions(notes.versions, path, strict=strict)
+    if notes.files.get(METRICS_FILE, (0, ""))[1] is None:
+        raise PgtsError(f"{path} was written by version 0.1, which trains otherwise: go on with that one, or {_ADVICE}")
+    _check_config(config, notes.config, run)
+    _check_metrics(run, notes, path)
+    _complain(_other_versions(notes.versions, path), strict=strict)
+    lost_events = config.run.tensorboard and _lost_events(run, notes)
+    lost_best = _lost_best(run, notes) if config.eval.keep_best else ""
+    if lost_events:
+        _complain(
+            [f"{lost_events} since {path} was written: the events are made anew from {METRICS_FILE}"], strict=strict
+        )
+    if lost_best:
+        _complain([f"{lost_best}: the model of {path} takes its place until a better one comes"], strict=strict)
     if notes.world_size != world_size and not any_world_size:
         raise PgtsError(
             f"{path} was written by {notes.world_size} processes, and {world_size} are to go on: start as many, or "
             "give --any-world-size for other bits"
         )
-    return Start(path, notes, content["state"])
+    has_events = not lost_events and any(map(is_events, notes.files))
+    return Start(path, notes, content["state"], has_events, lost_best)
 
 
 def is_kept(config: Config, run: Path, mark: Mark) -> bool:
@@ -111,10 +146,11 @@ def is_kept(config: Config, run: Path, mark: Mark) -> bool:
     return True
 
 
-def resuming(run: str | Path, world_size: int) -> str:
-    """The command by which as many processes go on with a run."""
+def resuming(run: str | Path, world_size: int, env_id: str) -> str:
+    """The command by which as many processes go on with a run in this environment."""
+    trust = " --trust-imports" if ":" in env_id else ""
     command = "pgts train" if world_size == 1 else f"torchrun --nproc-per-node={world_size} train.py"
-    return f"{command} --resume {shlex.quote(str(run))}"
+    return f"{command} --resume {shlex.quote(str(run))}{trust}"
 
 
 def flat(config: Config) -> dict[str, Any]:
@@ -130,6 +166,13 @@ def _flat(prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{name}", value
 
 
+def _check_config(config: Config, earlier: Mapping[str, Any], run: Path) -> None:
+    """PgtsError, key by key, where a run had another configuration."""
+    if differing := list(_differing(flat(config), earlier)):
+        lines = (f"{key} is {_shown(now)}; in run.dir {run} it is {_shown(before)}" for key, now, before in differing)
+        raise PgtsError("\n".join([*lines, f"run.dir {run} holds an earlier run of another configuration; {_ADVICE}"]))
+
+
 def _differing(now: Mapping[str, Any], before: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """(key, value now, value before) where it matters; a key that is missing on one side has None there."""
     for key in dict.fromkeys((*now, *before)):
@@ -142,20 +185,60 @@ def _shown(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _check_metrics(path: Path, metrics_bytes: int, taken: Path) -> None:
-    size = path.stat().st_size if path.is_file() else 0
-    if size < metrics_bytes:
-        raise PgtsError(f"{path} has {size} bytes; it had {metrics_bytes} when {taken} was written; {_ADVICE}")
+def _changed(path: Path, size: int, sha256: str | None) -> str:
+    """What has happened to a file since it had this length and SHA-256, beside that it has grown; or nothing."""
+    if files.kind(path) != "file":
+        return f"{path} is missing"
+    if (now := path.stat().st_size) < size:
+        return f"{path} has {now} bytes; it had {size}"
+    if sha256 is not None and Growing(path).now(size) != (size, sha256):
+        return f"{path} was changed"
+    return ""
 
 
-def _check_versions(before: Mapping[str, str], path: Path, *, strict: bool) -> None:
+def _check_metrics(run: Path, notes: checkpoint.Notes, taken: Path) -> None:
+    size, sha256 = notes.files.get(METRICS_FILE, (0, None))
+    if size and (change := _changed(run / METRICS_FILE, size, sha256)):
+        raise PgtsError(f"{change} when {taken} was written; {_ADVICE}".replace("changed when", "changed since"))
+
+
+def _lost_events(run: Path, notes: checkpoint.Notes) -> str:
+    noted = {name: told for name, told in notes.files.items() if is_events(name)}
+    return next(filter(None, (_changed(run / name, *told) for name, told in noted.items())), "")
+
+
+def _lost_best(run: Path, notes: checkpoint.Notes) -> str:
+    """What is wrong with the best model, if there should be one. A later one than the checkpoint is right: it will come
+    again."""
+    path, told = run / BEST_FILE, notes.files.get(BEST_FILE)
+    evaluations = notes.progress.get("evaluations")
+    greedy = evaluations.get("deterministic") if isinstance(evaluations, Mapping) else None
+    if told is None and not (isinstance(greedy, Mapping) and greedy.get("history")):
+        return ""
+    if files.kind(path) is None:
+        return f"{path} is missing"
+    try:
+        steps = saving.read(path)["state"]["num_env_steps"]
+    except PgtsError as error:
+        return str(error)
+    except (KeyError, TypeError):
+        return f"{path} holds no model"
+    is_noted = told is None or Growing(path).now() == tuple(told)
+    return "" if is_noted or steps > notes.env_steps else f"{path} was changed"
+
+
+def _other_versions(before: Mapping[str, str], path: Path) -> list[str]:
     now = versions()
-    lines = [
-        f"{name} is {now.get(name)}; {path} was written with {before.get(name)}"
+    return [
+        f"{name} is {now.get(name)}; {path} was written with {before.get(name)}: the last bits may differ"
         for name in dict.fromkeys((*now, *before))
         if now.get(name) != before.get(name)
     ]
+
+
+def _complain(lines: list[str], *, strict: bool) -> None:
+    """Warn of these, or refuse them."""
     if lines and strict:
         raise PgtsError("\n".join(lines))
     for line in lines:
-        print(f"warning: {line}: the last bits may differ", file=sys.stderr)
+        print(f"warning: {line}", file=sys.stderr)

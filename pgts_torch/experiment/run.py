@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -20,7 +20,8 @@ from pgts_torch.agent.evaluate import Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.ranks import joined_ranks
-from pgts_torch.errors import Failed, ModelMismatch, NotFinite, Stopped, failure
+from pgts_torch.agent.states import check_keys, take_over
+from pgts_torch.errors import Failed, ModelMismatch, NotFinite, PgtsError, Stopped, check_count, failure
 from pgts_torch.experiment import checkpoint, diagnostics
 from pgts_torch.experiment.advice import Movement, greedy_is_worse, span_of, stuck
 from pgts_torch.experiment.checkpoint import Notes
@@ -115,7 +116,7 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
 
         path, start = ranks.first("where to begin", claim)
         if start is not None:
-            algorithm.load_state_dict(dict(start.state))
+            ranks.together("the saved state", lambda: start.load(algorithm))
         folder: Folder = NoFolder(path)
 
         def open_folder() -> None:
@@ -148,7 +149,7 @@ def _loop(
 ) -> Summary:
     recorder = _Recorder(config, algorithm, folder, stop, movement)
     if start is not None:
-        recorder.load(start.notes)
+        recorder.load(start)
     try:
         try:
             if not recorder.finished:
@@ -158,7 +159,7 @@ def _loop(
         recorder.save()
         if not recorder.finished:
             signals = algorithm.ranks.gather("signals", lambda: stop.signal)
-            again = resuming(folder.path, algorithm.ranks.size)
+            again = resuming(folder.path, algorithm.ranks.size, config.env.id)
             raise Stopped(
                 f"stopped at step {algorithm.num_env_steps}; `{again}` goes on",
                 next(each for each in signals if each is not None),
@@ -254,24 +255,39 @@ class _Recorder:
             config=flat(self.config),
             versions=versions(),
             world_size=self.algorithm.ranks.size,
-            metrics_bytes=self.folder.flush(),
+            files=self.folder.flush(),
             finished=self.finished,
             progress=progress,
         )
         checkpoint.write(self.folder.path, self.algorithm, notes, keep=self.config.log.keep)
         self._saved_at, self._saved_clock = self.algorithm.num_env_steps, time.perf_counter()
 
-    def load(self, notes: Notes) -> None:
-        """Go on from what `save` wrote; the algorithm has been loaded."""
-        progress = notes.progress
-        self.ended_by, self._saved_at = progress["ended_by"], notes.env_steps
-        self._deepest = progress["depth"]
-        self._certificate = math.inf if progress["certificate"] is None else progress["certificate"]
+    def load(self, start: Start) -> None:
+        """Go on from what `save` wrote; the algorithm has been loaded. PgtsError if this is something else."""
+        notes, progress = start.notes, start.notes.progress
+        check_keys("progress", progress, {"ended_by", "depth", "certificate", "seconds", "evaluations", "movement"})
+        plain = {name: value for name, value in progress.items() if name != "movement"}
+        take_over("progress", plain, self._take, lambda: plain)
+        self.movement.load_state_dict(progress["movement"])
+        self._saved_at = notes.env_steps
+        if start.lost_best:
+            best = self._evaluations["deterministic"]
+            best.forget()
+            assert best.best_path is not None
+            self.algorithm.save(best.best_path)
+
+    def _take(self, progress: Mapping[str, Any]) -> None:
+        if progress["ended_by"] not in (None, *get_args(EndedBy)):
+            raise PgtsError(f"ended_by is {progress['ended_by']!r}")
+        check_count("depth", progress["depth"], least=0)
+        self.ended_by, self._deepest = progress["ended_by"], progress["depth"]
+        self._certificate = math.inf if progress["certificate"] is None else float(progress["certificate"])
         self._started -= progress["seconds"]
-        self.movement.load_state_dict(progress.get("movement", {}))
+        evaluations = dict(progress["evaluations"])
         for kind, evaluation in self._evaluations.items():
-            if kind in progress["evaluations"]:
-                evaluation.load_state_dict(progress["evaluations"][kind])
+            if kind in evaluations:
+                state = evaluations[kind]
+                take_over(f"evaluations.{kind}", state, evaluation.load_state_dict, evaluation.state_dict)
 
     def _scores(self, kind: str, step: int) -> Iterator[tuple[str, float]]:
         """The tags of the evaluation that was made just now, if one was."""

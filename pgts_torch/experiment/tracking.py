@@ -1,12 +1,13 @@
 """What a run writes while it trains: metrics, TensorBoard events, texts and pictures."""
 
+import hashlib
 import json
 import math
 import os
 import platform
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -18,7 +19,7 @@ from matplotlib.figure import Figure
 from pgts_torch import files
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.locking import RunLock
-from pgts_torch.experiment.ownership import EVENTS_SUFFIX, FAILURE_FILE, METRICS_FILE
+from pgts_torch.experiment.ownership import BEST_FILE, EVENTS_SUFFIX, FAILURE_FILE, METRICS_FILE, is_events
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -36,8 +37,8 @@ class Folder(ABC):
         """Numbers of one step."""
 
     @abstractmethod
-    def flush(self) -> int:
-        """Have all that was logged on the disk; how many bytes metrics.jsonl holds."""
+    def flush(self) -> dict[str, tuple[int, str]]:
+        """Have all that was logged on the disk; length and SHA-256 of the metrics, the events and the best model."""
 
     @abstractmethod
     def text(self, name: str, content: str) -> None:
@@ -58,9 +59,9 @@ class NoFolder(Folder):
     def log(self, step: int, tags: dict[str, float]) -> None:
         """Nothing."""
 
-    def flush(self) -> int:
-        """0."""
-        return 0
+    def flush(self) -> dict[str, tuple[int, str]]:
+        """Nothing."""
+        return {}
 
     def text(self, name: str, content: str) -> None:
         """Nothing."""
@@ -79,6 +80,7 @@ class RunFolder(Folder):
         lock: of the folder; it is looked at before each file, so that nothing gets into a folder that took its place.
         metrics_bytes: what is kept of metrics.jsonl; the rest is cut off.
         after_step: the last step whose events are kept; TensorBoard hides later ones of a process that was killed.
+        rebuild: make the events anew from the metrics that are kept.
 
     Raises:
         PgtsError: from all that writes, if the disk is full.
@@ -92,18 +94,24 @@ class RunFolder(Folder):
         lock: RunLock | None = None,
         metrics_bytes: int = 0,
         after_step: int | None = None,
+        rebuild: bool = False,
     ) -> None:
         self.path, self._lock = path, lock
         path.mkdir(parents=True, exist_ok=True)
         (path / FAILURE_FILE).unlink(missing_ok=True)
         self._metrics = (path / METRICS_FILE).open("ab", buffering=0)
         self._metrics.truncate(metrics_bytes)
+        self._growing = {METRICS_FILE: Growing(path / METRICS_FILE)}
         purge_step = None if after_step is None else after_step + 1
         self._thread_hook = threading.excepthook
         with self._writing("events"):
             self._events = (
                 event_writer()(str(path), purge_step=purge_step, filename_suffix=EVENTS_SUFFIX) if tensorboard else None
             )
+
+        if self._events is not None and rebuild:
+            for line in read_metrics(path):
+                self._add_scalars(line.pop("step"), line)
 
     def __enter__(self) -> Self:
         threading.excepthook = self._hear
@@ -149,17 +157,27 @@ class RunFolder(Folder):
         if not whole:
             raise PgtsError(f"{self.path / METRICS_FILE} cannot be written to at step {step}; is the disk full?")
         if self._events is not None:
-            with self._writing("events"):
-                for tag, value in tags.items():
-                    self._events.add_scalar(tag, value, step)
+            self._add_scalars(step, tags)
 
-    def flush(self) -> int:
+    def _add_scalars(self, step: int, tags: Mapping[str, float | None]) -> None:
+        assert self._events is not None
+        with self._writing("events"):
+            for tag, value in tags.items():
+                self._events.add_scalar(tag, math.nan if value is None else value, step)
+
+    def flush(self) -> dict[str, tuple[int, str]]:
         with self._writing(METRICS_FILE):
             os.fsync(self._metrics.fileno())
         if self._events is not None:
             with self._writing("events"):
                 self._events.flush()
-        return os.fstat(self._metrics.fileno()).st_size
+        names = [path.name for path in self.path.iterdir() if self._events is not None and is_events(path.name)]
+        with self._writing("its files"):
+            told = {name: self._growing.setdefault(name, Growing(self.path / name)).now() for name in names}
+            told[METRICS_FILE] = self._growing[METRICS_FILE].now()
+            if files.kind(self.path / BEST_FILE) is not None:
+                told[BEST_FILE] = Growing(self.path / BEST_FILE).now()
+        return told
 
     def text(self, name: str, content: str) -> None:
         with self._writing(name):
@@ -172,6 +190,23 @@ class RunFolder(Folder):
         if self._events is not None:
             with self._writing("events"):
                 self._events.add_figure(name, figure, step)
+
+
+@final
+class Growing:
+    """Length and SHA-256 of a file that only ever grows; what was read before is not read again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._hash, self._bytes = path, hashlib.sha256(), 0
+
+    def now(self, most: int | None = None) -> tuple[int, str]:
+        """Of the whole file, or of its first `most` bytes."""
+        with self._path.open("rb") as file:
+            file.seek(self._bytes)
+            while chunk := file.read(2**20 if most is None else min(2**20, most - self._bytes)):
+                self._hash.update(chunk)
+                self._bytes += len(chunk)
+        return self._bytes, self._hash.hexdigest()
 
 
 def event_writer() -> "type[SummaryWriter]":
@@ -198,5 +233,11 @@ def _version(package: str) -> str | None:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a run's metrics.jsonl."""
-    return [json.loads(line) for line in (path / METRICS_FILE).read_text(encoding="utf-8").splitlines()]
+    """The lines of a run's metrics.jsonl; PgtsError where one is damaged."""
+    lines = []
+    for number, raw in enumerate(files.read(path / METRICS_FILE).splitlines(), start=1):
+        try:
+            lines.append(dict(json.loads(raw)))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise PgtsError(f"{path / METRICS_FILE}:{number} is damaged: {error}") from error
+    return lines

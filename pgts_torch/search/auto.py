@@ -1,12 +1,13 @@
 """The search that chooses: by what the model can do, by how often paths meet, and by the budget."""
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import final
+from typing import Any, final
 
 import torch
 from torch import Tensor
 
-from pgts_torch.errors import NodeBudgetExceeded, RandomOutcomes
+from pgts_torch.errors import NodeBudgetExceeded, PgtsError, RandomOutcomes
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.engine import SampledSearch, Search
 from pgts_torch.search.expectimax import expectimax
@@ -145,6 +146,14 @@ class AutoSearch(Search):
         if self._samples < MOST_SAMPLES and look.nodes * 2**expansions <= self.max_nodes:
             self._samples *= 2
         return look
+
+    def check_choices(self, choices: Mapping[str, Any]) -> None:
+        super().check_choices(choices)
+        counts = (choices["_width"], choices["_samples"], *choices["_most_asked"], *(choices["_too_much"] or ()))
+        if any(type(count) is not int or count < 0 for count in counts) or choices["_width"] == 0:
+            raise PgtsError(f"its width, samples and numbers of states are {counts}; they must be counts")
+        if not isinstance(choices["_picked"], str) or len(choices["_most_asked"]) != 2:
+            raise PgtsError("its choices are of another form")
 
     def forget(self) -> None:
         if self.topology is not None:

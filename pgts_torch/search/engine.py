@@ -1,7 +1,7 @@
 """Searches as objects: one way to look ahead in one model, with what it remembers from one search to the next."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, final
 
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from pgts_torch.errors import MissingModel, check_count
+from pgts_torch.errors import MissingModel, PgtsError, check_count
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.empirical import Drawn, Share
 from pgts_torch.search.expectimax import expectimax
@@ -82,13 +82,25 @@ class Search(ABC):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave: later searches are, and count, those of the search that gave it."""
+        """Take over what `state_dict` gave: later searches are, and count, those of the search that gave it.
+
+        Raises:
+            PgtsError: it is that of another search.
+        """
+        self.check_choices(state["choices"])
+        if state["asked"].dtype != torch.int64 or state["asked"].ndim != 1:
+            raise PgtsError("asked is no list of states")
         for name in self.choices:
             setattr(self, name, state["choices"][name])
         if not state["lists"]:
             self.topology = None
         elif self.topology is not None:
             self.topology.recall(state["asked"].to(self.model.device))
+
+    def check_choices(self, choices: Mapping[str, Any]) -> None:
+        """PgtsError unless earlier searches can have chosen this."""
+        if set(choices) != set(self.choices):
+            raise PgtsError(f"its choices are {sorted(choices)}; {type(self).__name__} makes {sorted(self.choices)}")
 
     @abstractmethod
     def __str__(self) -> str:

@@ -23,7 +23,7 @@ from tests import reliability
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
 
-def notes(env_steps: int, *, metrics_bytes: int = 17) -> Notes:
+def notes(env_steps: int, *, metrics_bytes: int = 0) -> Notes:
     return Notes(
         iterations=1,
         env_steps=env_steps,
@@ -31,7 +31,7 @@ def notes(env_steps: int, *, metrics_bytes: int = 17) -> Notes:
         config={"search.depth": 2, "update.step_size": 0.1},
         versions={"torch": "1"},
         world_size=1,
-        metrics_bytes=metrics_bytes,
+        files={"metrics.jsonl": [metrics_bytes, None]},
         finished=False,
         progress={"certificate": None},
     )
@@ -145,7 +145,7 @@ def test_another_format_is_named(tmp_path):
     [path] = written(tmp_path, 10)
     content = json.loads((path / MANIFEST_FILE).read_text())["content"] | {"format": 7}
     (path / MANIFEST_FILE).write_bytes(sealed(content))
-    with pytest.raises(PgtsError, match="has the format 7; this version reads 2") as raised:
+    with pytest.raises(PgtsError, match="has the format 7; this version reads 3") as raised:
         checkpoint.read(path)
     assert not isinstance(raised.value, Damaged)
 

@@ -54,8 +54,8 @@ class FakeEvaluation(types.ModuleType):
         super().__init__("pgts_torch.experiment.evaluate")
         self.calls: list[Any] = []
 
-    def evaluate_run(self, run: Path, *, episodes: int, seed: int) -> dict[str, Answer]:
-        self.calls.append((run, episodes, seed))
+    def evaluate_run(self, run: Path, *, episodes: int, seed: int, trust_imports: bool) -> dict[str, Answer]:
+        self.calls.append((run, episodes, seed, trust_imports))
         return {"sampled": Answer(0.25), "deterministic": Answer(0.5, 0.125)}
 
 
@@ -176,7 +176,7 @@ def test_evaluate_hands_on_its_arguments_and_prints_for_people_or_programs(
     ]
     assert main(["evaluate", "--json", "."]) == 0
     assert json.loads(capsys.readouterr().out)["deterministic"] == {"mean": 0.5, "half_width": 0.125}
-    assert fake.calls == [(Path("."), 7, 3), (Path("."), 100, 0)]
+    assert fake.calls == [(Path("."), 7, 3, False), (Path("."), 100, 0, False)]
 
 
 def test_an_error_of_the_run_is_one_line_and_ctrl_c_exits_with_130(

@@ -1,5 +1,6 @@
 """Only files that a run has made are ever replaced or removed, whatever else lies in its folder."""
 
+import json
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +18,7 @@ from pgts_torch.experiment.figures import command as figures
 from pgts_torch.experiment.figures.drawing import pictures
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.locking import RunLock
-from pgts_torch.experiment.ownership import MARK_FILE
+from pgts_torch.experiment.ownership import MANIFEST_FILE, MARK_FILE, digest, sealed
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -106,7 +107,7 @@ def test_a_run_that_starts_anew_leaves_and_names_what_it_has_not_made(unfinished
     assert main(["train", *SHORT, checkpointing, "--run.dir=run", *more]) == 0
     assert {name: tree(folder)[name] for name in theirs} == theirs
     assert (here / "outside" / "model.pt").read_text() == "mine"
-    [note] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note:")]
+    [note] = [line for line in capsys.readouterr().err.splitlines() if "also holds" in line]
     assert note.startswith("note: run.dir run also holds .best.pt.mine.partial, ")
     assert note.endswith(", which no run has left; it stays")
     assert [line["step"] for line in read_metrics(folder)] == [5, 10, 15]
@@ -132,6 +133,13 @@ def test_a_run_that_is_overwritten_leaves_nothing_of_the_one_before(here, capsys
 def age(folder: Path) -> None:
     """Make of a run folder what version 0.1 would have left."""
     (folder / MARK_FILE).unlink()
+    for path in checkpoint.listed(folder):
+        model = path / MODEL_FILE
+        model.write_bytes(model.read_bytes().replace(b"pgts_torch 4", b"pgts_torch 3", 1))
+        content = json.loads((path / MANIFEST_FILE).read_text())["content"]
+        content["notes"]["metrics_bytes"] = content["notes"].pop("files")["metrics.jsonl"][0]
+        sealed_again = sealed({**content, "format": 2, "files": {MODEL_FILE: digest(model.read_bytes())}})
+        (path / MANIFEST_FILE).write_bytes(sealed_again)
     for path in folder.glob("events.*.pgts"):
         path.rename(path.with_suffix(".0"))
 
@@ -146,9 +154,20 @@ def test_a_run_of_an_earlier_version_is_known_by_what_it_has_left(left, here, mo
     if left == "versions":
         (folder / "metrics.jsonl").write_bytes(b"")
     put(folder, notes_md="mine")
-    assert main(["train", *SHORT, *arguments, "--run.dir=run"]) == 0
-    assert [line["step"] for line in read_metrics(folder)] == [5, 10, 15]
-    assert ("going on from" in capsys.readouterr().err) == (left == "checkpoints")
+    before = tree(folder)
+    if left == "checkpoints":
+        with pytest.warns(UserWarning, match="was saved by version 0.1"):
+            assert main(["train", *SHORT, *arguments, "--run.dir=run"]) == 2
+        mistake = "error: run/checkpoints/000000000005 was written by version 0.1, which trains otherwise: go on with"
+        assert mistake in capsys.readouterr().err
+        assert {name: content for name, content in tree(folder).items() if name != ".lock"} == {
+            name: content for name, content in before.items() if name != ".lock"
+        }
+        with pytest.warns(UserWarning, match="was saved by version 0.1"):
+            assert main(["evaluate", "run", "--episodes=2"]) == 0
+    else:
+        assert main(["train", *SHORT, *arguments, "--run.dir=run"]) == 0
+        assert [line["step"] for line in read_metrics(folder)] == [5, 10, 15]
     assert (folder / "notes.md").read_text() == "mine"
     assert main(["train", *SHORT, "--run.dir=run", "--run.overwrite"]) == 0
     assert list(folder.glob("events*")) == []

@@ -3,6 +3,8 @@
 import errno
 import json
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +12,19 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from pgts_torch.agent import saving
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint, resume, run, tracking
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import last_checkpoint
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.locking import RunLock
+from pgts_torch.experiment.ownership import digest, sealed
 from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
+from tests.support import same_values
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -87,16 +93,6 @@ def curve(folder: Path) -> list[tuple[int, float]]:
     return [(event.step, event.value) for event in events]
 
 
-def same_bits(first: Any, second: Any) -> bool:
-    if isinstance(first, torch.Tensor):
-        return torch.equal(first, second) and first.dtype == second.dtype
-    if isinstance(first, dict):
-        return first.keys() == second.keys() and all(same_bits(first[key], second[key]) for key in first)
-    if isinstance(first, list | tuple):
-        return len(first) == len(second) and all(map(same_bits, first, second))
-    return first == second or (first != first and second != second)
-
-
 @pytest.mark.fault("kill at any moment")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_training_cut_off_anywhere_ends_with_the_bits_of_one_that_was_not(kind, tmp_path, monkeypatch):
@@ -108,7 +104,7 @@ def test_a_training_cut_off_anywhere_ends_with_the_bits_of_one_that_was_not(kind
     cut_off(config, monkeypatch, after=1)
     assert len(read_metrics(tmp_path / "cut")) == 2  # one more than the checkpoint knows
     run.train(config)
-    assert same_bits(left(tmp_path / "whole"), left(tmp_path / "cut"))
+    assert same_values(left(tmp_path / "whole"), left(tmp_path / "cut"))
 
 
 @pytest.mark.fault("kill at any moment")
@@ -118,11 +114,11 @@ def test_tensorboard_shows_every_step_once_and_evaluations_and_the_best_model_ar
     cut_off(config, monkeypatch, after=3)
     run.train(config)
     assert [step for step, _ in curve(tmp_path / "cut")] == [60, 120, 180, 240, 300]
-    assert same_bits(left(tmp_path / "cut"), left(tmp_path / "whole"))
+    assert same_values(left(tmp_path / "cut"), left(tmp_path / "whole"))
     best = [PGTS.load(tmp_path / name / "best.pt").state_dict() for name in ("whole", "cut")]
-    assert same_bits(*best)
+    assert same_values(*best)
     other = run.build(configured(tmp_path / "other", "--seed", "1")).learn(60).state_dict()
-    assert not same_bits(best[0], other)
+    assert not same_values(best[0], other)
 
 
 @pytest.fixture
@@ -226,7 +222,7 @@ def test_what_no_bit_of_training_depends_on_may_differ(cut, tmp_path, capsys):
     assert main(arguments("--name", "x", "--log.keep", "1", "--log.every", "2", "--eval.every", "60")) == 0
     assert "going on from cut/checkpoints/000000000120" in capsys.readouterr().err
     run.train(configured(tmp_path / "whole", *QUIET))
-    assert same_bits(*(PGTS.load(last_checkpoint(tmp_path / name)).state_dict() for name in ("cut", "whole")))
+    assert same_values(*(PGTS.load(last_checkpoint(tmp_path / name)).state_dict() for name in ("cut", "whole")))
     assert len(checkpoint.listed(cut)) == 1
     assert load(cut / "config.yaml").name == "x"
 
@@ -263,7 +259,7 @@ def test_overwriting_starts_anew(flag, cut):
 
 
 @pytest.mark.fault("damaged last checkpoint")
-def test_after_a_damaged_checkpoint_the_one_before_leads_to_the_same_bits(cut, tmp_path, capsys):
+def test_after_a_damaged_checkpoint_the_one_before_leads_to_the_same_values(cut, tmp_path, capsys):
     newest = checkpoint.listed(cut)[-1]
     (newest / checkpoint.MODEL_FILE).write_bytes(b"")
     before = content(cut)
@@ -275,14 +271,155 @@ def test_after_a_damaged_checkpoint_the_one_before_leads_to_the_same_bits(cut, t
     err = capsys.readouterr().err
     assert f"warning: {damaged}\ngoing on from cut/checkpoints/000000000060" in err
     run.train(configured(tmp_path / "whole", *QUIET))
-    assert same_bits(left(cut), left(tmp_path / "whole"))
+    assert same_values(left(cut), left(tmp_path / "whole"))
 
 
 @pytest.mark.fault("lost metrics")
-def test_lost_metrics_are_noticed(cut, capsys):
-    (cut / "metrics.jsonl").write_bytes((cut / "metrics.jsonl").read_bytes()[:100])
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda raw: raw[:100], "has 100 bytes; it had "),
+        (lambda raw: raw.replace(b"0.5", b"0.6", 1), "was changed since cut/checkpoints/000000000120 was written"),
+        (lambda raw: raw[:40] + bytes([raw[40] ^ 1]) + raw[41:], "was changed since"),
+        (None, "is missing"),
+    ],
+)
+def test_lost_or_changed_metrics_are_noticed(damage, said, cut, capsys):
+    path = cut / "metrics.jsonl"
+    changed = None if damage is None else damage(path.read_bytes())
+    assert changed != path.read_bytes()
+    path.unlink()
+    if changed is not None:
+        path.write_bytes(changed)
+    before = content(cut)
     assert main(arguments()) == 2
-    assert "cut/metrics.jsonl has 100 bytes; it had " in capsys.readouterr().err
+    assert f"cut/metrics.jsonl {said}" in capsys.readouterr().err
+    assert content(cut) == before
+
+
+@pytest.mark.fault("all checkpoints gone")
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("aged", [True, False])
+def test_a_run_that_has_lost_its_checkpoints_is_not_begun_anew(whole, aged, cut, capsys):
+    shutil.rmtree(cut / "checkpoints")
+    if not whole:
+        (cut / "checkpoints").mkdir()
+    if aged:
+        if whole:
+            pytest.skip("version 0.1 left nothing that tells this from a run before its first checkpoint")
+        (cut / ".pgts_run").unlink()
+    before = content(cut)
+    assert main(arguments()) == 2
+    mistake = "error: run.dir cut has lost its checkpoints and cannot go on: bring them back, or choose another folder"
+    assert mistake in capsys.readouterr().err
+    assert content(cut) == before
+    assert main(arguments("--run.overwrite")) == 0
+
+
+def test_a_run_whose_configuration_is_gone_goes_on_and_is_not_begun_anew(cut, tmp_path):
+    (cut / "config.yaml").unlink()
+    assert main(arguments()) == 0
+    run.train(configured(tmp_path / "whole", *QUIET))
+    assert same_values(left(cut), left(tmp_path / "whole"))
+
+
+def watched(folder: Path, monkeypatch: pytest.MonkeyPatch, *more: str) -> Config:
+    """A run that keeps its best model and events, cut off after its third checkpoint."""
+    config = configured(folder, *WATCHED, *more)
+    cut_off(config, monkeypatch, after=3, logs=2)
+    return config
+
+
+@pytest.mark.fault("best model missing or damaged")
+@pytest.mark.parametrize("damage", ["missing", "cut", "empty", "another"])
+def test_a_lost_best_model_is_named_and_the_run_does_not_end_without_one(damage, tmp_path, monkeypatch, capsys):
+    config = watched(tmp_path / "run", monkeypatch, "--run.tensorboard=false")
+    path, raw = tmp_path / "run" / "best.pt", (tmp_path / "run" / "best.pt").read_bytes()
+    path.unlink()
+    if damage == "another":
+        PGTS("pgts/Ladder-v0", depth=0, seed=5).save(path)
+    elif damage != "missing":
+        path.write_bytes(raw[:-7] if damage == "cut" else b"")
+    before = content(tmp_path / "run")
+    with pytest.raises(PgtsError, match=r"best\.pt"):
+        run.train(config, strict_resume=True)
+    assert content(tmp_path / "run") == before
+    run.train(config)
+    [warning] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning")]
+    assert "best.pt" in warning
+    assert warning.endswith("takes its place until a better one comes")
+    assert PGTS.load(path).num_env_steps > 0
+
+
+@pytest.mark.fault("best model missing or damaged")
+def test_a_finished_training_that_has_lost_its_best_model_ends_with_one(tmp_path, monkeypatch, capsys):
+    config = configured(tmp_path / "run", *QUIET, *WATCHED)
+    with monkeypatch.context() as patch:
+        patch.setattr(run._Recorder, "finish", lambda recorder: (_ for _ in ()).throw(Killed()))
+        with pytest.raises(Killed):
+            run.train(config)
+    (tmp_path / "run" / "best.pt").unlink()
+    run.train(config)
+    assert "best.pt is missing" in capsys.readouterr().err
+    assert PGTS.load(tmp_path / "run" / "best.pt").num_env_steps == 300
+
+
+@pytest.mark.fault("events missing or damaged")
+@pytest.mark.parametrize("damage", ["missing", "cut", "changed"])
+def test_lost_events_are_made_anew_from_the_metrics(damage, tmp_path, monkeypatch, capsys):
+    run.train(configured(tmp_path / "whole", *WATCHED))
+    config = watched(tmp_path / "cut", monkeypatch)
+    [path] = (tmp_path / "cut").glob("events*")
+    raw = path.read_bytes()
+    path.unlink()
+    if damage != "missing":
+        path.write_bytes(raw[:200] if damage == "cut" else raw[:200] + b"?" + raw[201:])
+    with pytest.raises(PgtsError, match="events"):
+        run.train(config, strict_resume=True)
+    run.train(config)
+    assert "the events are made anew from metrics.jsonl" in capsys.readouterr().err
+    assert same_values(left(tmp_path / "cut"), left(tmp_path / "whole"))
+    assert [step for step, _ in curve(tmp_path / "cut")] == [60, 120, 180, 240, 300]
+
+
+def resealed(path: Path, change: Callable[[dict[str, Any], dict[str, Any]], object]) -> None:
+    """Change what a checkpoint says, its notes and its model, with all checksums right."""
+    manifest = json.loads((path / "manifest.json").read_text())["content"]
+    saved = saving.read(path / "model.pt")
+    change(manifest["notes"], saved["state"])
+    saving.write(path / "model.pt", saved)
+    manifest["files"] = {"model.pt": digest((path / "model.pt").read_bytes())}
+    (path / "manifest.json").write_bytes(sealed(manifest))
+
+
+@pytest.mark.fault("checkpoint that says what cannot be")
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        (lambda notes, state: state.pop("policy"), "policy"),
+        (lambda notes, state: state["policy"]["logits_SA"].fill_(torch.nan), "policy"),
+        (lambda notes, state: state["critic"].update(count_C=-state["critic"]["count_C"] - 1), "critic"),
+        (lambda notes, state: state.update(num_iterations="2"), "num_iterations"),
+        (lambda notes, state: state.update(num_env_steps=7), "step 7"),
+        (lambda notes, state: notes.pop("progress"), "progress"),
+        (lambda notes, state: notes.update(more=1), "more"),
+        (lambda notes, state: notes.update(env_steps=-1), "env_steps"),
+        (lambda notes, state: notes.update(files=[]), "files"),
+        (lambda notes, state: notes.update(files={"metrics.jsonl": "all"}), "not of the form"),
+        (lambda notes, state: notes.update(world_size="1"), "world_size"),
+        (lambda notes, state: notes.update(config=None), "config"),
+        (lambda notes, state: notes["progress"].pop("depth"), "depth"),
+        (lambda notes, state: notes["progress"].update(ended_by="rain"), "ended_by"),
+        (lambda notes, state: notes["progress"].update(seconds="long"), "progress"),
+        (lambda notes, state: notes["progress"].update(evaluations=3), "progress"),
+        (lambda notes, state: notes["progress"].update(certificate="low"), "progress"),
+    ],
+)
+def test_a_checkpoint_that_says_what_cannot_be_is_refused_by_name(change, part, cut, capsys):
+    resealed(checkpoint.listed(cut)[-1], change)
+    assert main(arguments()) == 2
+    mistakes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert part in mistakes[0]
 
 
 @pytest.mark.fault("other versions at resume")
@@ -291,7 +428,7 @@ def test_other_versions_are_a_warning_or_refused(cut, monkeypatch, capsys):
     monkeypatch.setattr(resume, "versions", lambda: now | {"torch": "0.1"})
     line = f"torch is 0.1; cut/checkpoints/000000000120 was written with {now['torch']}"
     assert main(arguments("--strict-resume")) == 2
-    assert f"error: {line}\n" in capsys.readouterr().err
+    assert f"error: {line}: the last bits may differ\n" in capsys.readouterr().err
     assert main(arguments()) == 0
     assert f"warning: {line}: the last bits may differ\n" in capsys.readouterr().err
 

@@ -12,7 +12,7 @@ from pgts_torch.experiment.report.facts import gather
 from pgts_torch.experiment.report.page import is_page, page
 
 
-def write(run: Path, out: Path | None) -> dict[str, Any]:
+def write(run: Path, out: Path | None, *, trust_imports: bool = False) -> dict[str, Any]:
     """Write the page about a run, by default into its folder.
 
     Returns:
@@ -24,6 +24,6 @@ def write(run: Path, out: Path | None) -> dict[str, Any]:
     """
     torch.set_num_threads(1)
     out = files.target(run / REPORT_FILE if out is None else out, is_page, "a page of pgts report")
-    facts, trained = gather(run)
+    facts, trained = gather(run, trust_imports=trust_imports)
     files.replace(out, page(facts, trained).encode())
     return {"page": str(out), **asdict(facts)}

@@ -78,7 +78,7 @@ class Trained:
     step: int
 
 
-def gather(run: Path) -> tuple[Facts, Trained | None]:
+def gather(run: Path, *, trust_imports: bool = False) -> tuple[Facts, Trained | None]:
     """What a run folder says, and the policy in it.
 
     Raises:
@@ -89,7 +89,7 @@ def gather(run: Path) -> tuple[Facts, Trained | None]:
     summary, failure = reading.summary(run, notes), reading.failure(run, notes)
     lines = reading.metrics(run, notes)
     path, last = reading.last_checkpoint(run, notes) or (None, None)
-    trained = None if path is None or last is None else _trained(path, last, notes)
+    trained = None if path is None or last is None else _trained(path, last, notes, trust_imports=trust_imports)
     latest = {tag: value for line in lines for tag, value in line.items()}
     curves = panels(lines)
     facts = Facts(
@@ -115,9 +115,9 @@ def gather(run: Path) -> tuple[Facts, Trained | None]:
     return facts, trained
 
 
-def _trained(path: Path, last: Notes, notes: list[str]) -> Trained | None:
+def _trained(path: Path, last: Notes, notes: list[str], *, trust_imports: bool) -> Trained | None:
     try:
-        algorithm = PGTS.load(path / checkpoint.MODEL_FILE, device="cpu")
+        algorithm = PGTS.load(path / checkpoint.MODEL_FILE, device="cpu", trust_imports=trust_imports)
     except PgtsError as error:
         notes.append(f"The trained policy cannot be loaded, so there are no pictures of it: {error}.")
         return None

@@ -101,7 +101,7 @@ def _state(facts: Facts) -> Iterator[Html]:
         yield element(
             "p",
             f"{facts.step:,} of {facts.total_steps:,} environment steps are made. Unless it is still being trained, ",
-            element("code", resuming(facts.run, facts.world_size)),
+            element("code", resuming(facts.run, facts.world_size, facts.env)),
             " goes on.",
             class_="box",
         )

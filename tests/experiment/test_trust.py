@@ -1,0 +1,97 @@
+"""A module that only a saved file names is not imported, unless somebody has said that it may be."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from pgts_torch import PGTS
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.cli import main
+from pgts_torch.trust import check_imports
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+MODULE = """
+from pathlib import Path
+import gymnasium
+from pgts_torch.envs import entry_points
+Path("trace").write_text("imported")
+if "Mine-v0" not in gymnasium.registry:
+    gymnasium.register("Mine-v0", entry_point=entry_points.ladder, vector_entry_point=entry_points.ladder_vector)
+"""
+TINY = ["--rollout.num_envs=1", "--rollout.horizon.length=5", "--search.depth=0", "--eval.episodes=1"]
+ENV = "environments_of_mine:Mine-v0"
+SHORT = [*TINY, "--total_steps=10", "--run.tensorboard=false", "--run.dir=run"]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with a module of environments that leaves a trace where it is imported."""
+    (tmp_path / "environments_of_mine.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    sys.modules.pop("environments_of_mine", None)
+
+
+def forgotten() -> Path:
+    """The trace of an import, and nobody has imported the module yet."""
+    sys.modules.pop("environments_of_mine", None)
+    trace = Path("trace")
+    trace.unlink(missing_ok=True)
+    return trace
+
+
+@pytest.mark.fault("saved file that names a module")
+def test_a_saved_model_imports_the_module_of_its_environment_only_where_it_is_trusted(here):
+    PGTS(ENV, depth=0, num_envs=1).save("model.pt")
+    trace = forgotten()
+    with pytest.raises(PgtsError, match=r"^model\.pt names 'environments_of_mine:Mine-v0' .* trust_imports=True"):
+        PGTS.load("model.pt")
+    assert not trace.exists()
+    assert PGTS.load("model.pt", trust_imports=True).num_env_steps == 0
+    assert trace.exists()
+
+
+@pytest.mark.fault("saved file that names a module")
+def test_the_folder_of_a_run_imports_a_module_only_where_it_is_trusted(here, capsys):
+    assert main(["train", f"--env.id={ENV}", *SHORT]) == 0  # typed by the user, who so consents
+    trace = forgotten()
+    for command in (["train", "--resume", "run"], ["evaluate", "run"]):
+        assert main(command) == 2
+        assert "names 'environments_of_mine:Mine-v0' as its environment" in capsys.readouterr().err
+        assert not trace.exists()
+    assert main(["report", "run"]) == 0
+    assert not trace.exists()
+    assert "trust_imports=True, or --trust-imports" in Path("run/report.html").read_text()
+    assert main(["report", "run", "--trust-imports"]) == 0
+    assert trace.exists()
+    assert main(["evaluate", "run", "--trust-imports", "--episodes=1"]) == 0
+    for consent in (["--trust-imports"], [f"--env.id={ENV}"]):
+        assert main(["train", "--resume", "run", *consent]) == 2
+        assert "holds a finished run" in capsys.readouterr().err
+    assert main(["train", "--trust-imports"]) == 2
+    assert "error: --trust-imports goes with --resume only" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("env", "kwargs", "refused"),
+    [
+        ("os:Path-v0", {}, True),
+        ("a.b:c:Id-v0", {}, True),
+        (" os : x", {}, True),
+        (None, {"make": "os:system"}, True),
+        ("CartPole-v1", {"inner": [{"env": ("a_b.c:D-v0",)}]}, True),
+        ("CartPole-v1", {"os:system": 1}, True),
+        ("ALE/Pong-v5", {"url": "http://x.org:80/a", "time": "12:30", "n": 3}, False),
+        (None, {}, False),
+        (None, None, False),
+    ],
+)
+def test_what_names_a_module_is_told_from_what_does_not(env, kwargs, refused):
+    if refused:
+        with pytest.raises(PgtsError, match="imports the module"):
+            check_imports("file", env, kwargs)
+    else:
+        check_imports("file", env, kwargs)
