@@ -144,10 +144,10 @@ def test_another_configuration_is_refused_key_by_key_and_nothing_is_lost(cut, ca
     other = [
         "--seed",
         "3",
-        "--update",
-        "{type: mirror}",
-        "--policy.init",
-        "{type: biased, probability: 0.5}",
+        "--rollout.horizon",
+        "{type: geometric}",
+        "--search.depth",
+        "adaptive",
         "--eval.every",
         "60",
     ]
@@ -155,12 +155,10 @@ def test_another_configuration_is_refused_key_by_key_and_nothing_is_lost(cut, ca
     where = "in run.dir cut it is"
     assert capsys.readouterr().err.splitlines()[1:] == [
         f"error: seed is 3; {where} 0",
-        f"error: policy.init.type is biased; {where} uniform",
-        f"error: policy.init.action is 0; {where} null",
-        f"error: policy.init.probability is 0.5; {where} null",
-        f"error: update.type is mirror; {where} softmax",
-        f"error: update.state_weight is null; {where} occupancy",
-        f"error: update.step_size is null; {where} 0.1",
+        f"error: rollout.horizon.type is geometric; {where} fixed",
+        f"error: rollout.horizon.max_length is 100000; {where} null",
+        f"error: search.depth is adaptive; {where} 4",
+        f"error: rollout.horizon.length is null; {where} 15",
         "error: run.dir cut holds an earlier run of another configuration; choose another folder, or set run.overwrite",
     ]
     assert content(cut) == before
