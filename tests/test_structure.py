@@ -14,6 +14,7 @@ PACKAGE = ROOT / "pgts_torch"
 ROOMS = [
     "errors",
     "files",
+    "trust",
     "bellman",
     "seeding",
     "tabular",
