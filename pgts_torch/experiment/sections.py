@@ -353,8 +353,8 @@ class SearchConfig(Section):
     """The most nodes of one search. One that needs more is narrowed by auto and refused by the others."""
 
     max_bytes: Count = 4 * 2**30
-    """The most memory that the outcomes and nodes of one search may take; at its peak it needs about three times as
-    much. One that needs more is treated likewise, before it takes it."""
+    """The most memory that a search may take at its peak, with what is remembered for the next ones. One that needs
+    more is treated likewise, before it takes it."""
 
     max_width: Count | None = None
     """The most states of a level that are unfolded; null: all. Only with search.kind expectimax."""

@@ -125,7 +125,14 @@ def promise(model: Model, reward_range: RewardRange, *, gamma: float) -> None:
 
 
 class EnumeratingModel(Model):
-    """A model that lists all outcomes of a state."""
+    """A model that lists all outcomes of a state.
+
+    num_outcomes: K; None: it is not known before the model is asked.
+    draws: whether it draws the outcomes that it lists, and remembers them.
+    """
+
+    num_outcomes: int | None = None
+    draws: bool = False
 
     @abstractmethod
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:

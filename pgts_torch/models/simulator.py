@@ -73,6 +73,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
 
     kind, is_cheap = "simulator", False
 
+    num_outcomes = 1
+
     def __init__(
         self,
         env: EnvSource,

@@ -27,6 +27,9 @@ from pgts_torch.tabular.stationary import highest_value, lowest_value
 _MOST_TOLD = 8
 """How many outcomes a message names."""
 
+_CHUNK = 2**18
+"""About how many probabilities are held at a time while outcomes are drawn."""
+
 _ODD = [factor - 2**64 for factor in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)]
 """By which what tells outcomes apart is multiplied, modulo 2**64."""
 
@@ -48,7 +51,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
     ) -> None:
         self.table = mdp.outcomes.to(device, dtype)
         self.num_states = mdp.num_states
-        self.num_actions = mdp.num_actions
+        self.num_actions, self.num_outcomes = mdp.num_actions, mdp.outcomes.num_outcomes
         self.device = self.table.device
         self.dtype = dtype
         self.highest_value, self.lowest_value = highest_value(mdp.outcomes), lowest_value(mdp.outcomes)
@@ -62,15 +65,21 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
 
     def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
         """One outcome of each (state, action) by inverting the distribution function; the reward is r(s, a)."""
+        pieces = [each.split(max(1, _CHUNK // self.table.num_outcomes)) for each in (state_N, action_N, key_N)]
+        k_N = torch.cat([self._drawn(*piece) for piece in zip(*pieces, strict=True)])
+        table = self.table
+        return Transitions(
+            table.reward_NA[state_N, action_N],
+            table.discount_NAK[state_N, action_N, k_N],
+            table.child_NAK[state_N, action_N, k_N],
+        )
+
+    def _drawn(self, state_N: Tensor, action_N: Tensor, key_N: Tensor) -> Int[Tensor, "N"]:
+        """Which outcome is drawn."""
         cumulative_NK = self._cumulative_NAK[state_N, action_N]
         level_N1 = uniform(key_N, self.dtype).unsqueeze(-1) * cumulative_NK[:, -1:]
         # The first k whose cumulative probability exceeds u < total always has positive probability.
-        k_N1 = (cumulative_NK <= level_N1).sum(-1, keepdim=True)
-        return Transitions(
-            self.table.reward_NA[state_N, action_N],
-            self.table.discount_NAK[state_N, action_N].gather(-1, k_N1).squeeze(-1),
-            self.table.child_NAK[state_N, action_N].gather(-1, k_N1).squeeze(-1),
-        )
+        return (cumulative_NK <= level_N1).sum(-1)
 
     @cached_property
     def _looks_RK(self) -> Int[np.ndarray, "R K"]:

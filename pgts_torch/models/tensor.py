@@ -51,6 +51,8 @@ class TensorModel(EnumeratingModel, SamplingModel):
         PgtsError: action_repeat is below 1.
     """
 
+    num_outcomes = 1
+
     def __init__(
         self,
         state_size: int,

@@ -32,7 +32,7 @@ class AutoSearch(Search):
     Args:
         model: what is asked.
         max_nodes: the most nodes of one search.
-        max_bytes: the most memory that its outcomes may take.
+        max_bytes: the most memory that a search may take.
 
     Raises:
         NodeBudgetExceeded: from a search, where even one state a level, or one sample of each action, is too much.
@@ -66,9 +66,9 @@ class AutoSearch(Search):
     def _listed(
         self, root_B: Tensor, depth: int, expansions: int, q_leaf: Leaf | None, v_leaf: Leaf | None
     ) -> Lookahead:
-        topology = self.topology
-        assert topology is not None
-        calls_before = topology.model_calls
+        assert self.topology is not None
+        topology: Topology = self.topology
+        calls_before, calls_left_behind = topology.model_calls, 0
 
         def look(max_width: int | None) -> Lookahead:
             return expectimax(
@@ -90,11 +90,20 @@ class AutoSearch(Search):
                 return full
             except NodeBudgetExceeded:
                 self._too_much = len(root_B), expansions
+        begun_anew = False
         while True:
             try:
                 narrow = look(self._width)
                 break
             except NodeBudgetExceeded:
+                # What was found before, or by this attempt, takes memory too; the next one begins without it.
+                calls_left_behind += topology.model_calls - calls_before
+                is_full = topology.num_expanded > 0
+                topology = self.topology = topology.anew()
+                calls_before = 0
+                if is_full and not begun_anew:
+                    begun_anew = True
+                    continue
                 if self._width == 1:
                     raise
                 self._width //= 2
@@ -107,7 +116,7 @@ class AutoSearch(Search):
             )
         if 2 * max(self._width, narrow.nodes) <= self.max_nodes:
             self._width *= 2
-        return replace(narrow, model_calls=topology.model_calls - calls_before)
+        return replace(narrow, model_calls=calls_left_behind + topology.model_calls - calls_before)
 
     def _sampled(
         self,

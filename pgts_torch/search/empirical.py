@@ -38,6 +38,8 @@ class Empirical(EnumeratingModel):
         key: the key of the search, shape [1].
     """
 
+    draws = True
+
     # What the calls of a `Topology` change must be ordinary tensors even if the caller is in inference mode.
     @torch.inference_mode(False)
     @torch.no_grad()
@@ -55,6 +57,8 @@ class Empirical(EnumeratingModel):
         self.num_states = 0
         self._model, self._samples, self._share, self._key = model, samples, share, key
         self._most_samples = max((C for C in samples if C is not None), default=0)
+        listed = model.num_outcomes if isinstance(model, EnumeratingModel) else None
+        self.num_outcomes = max((listed or 1) if C is None else C for C in samples)
         self._states: list[Tensor] = []
         self._keys: list[Tensor] = []
         self._rewards: list[Tensor] = []
@@ -148,6 +152,7 @@ class Drawn(EnumeratingModel):
     def __init__(self, model: SamplingModel, *, samples: int, key: Int[Tensor, "1"]) -> None:
         self.num_actions, self.device, self.dtype = model.num_actions, model.device, model.dtype
         self._model, self._samples, self._key = model, samples, key
+        self.num_outcomes = samples
 
     @property
     def num_states(self) -> int:  # type: ignore[override]  # it grows with the model's

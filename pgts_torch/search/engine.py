@@ -115,7 +115,7 @@ class ExpectimaxSearch(Search):
         model: lists outcomes.
         max_nodes: the most nodes of one search.
         max_width: the most states of a level that are unfolded. Default: all.
-        max_bytes: the most memory that the outcomes of one search may take.
+        max_bytes: the most memory that a search may take, with what is remembered.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class SampledSearch(Search):
         samples: outcomes of each (state, action), one number or one for each level.
         share: what shares them, "none", "level" or "search".
         max_nodes: the most nodes of one search.
-        max_bytes: the most memory that its outcomes may take.
+        max_bytes: the most memory that a search may take.
     """
 
     def __init__(
@@ -214,7 +214,7 @@ class MCTSSearch(Search):
         samples: how many drawn outcomes of each action stand for all, anew in each search. Default: all are listed, or
             4 where the model only draws.
         max_nodes: the most nodes of one search.
-        max_bytes: the most memory that its nodes and the outcomes of their states may take.
+        max_bytes: the most memory that a search may take, with what is remembered.
     """
 
     def __init__(
@@ -245,7 +245,7 @@ class MCTSSearch(Search):
         if topology is None:
             key = draw_keys(1, generator=generator).to(self.model.device)
             drawn = Drawn(drawing(self.model, "mcts"), samples=self.samples, key=key)
-            topology = Topology(drawn, max_bytes=self.max_bytes, num_outcomes=self.samples)
+            topology = Topology(drawn, max_bytes=self.max_bytes)
             calls_each = self.samples
         look = mcts(
             topology.model,

@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import NodeBudgetExceeded, PgtsError
+from pgts_torch.errors import PgtsError
 from pgts_torch.search.lookahead import Leaf, Leaves
-from pgts_torch.search.topology import Topology, counting, gib, table_bytes
+from pgts_torch.search.memory import GROWTH, check_memory
+from pgts_torch.search.topology import Topology, counting
 
 _FAIR = 1e-3
 """By how much the probabilities of a prior may miss 1."""
@@ -49,11 +50,11 @@ class KnownStates:
         self.prob_TE, self.child_TE = none(A, dtype=torch.float64), none(A, dtype=torch.int64)
         self.v_T, self.shut_T, self.outcomes_T = none(), none(), none(dtype=torch.int64)
 
-    def rows(self, state_N: Int[Tensor, "N"], *, beside: int = 0) -> Int[Tensor, "N"]:
+    def rows(self, state_N: Int[Tensor, "N"], **tree: int) -> Int[Tensor, "N"]:
         """Where these states stand in the tables; those that are new are asked about first, together.
 
         Args:
-            beside: how many bytes the nodes of the search take.
+            tree: what the nodes of the search take, see `check_memory`.
 
         Raises:
             PgtsError: the model, the critic or the prior answers with something that cannot be used.
@@ -62,23 +63,25 @@ class KnownStates:
         row_N = self.row_S.index_select(0, state_N)
         if int(row_N.amin()) < 0:
             new_N = state_N[row_N < 0].unique()
-            self.check_memory(len(new_N), beside)
+            self.check_memory(len(new_N), **tree)
             self._learn(new_N)
             row_N = self.row_S.index_select(0, state_N)
         else:
-            self.check_memory(0, beside)
+            self.check_memory(0, **tree)
         return row_N
 
-    def check_memory(self, new: int, beside: int) -> None:
-        """NodeBudgetExceeded if so many more states, and so many bytes beside the states, are too much."""
-        A, K, limit = self.num_actions, self._topology.num_outcomes, self.max_bytes
-        states = state_bytes(self.count + new, A, K, self.dtype)
-        if states + beside > limit:
-            raise NodeBudgetExceeded(
-                f"the search would take {gib(states + beside)}: {gib(beside)} for its nodes and {gib(states)} for "
-                f"{self.count + new} states of {A} actions and {K} outcomes of each; the limit is {gib(limit)}: lower "
-                "the simulations, ask for fewer roots or raise max_bytes"
-            )
+    def check_memory(self, new: int, **tree: int) -> None:
+        """NodeBudgetExceeded if so many more states, beside the tree, are too much.
+
+        Args:
+            tree: what the tree counts: nodes, places and arms.
+        """
+        learned = self.count + new
+        needed = self._topology.bytes(new, asked=new, kept=new, learned=learned, **tree)
+        nodes = tree.get("nodes", 0)
+        check_memory(
+            needed, self.max_bytes, f"the search ({nodes} nodes, {learned} states of {self.num_actions} actions)"
+        )
 
     def _learn(self, state_N: Int[Tensor, "N"]) -> None:
         with torch.inference_mode(False), torch.no_grad():
@@ -118,7 +121,7 @@ class KnownStates:
         first, last = self.count, self.count + N
         if last > len(self.v_T):
             for name in more:
-                setattr(self, name, longer(getattr(self, name), 2 * last))
+                setattr(self, name, longer(getattr(self, name), max(last, int(GROWTH * len(getattr(self, name))))))
         for name, rows in more.items():
             getattr(self, name)[first:last] = rows.view(N, *getattr(self, name).shape[1:])
         if (missing := self._topology.model.num_states - len(self.row_S)) > 0:
@@ -146,14 +149,6 @@ class KnownStates:
             n = int(off_N.nonzero()[0, 0])
             raise PgtsError(f"the prior of state {int(state_N[n])} is {prior_NA[n].tolist()}; it is no distribution")
         return prior_NA
-
-
-def state_bytes(num_states: int, num_actions: int, num_outcomes: int, dtype: torch.dtype) -> int:
-    """How much memory the tables of `KnownStates` and the outcomes of their states take."""
-    s, A, E = dtype.itemsize, num_actions, num_actions * num_outcomes
-    return num_states * (2 * s + 8 + A * (4 * s + 8) + E * (4 * s + 16)) + table_bytes(
-        num_states, num_actions, num_outcomes, dtype
-    )
 
 
 def longer(x_N: Tensor, rows: int) -> Tensor:

@@ -21,7 +21,7 @@ Leaf = Callable[[Tensor], Tensor]
 MAX_NODES = 10_000_000
 
 MAX_BYTES = 4 * 2**30
-"""How much memory the outcomes of one lookahead may take; at its peak it needs about three times as much."""
+"""How much memory a search may take at its peak, with what is remembered for the next ones."""
 
 
 @dataclass(frozen=True, eq=False)

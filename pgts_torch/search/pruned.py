@@ -100,7 +100,7 @@ def _unfold(
     kept_M = _all(roots)
     levels: list[_Level] = []
     while len(levels) < leaves.expansions and len(kept_M):
-        step, children = topology.step(frontier[kept_M])
+        step, children = topology.step(frontier[kept_M], kept=sum(len(level.kept_M) for level in levels))
         levels.append(_Level(v_N, kept_M, step))
         nodes_per_level.append(len(children))
         _check_budget(nodes_per_level, max_nodes)

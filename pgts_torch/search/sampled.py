@@ -22,6 +22,7 @@ from pgts_torch.search.lookahead import (
     check_vector,
     unexpanded,
 )
+from pgts_torch.search.memory import RESAMPLED
 from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import draw_keys, mix, uniform
 
@@ -29,7 +30,7 @@ _RESAMPLE = 0x626F6F74
 """Parts the keys of the bootstrap from those of the samples."""
 
 _CHUNK = 2**22
-"""About how many resampled outcomes of one level are held at a time."""
+"""The most resampled outcomes of one level that are held at a time, or those of one replicate."""
 
 
 @torch.no_grad()
@@ -77,7 +78,7 @@ def sampled(
         generator: gives one key, from which all samples of this search follow.
         replicates: R of the bootstrap: 0, or at least 2.
         max_nodes: the most nodes, summed over levels; the samples of a level are drawn before its children are counted.
-        max_bytes: the most memory that the outcomes may take; those of a level are estimated before they are drawn.
+        max_bytes: the most memory that the search may take; a level is estimated before it is drawn.
 
     Returns:
         `model_calls` counts each (state, action, sample), and one for a (state, action) whose outcomes are listed.
@@ -102,15 +103,16 @@ def sampled(
             model, root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, topology=topology, max_nodes=max_nodes
         )
     empirical = Empirical(model, root_B, samples=plan, share=share, key=key)
-    widest = max(C or 1 for C in plan)
-    topology = Topology(empirical, max_bytes=max_bytes, num_outcomes=widest)
+    topology = Topology(empirical, max_bytes=max_bytes)
     steps, bottom_N, nodes_per_level = _unfolded(empirical, topology, leaves.expansions, share, max_nodes)
     v_N = _leaf_values(leaves, empirical, steps, bottom_N)
     q_BA = _backups([outcomes for _, outcomes in reversed(steps)], v_N)[empirical.root_B]
     stderr_BA = bias_BA = torch.full_like(q_BA, torch.nan)
     fewest = min(C for C in plan if C is not None)
     if replicates and fewest > 1:
-        again_RNA = _bootstrap(empirical, plan, steps, v_N, replicates)
+        kept = sum(outcomes.num_states for _, outcomes in steps)
+        free = max(0, max_bytes - topology.bytes(0, kept=kept))
+        again_RNA = _bootstrap(empirical, plan, steps, v_N, replicates, at_once=free // RESAMPLED)
         stderr_BA, bias_BA = _spread(q_BA, again_RNA[:, empirical.root_B])
         if len(plan) == 1:  # it would be noise of the bootstrap: there is no maximum over samples
             bias_BA = torch.zeros_like(bias_BA)
@@ -192,9 +194,15 @@ def _backups(outcomes: Iterable[Outcomes], v_N: Float[Tensor, "leaves"]) -> Floa
 
 
 def _bootstrap(
-    empirical: Empirical, plan: Sequence[int | None], steps: list[Step], v_N: Tensor, replicates: int
+    empirical: Empirical,
+    plan: Sequence[int | None],
+    steps: list[Step],
+    v_N: Tensor,
+    replicates: int,
+    at_once: int,
 ) -> Float[Tensor, "R N A"]:
-    """Values at the roots, done again with resampled outcomes."""
+    """Values at the roots, done again with resampled outcomes, of which about so many are held at once beyond those of
+    one replicate."""
     key_N, reward_NAC = empirical.key_N, empirical.reward_NAC
 
     def resampled(replicate_R: Tensor) -> Iterator[Outcomes]:
@@ -206,7 +214,7 @@ def _bootstrap(
             yield done[1]
 
     largest = max(outcomes.child_NAK.numel() for _, outcomes in steps)
-    chunks = torch.arange(replicates, device=v_N.device).split(max(1, _CHUNK // largest))
+    chunks = torch.arange(replicates, device=v_N.device).split(1 + min(at_once, _CHUNK) // largest)
     A = empirical.num_actions
     return torch.cat([_backups(resampled(chunk), v_N.repeat(len(chunk))).view(len(chunk), -1, A) for chunk in chunks])
 

@@ -13,6 +13,7 @@ from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NodeBudgetExceeded, NotFinite, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model
 from pgts_torch.search.lookahead import MAX_BYTES, check_states, check_vector
+from pgts_torch.search.memory import GROWTH, Sizes, check_memory, search_bytes
 
 _REMEMBERED_ROOTS = 8
 """How many different batches of roots keep their levels."""
@@ -41,6 +42,12 @@ class Levels:
 
     def __post_init__(self) -> None:
         self.closed_states = self.frontiers[0]
+
+    @property
+    def rows(self) -> int:
+        """How many rows of outcomes are kept."""
+        closed = 0 if self.closed is None else self.closed.num_states
+        return closed + sum(outcomes.num_states for outcomes in self.outcomes)
 
     def sweeps(self, expansions: int) -> int:
         """How many of `expansions` levels, counted from the leaves, are the closed set."""
@@ -92,24 +99,26 @@ class _Rows:
         """Add copies of these rows, padded to the largest K so far, and say where they are."""
         first, last = self.count, self.count + more.num_states
         row_N = torch.arange(first, last, device=more.device)
-        table = self._table or more.rows(row_N[:0])
-        K = max(table.num_outcomes, more.num_outcomes)
-        if last > table.num_states:
-            table = _padded(table, max(last, 2 * table.num_states), K)
-        elif table.num_outcomes < K:
-            table = _padded(table, table.num_states, K)
-        for mine, given in zip(_tensors(table), _tensors(more), strict=True):
-            mine[first:last, ..., : given.shape[-1]] = given
-        self._table, self.count = table, last
+        columns = [*_tensors(self._table or more.rows(row_N[:0]))]
+        room, K = len(columns[0]), max(columns[1].shape[-1], more.num_outcomes)
+        room = room if last <= room else max(last, int(GROWTH * room))
+        self._table = None
+        for i, given in enumerate(_tensors(more)):  # one after the other, so that only one is there twice
+            columns[i] = _padded(columns[i], room, K)
+            columns[i][first:last, ..., : given.shape[-1]] = given
+        reward_NA, prob_NAK, discount_NAK, child_NAK = columns
+        self._table = Outcomes(reward_NA, prob_NAK, discount_NAK, child_NAK, more.num_children)
+        self.count = last
         return row_N
 
 
-def _padded(outcomes: Outcomes, N: int, K: int) -> Outcomes:
-    """The same outcomes with room for N states and K outcomes."""
-    reward_NA, *of_outcomes = _tensors(outcomes)
-    pad, more_N, more_K = torch.nn.functional.pad, N - outcomes.num_states, K - outcomes.num_outcomes
-    prob_NAK, discount_NAK, child_NAK = (pad(x_NAK, (0, more_K, 0, 0, 0, more_N)) for x_NAK in of_outcomes)
-    return Outcomes(pad(reward_NA, (0, 0, 0, more_N)), prob_NAK, discount_NAK, child_NAK, outcomes.num_children)
+def _padded(x: Tensor, N: int, K: int) -> Tensor:
+    """The same column with room for N states, and for K outcomes if it is one of outcomes."""
+    by_outcome = x.ndim == 3
+    if len(x) == N and (not by_outcome or x.shape[-1] == K):
+        return x
+    more = (0, K - x.shape[-1], 0, 0, 0, N - len(x)) if by_outcome else (0, 0, 0, N - len(x))
+    return torch.nn.functional.pad(x, more)
 
 
 def _tensors(outcomes: Outcomes) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -125,12 +134,11 @@ class Topology:
 
     Args:
         model: the model that answers.
-        max_bytes: the most memory that the outcomes of one lookahead may take, see `table_bytes`.
-        num_outcomes: K as far as it is known before the model is asked.
+        max_bytes: the most memory that a search may take, with all that is remembered here (`memory.search_bytes`).
     """
 
-    def __init__(self, model: EnumeratingModel, *, max_bytes: int = MAX_BYTES, num_outcomes: int = 1) -> None:
-        self.model, self.max_bytes, self._least_outcomes = model, max_bytes, num_outcomes
+    def __init__(self, model: EnumeratingModel, *, max_bytes: int = MAX_BYTES) -> None:
+        self.model, self.max_bytes = model, max_bytes
         self.model_calls = 0
         self._generation = model.generation
         self._known = _Rows()
@@ -161,8 +169,8 @@ class Topology:
                 self._levels.popitem(last=False)
         self._levels.move_to_end(key)
         while levels.closed is None and len(levels.outcomes) < expansions:
-            nodes = self._check_nodes(levels, len(levels.outcomes), expansions, max_nodes)
-            self._check_memory(nodes, f"levels 0 to {len(levels.outcomes)} of the {expansions}")
+            self._check_nodes(levels, len(levels.outcomes), expansions, max_nodes)
+            self._afford(levels.frontiers[-1], levels, f"level {len(levels.outcomes)} of the {expansions}")
             self._expand(levels)
         self._check_nodes(levels, expansions, expansions, max_nodes)
         return levels
@@ -170,18 +178,21 @@ class Topology:
     # What these make outlives the call: it must be ordinary tensors even if the caller is in inference mode.
     @torch.inference_mode(False)
     @torch.no_grad()
-    def step(self, state_N: Int[Tensor, "N"]) -> tuple[Outcomes, Int[Tensor, "C"]]:
+    def step(self, state_N: Int[Tensor, "N"], *, kept: int = 0, beside: int = 0) -> tuple[Outcomes, Int[Tensor, "C"]]:
         """What follows these states, in terms of positions among their distinct children; and these, ascending.
 
         Nothing but the answers of the model is remembered. Where every outcome ends there are no children, and the
         outcomes cannot be backed up.
 
+        Args:
+            kept: how many rows of earlier steps the caller holds.
+
         Raises:
             NodeBudgetExceeded: what follows these states would take more memory than `max_bytes`.
         """
         self._check_generation()
-        self._check_memory(len(state_N), "one level")
         self._grow_tables()
+        self._afford(state_N, None, "one level", kept=kept)
         outcomes = self._outcomes(state_N)
         counts_NAK = counting(outcomes)
         children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
@@ -189,12 +200,12 @@ class Topology:
 
     def anew(self) -> "Topology":
         """One of the same model and limits that has asked nothing yet."""
-        return Topology(self.model, max_bytes=self.max_bytes, num_outcomes=self._least_outcomes)
+        return Topology(self.model, max_bytes=self.max_bytes)
 
     @property
     def num_outcomes(self) -> int:
         """K, as far as it is known by now."""
-        return max(self._least_outcomes, self._known.num_outcomes)
+        return max(self.model.num_outcomes or 1, self._known.num_outcomes)
 
     @property
     def asked(self) -> Int[Tensor, "N"]:
@@ -252,6 +263,7 @@ class Topology:
         elif len(levels.frontiers) == 1:  # the roots are closed by themselves
             levels.closed = step
         else:
+            self._afford(levels.closed_states, levels, "the closed set")
             inside = self._outcomes(levels.closed_states)
             levels.closed = self._renumbered(inside, counting(inside), levels.closed_states)
         levels.outcomes.append(step)
@@ -308,15 +320,39 @@ class Topology:
             size += f", and levels 0 to {expansions} hold up to {most:.3g}"
         raise NodeBudgetExceeded(f"{size}: {_SMALLER}")
 
-    def _check_memory(self, states: int, which: str) -> None:
-        """NodeBudgetExceeded if the outcomes of so many states would not fit."""
+    def _afford(self, state_N: Int[Tensor, "N"], levels: Levels | None, which: str, *, kept: int = 0) -> None:
+        """NodeBudgetExceeded if what follows these states would not fit. Levels of other roots make room before."""
+        missing = int((self._row_S[state_N] < 0).sum())
+        own = 0 if levels is None else levels.rows
+
+        def needed() -> int:
+            remembered = sum(each.rows for each in self._levels.values() if each is not levels)
+            return self.bytes(missing, asked=len(state_N), kept=kept + own + remembered + len(state_N))
+
+        while needed() > self.max_bytes and any(each is not levels for each in self._levels.values()):
+            self._levels.pop(next(key for key, each in self._levels.items() if each is not levels))
+        check_memory(needed(), self.max_bytes, self._told(which, len(state_N)))
+        if missing > 1 and self._known.count == 0 and self.model.num_outcomes is None:
+            self._probe(state_N[:1])  # one alone, to learn K
+            check_memory(needed(), self.max_bytes, self._told(which, len(state_N)))
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def _probe(self, state_N: Int[Tensor, "1"]) -> None:
+        self._outcomes(state_N)
+
+    def _told(self, which: str, states: int) -> str:
         A, K = self.model.num_actions, self.num_outcomes
-        needed = table_bytes(states, A, K, self.model.dtype)
-        if needed > self.max_bytes:
-            raise NodeBudgetExceeded(
-                f"the outcomes of {which} of the lookahead ({states} nodes, {A} actions, {K} outcomes of each: up to "
-                f"{states * A * K} children) would take {gib(needed)}; the limit is {gib(self.max_bytes)}: {_SMALLER}"
-            )
+        return f"the outcomes of {which} of the lookahead ({states} nodes, {A} actions, {K} outcomes of each)"
+
+    def bytes(self, new: int, *, asked: int = 0, kept: int = 0, **counts: int) -> int:
+        """`search_bytes` of a search that asks about so many new states and looks up so many."""
+        sizes = Sizes(self.model.num_actions, self.num_outcomes, self.model.dtype)
+        numbered, answered = max(self.model.num_states, len(self._row_S)), self._known.count + new
+        if self.model.draws:
+            rows = [step.num_states for each in self._levels.values() for step in each.outcomes]
+            counts |= {"drawn": answered, "drawing": new, "resampled": max([asked, *rows])}
+        return search_bytes(sizes, numbered=numbered, answered=answered, asked=asked, kept=kept, **counts)
 
     def _check_generation(self) -> None:
         if self.model.generation != self._generation:
@@ -385,11 +421,6 @@ def check_answer(model: Model, state_N: Int[Tensor, "N"], answer: Outcomes) -> N
 _SMALLER = "set a smaller depth or max_width, fewer environments, or the search sampled with fewer samples"
 
 
-def table_bytes(num_states: int, num_actions: int, num_outcomes: int, dtype: torch.dtype) -> int:
-    """How much memory the outcomes of so many states take: N A (s + K (2 s + 8)), where a number takes s."""
-    return num_states * num_actions * (dtype.itemsize + num_outcomes * (2 * dtype.itemsize + 8))
-
-
 def tree_nodes(roots: int, children: int, expansions: int) -> float:
     """Nodes of trees in which no two paths meet."""
     if children == 1:
@@ -398,8 +429,3 @@ def tree_nodes(roots: int, children: int, expansions: int) -> float:
         return roots * (float(children) ** (expansions + 1) - 1) / (children - 1)
     except OverflowError:
         return math.inf
-
-
-def gib(num_bytes: int) -> str:
-    """As a person reads it."""
-    return f"{num_bytes / 2**30:.3g} GiB"

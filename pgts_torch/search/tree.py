@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pgts_torch.errors import NodeBudgetExceeded
 from pgts_torch.search.known import KnownStates, longer, widened
+from pgts_torch.search.memory import GROWTH, Sizes
 from pgts_torch.search.split import Selection, apportion
 
 Backup = Literal["max", "mean"]
@@ -26,12 +27,6 @@ _ROOM = 2**22
 
 _DUST = 1e-6
 """Shares of simulations below this are rounding and go nowhere."""
-
-
-def node_bytes(num_nodes: int, num_actions: int, num_outcomes: int, dtype: torch.dtype) -> int:
-    """How much memory so many nodes of a `Tree` take."""
-    s, A, E = dtype.itemsize, num_actions, num_actions * num_outcomes
-    return num_nodes * (2 * s + 16 + A * (2 * s + 8) + E * (2 * s + 16))
 
 
 @dataclass(eq=False)
@@ -86,10 +81,11 @@ class Tree:
         self.known, self.bottom, self.selection = known, bottom, selection
         self.merge, self.mean, self.max_nodes = merge, backup == "mean", max_nodes
         self.A, self.K, self.count = known.num_actions, known.num_outcomes, 1
-        known.check_memory(0, self._bytes(0))
+        self.arms = 0
+        known.check_memory(0, places=bottom + 1 + 2 * len(known.row_S) + (2 * self._places() if merge else 0))
         self.valued = [0] * (bottom + 1)
         self._full_T = dict[tuple[int, int], Tensor]()
-        most = known.max_bytes // node_bytes(1, self.A, self.K, known.dtype)
+        most = known.max_bytes // (2 * Sizes(self.A, self.K, known.dtype).node)
         room = min(room, most, _ROOM // (self.A * self.K)) + 1
 
         def table(*shape: int, dtype: torch.dtype = known.dtype) -> Tensor:
@@ -193,6 +189,7 @@ class Tree:
         """Share simulations among outcomes and expand what they meet; how many are left, where they can go on."""
         known, A, K = self.known, self.A, self.K
         at_M = budget_FA.view(-1).nonzero().squeeze(1)
+        self.arms = max(self.arms, len(at_M))
         budget_M = budget_FA.view(-1).index_select(0, at_M)
         parent_M = at_M.div(A, rounding_mode="trunc")
         node_M = node_F.index_select(0, parent_M)
@@ -271,7 +268,7 @@ class Tree:
                 too many.
         """
         known, N = self.known, len(state_N)
-        state_N = known.rows(state_N, beside=self._bytes(N))
+        state_N = known.rows(state_N, **self._counts(N))
         self._reserve(N)
         new = slice(self.count, self.count + N)
         self.count += N
@@ -305,13 +302,13 @@ class Tree:
         if self.count + rows > len(self.state_N):
             for name, table in vars(self).items():
                 if name.endswith(("_N", "_NA", "_NE")):
-                    setattr(self, name, longer(table, 2 * (self.count + rows)))
+                    setattr(self, name, longer(table, max(self.count + rows, int(GROWTH * len(table)))))
 
-    def _bytes(self, rows: int) -> int:
-        """How much memory the nodes take once there are so many more."""
-        return 8 * (self.bottom + 1 + self.merge * self._places()) + node_bytes(
-            self.count + rows, self.A, self.known.num_outcomes, self.known.dtype
-        )
+    def _counts(self, rows: int) -> dict[str, int]:
+        """What `search_bytes` counts once there are so many more nodes."""
+        nodes = max(self.count + rows, int(len(self.state_N) / GROWTH) if self.count > 1 else 0)
+        places = self.bottom + 1 + 2 * len(self.known.row_S) + (2 * self._places() if self.merge else 0)
+        return {"nodes": nodes, "places": places, "arms": self.arms}
 
     def _places(self) -> int:
         return len(self.known.row_S) * (self.bottom + 1)

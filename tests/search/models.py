@@ -20,6 +20,7 @@ class WatchedModel(EnumeratingModel):
     def __init__(self, model: EnumeratingModel) -> None:
         self.model = model
         self.num_actions, self.device, self.dtype = model.num_actions, model.device, model.dtype
+        self.num_outcomes = model.num_outcomes
         self.calls: list[list[int]] = []
 
     @property

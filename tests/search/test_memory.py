@@ -6,17 +6,22 @@ from torch import Tensor
 
 from pgts_torch.errors import NodeBudgetExceeded
 from pgts_torch.experiment.sections import SearchConfig
+from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.search import expectimax, mcts, sampled
+from pgts_torch.search import known as known_module
+from pgts_torch.search import topology as topology_module
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
-from pgts_torch.search.known import KnownStates, state_bytes
-from pgts_torch.search.lookahead import MAX_BYTES, Leaves
+from pgts_torch.search.known import KnownStates
+from pgts_torch.search.lookahead import MAX_BYTES, Leaves, Lookahead
+from pgts_torch.search.memory import Sizes
 from pgts_torch.search.split import Selection
-from pgts_torch.search.topology import Topology, gib, table_bytes, tree_nodes
-from pgts_torch.search.tree import Tree, node_bytes
+from pgts_torch.search.topology import Topology, tree_nodes
+from pgts_torch.search.tree import Tree
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import random_mdp
+from tests.memory import peak_bytes
 from tests.search.models import WatchedModel
 
 A, K = 3, 4
@@ -28,47 +33,104 @@ def zeros(state_N):
     return torch.zeros(len(state_N), dtype=torch.float64)
 
 
-def test_the_estimate_is_what_the_tables_of_outcomes_take():
-    outcomes = TabularModel(GARNET).outcomes(torch.arange(7))
-    columns = (outcomes.reward_NA, outcomes.prob_NAK, outcomes.discount_NAK, outcomes.child_NAK)
-    assert table_bytes(7, A, K, torch.float64) == sum(column.numel() * column.element_size() for column in columns)
+def look_of(kind: str, model: EnumeratingModel, max_bytes: int) -> tuple[Lookahead, Topology]:
+    """One search, with what it leaves behind."""
+    root_B, critic = torch.arange(40), lambda state_N: torch.zeros(len(state_N), dtype=model.dtype)
+    topology = Topology(model, max_bytes=max_bytes)
+    ask = {"model": model, "root_B": root_B, "depth": 2, "v_leaf": critic}
+    if kind.startswith("sampled"):
+        share, generator = kind.removeprefix("sampled "), stream(0, "search")
+        return sampled(**ask, samples=3, share=share, generator=generator, max_bytes=max_bytes), topology
+    if kind.startswith("mcts"):
+        options = {"mcts": {}, "mcts, merged": {"merge": True}, "mcts, means": {"backup": "mean"}}[kind]
+        return mcts(**ask, simulations=30, topology=topology, **options), topology
+    return expectimax(**ask, topology=topology, max_width=100 if kind == "pruned" else None), topology
+
+
+def least_bytes(kind: str, model: EnumeratingModel, monkeypatch: pytest.MonkeyPatch) -> int:
+    """The smallest limit under which the search is made."""
+    told = [0]
+    with monkeypatch.context() as patch:
+        for module in (topology_module, known_module):
+            patch.setattr(module, "check_memory", lambda needed, most, what: told.append(needed))
+        look_of(kind, model, MAX_BYTES)
+    return max(told)
+
+
+KINDS = [
+    "expectimax",
+    "pruned",
+    "sampled level",
+    "sampled none",
+    "sampled search",
+    "mcts",
+    "mcts, merged",
+    "mcts, means",
+]
+TABLES = {"K = 4": (800, 3, 4), "K = 20": (200, 2, 20)}
 
 
 @pytest.mark.fault("lookahead larger than memory")
-def test_a_lookahead_is_refused_before_the_level_that_would_not_fit_is_asked_for():
-    model = WatchedModel(TabularModel(GARNET))
-    nodes = expectimax(TabularModel(GARNET), ROOT, depth=3, v_leaf=zeros).nodes_per_level
-    shallower = expectimax(TabularModel(GARNET), ROOT, depth=2, v_leaf=zeros).model_calls
-    enough = table_bytes(sum(nodes[:3]), A, K, torch.float64)
-    with pytest.raises(NodeBudgetExceeded) as caught:
-        expectimax(model, ROOT, depth=3, v_leaf=zeros, topology=Topology(model, max_bytes=enough))
-    assert len(model.asked) * A == shallower
-    asked_for = sum(nodes[:4])
-    assert str(caught.value) == (
-        f"the outcomes of levels 0 to 3 of the 4 of the lookahead ({asked_for} nodes, 3 actions, 4 outcomes of each: "
-        f"up to {asked_for * A * K} children) would take {table_bytes(asked_for, A, K, torch.float64) / 2**30:.3g} "
-        f"GiB; the limit is {enough / 2**30:.3g} GiB: set a smaller depth or max_width, fewer environments, or the "
-        "search sampled with fewer samples"
-    )
-    model = WatchedModel(TabularModel(GARNET))
-    expectimax(model, ROOT, depth=2, v_leaf=zeros, topology=Topology(model, max_bytes=enough))
-    assert len(model.asked) * A == shallower
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("table", TABLES)
+def test_a_search_stays_below_the_limit_and_is_refused_just_below_what_it_needs(kind, table, monkeypatch):
+    S, A, K = TABLES[table]
+    model = TabularModel(random_mdp(S, A, branching=K, seed=5))
+    enough = least_bytes(kind, model, monkeypatch)
+    peak = peak_bytes(lambda: look_of(kind, model, enough))
+    assert enough / 5 < peak <= enough
+    with pytest.raises(NodeBudgetExceeded, match=r"would take up to .* GiB; max_bytes is .* GiB: set a smaller depth"):
+        look_of(kind, model, enough - 1)
 
 
-def test_the_memory_of_a_narrow_lookahead_is_that_of_a_level():
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_search_that_goes_deeper_again_and_over_other_roots_stays_below_the_limit(dtype):
+    model = TabularModel(random_mdp(2000, 3, branching=3, seed=5), dtype=dtype)
+    limit, made = 3_000_000, []
+
+    def searches() -> Topology:
+        topology = Topology(model, max_bytes=limit)
+        for first in range(0, 300, 50):
+            for depth in (1, 3):
+                critic = lambda state_N: torch.zeros(len(state_N), dtype=dtype)  # noqa: E731
+                try:
+                    expectimax(model, torch.arange(first, first + 50), depth=depth, v_leaf=critic, topology=topology)
+                    made.append(True)
+                except NodeBudgetExceeded:
+                    made.append(False)
+        return topology
+
+    assert limit / 3 < peak_bytes(searches) <= limit
+    assert any(made)
+    assert not all(made)
+
+
+def test_the_outcomes_of_a_model_that_does_not_say_how_many_there_are_are_counted_from_its_first_answer():
+    class Silent(WatchedModel):
+        def __init__(self, model: EnumeratingModel) -> None:
+            super().__init__(model)
+            self.num_outcomes = None
+
+    wide = TabularModel(random_mdp(400, 2, branching=200, seed=5))
+    limit = 10_000_000
+    with pytest.raises(NodeBudgetExceeded, match="400 nodes, 2 actions, 200 outcomes of each"):
+        expectimax(
+            model := Silent(wide), torch.arange(400), depth=1, v_leaf=zeros, topology=Topology(model, max_bytes=limit)
+        )
+    assert model.calls == [[0]]
+
+
+def test_rows_of_tables_are_what_they_take():
     model = TabularModel(GARNET)
-    topology = Topology(model, max_bytes=table_bytes(20, A, K, torch.float64))
-    expectimax(model, ROOT, depth=5, v_leaf=zeros, topology=topology, max_width=20)
-    with pytest.raises(NodeBudgetExceeded, match=r"the outcomes of one level of the lookahead \(21 nodes"):
-        expectimax(model, ROOT, depth=5, v_leaf=zeros, topology=topology, max_width=21)
-
-
-def test_the_search_that_chooses_narrows_until_it_fits():
-    search = AutoSearch(TabularModel(GARNET))
-    search.topology = Topology(TabularModel(GARNET), max_bytes=table_bytes(50, A, K, torch.float64))
-    look = search(ROOT, depth=5, v_leaf=zeros, generator=stream(0, "search"))
-    assert max(look.nodes_per_level) > 50 > look.model_calls / A / 5
-    assert float(look.pruned_BA.max()) > 0
+    outcomes = model.outcomes(torch.arange(7))
+    columns = (outcomes.reward_NA, outcomes.prob_NAK, outcomes.discount_NAK, outcomes.child_NAK)
+    sizes = Sizes(A, K, torch.float64)
+    assert 7 * sizes.outcomes == sum(column.numel() * column.element_size() for column in columns)
+    known = KnownStates(Topology(model), Leaves(model, 2, None, zeros), None)
+    known.rows(ROOT)
+    tree = Tree(known, 3, Selection("gumbel", 1.25), backup="max", merge=False, max_nodes=100, room=1)
+    assert sizes.node == bytes_of(tree, "_N", "_NA", "_NE")
+    assert sizes.known == bytes_of(known, "_T", "_TA", "_TE")
 
 
 def bytes_of(tables: object, *endings: str) -> int:
@@ -76,63 +138,46 @@ def bytes_of(tables: object, *endings: str) -> int:
     return sum(x[0].numel() * x.element_size() for name, x in vars(tables).items() if name.endswith(endings))
 
 
-def test_the_estimates_of_a_tree_are_what_its_tables_take():
-    model = TabularModel(GARNET)
-    known = KnownStates(Topology(model), Leaves(model, 2, None, zeros), None)
-    known.rows(ROOT)
-    tree = Tree(known, 3, Selection("gumbel", 1.25), backup="max", merge=False, max_nodes=100, room=1)
-    assert node_bytes(7, A, K, torch.float64) == 7 * bytes_of(tree, "_N", "_NA", "_NE")
-    of_outcomes = table_bytes(7, A, K, torch.float64)
-    assert state_bytes(7, A, K, torch.float64) - of_outcomes == 7 * bytes_of(known, "_T", "_TA", "_TE")
-
-
 @pytest.mark.fault("lookahead larger than memory")
-@pytest.mark.parametrize("merge", [False, True])
-def test_a_tree_is_refused_before_the_states_that_would_not_fit_are_asked_about(merge):
-    def look(simulations: int, max_bytes: int) -> WatchedModel:
-        model = WatchedModel(TabularModel(GARNET))
-        topology = Topology(model, max_bytes=max_bytes)
-        options = {"simulations": simulations, "wave": 1, "merge": merge, "topology": topology}
-        mcts(model, ROOT, depth=3, v_leaf=zeros, **options)
-        return model
+def test_a_lookahead_is_refused_before_the_level_that_would_not_fit_is_asked_for(monkeypatch):
+    model = WatchedModel(TabularModel(GARNET))
+    shallower = expectimax(TabularModel(GARNET), ROOT, depth=2, v_leaf=zeros).model_calls
+    topology = Topology(model, max_bytes=10**6)
+    with pytest.raises(
+        NodeBudgetExceeded, match=r"outcomes of level 3 of the 4 of the lookahead \(\d+ nodes, 3 actions, 4"
+    ):
+        expectimax(model, ROOT, depth=3, v_leaf=zeros, topology=topology)
+    assert len(model.asked) * A == shallower
 
-    states = len(set(look(12, MAX_BYTES).asked))
-    levels = 8 * 5 * (1 + merge * GARNET.num_states)
-    nodes = node_bytes(13, A, K, torch.float64)  # one for each simulation, and the one that is none
-    enough = levels + nodes + state_bytes(states, A, K, torch.float64)
-    assert len(look(12, enough).asked) == states
-    with pytest.raises(NodeBudgetExceeded, match="for its nodes"):
-        look(12, enough - 1)
-    with pytest.raises(NodeBudgetExceeded):
-        look(13, enough)
+
+def test_the_search_that_chooses_narrows_until_it_fits():
+    search = AutoSearch(TabularModel(GARNET), max_bytes=10**6)
+    look = search(ROOT, depth=5, v_leaf=zeros, generator=stream(0, "search"))
+    assert max(look.nodes_per_level) > 50
+    assert float(look.pruned_BA.max()) > 0
+    assert str(search).startswith("expectimax, ")
 
 
 def test_roots_that_would_not_fit_are_refused_before_the_model_is_asked():
     model = WatchedModel(TabularModel(GARNET))
-    topology = Topology(model, max_bytes=10_000)
-    with pytest.raises(NodeBudgetExceeded) as caught:
-        mcts(model, torch.arange(50), depth=3, v_leaf=zeros, simulations=9, topology=topology)
+    for search in (mcts, expectimax):
+        options = {"simulations": 9} if search is mcts else {}
+        topology = Topology(model, max_bytes=200_000)
+        with pytest.raises(NodeBudgetExceeded):
+            search(model, torch.arange(500), depth=3, v_leaf=zeros, topology=topology, **options)
     assert len(model.asked) == 0
-    needed = state_bytes(50, A, 1, torch.float64)
-    assert str(caught.value) == (
-        f"the search would take {gib(needed)}: 0 GiB for its nodes and {gib(needed)} for 50 states of 3 actions and 1 "
-        f"outcomes of each; the limit is {gib(10_000)}: lower the simulations, ask for fewer roots or raise max_bytes"
-    )
 
 
 def test_a_tree_of_more_levels_than_memory_is_refused_at_once():
-    with pytest.raises(NodeBudgetExceeded, match=r"would take 7\.45 GiB: 7\.45 GiB for its nodes"):
+    with pytest.raises(NodeBudgetExceeded, match=r"the search \(0 nodes, .* would take up to 7\.45 GiB"):
         mcts(TabularModel(GARNET), ROOT, depth=10**9, v_leaf=zeros, simulations=2)
 
 
-def test_samples_that_would_not_fit_are_refused_before_one_is_drawn():
-    def look(samples: int) -> int:
-        knobs = {"samples": samples, "generator": stream(0, "search"), "max_bytes": table_bytes(1, A, 8, torch.float64)}
-        return sampled(TabularModel(GARNET), ROOT, depth=0, v_leaf=zeros, replicates=0, **knobs).model_calls
-
-    assert look(8) == 8 * A
-    with pytest.raises(NodeBudgetExceeded, match=r"1 nodes, 3 actions, 9 outcomes of each: up to 27 children"):
-        look(9)
+def test_samples_that_would_not_fit_are_refused_before_one_is_drawn(monkeypatch):
+    model = TabularModel(GARNET)
+    monkeypatch.setattr(TabularModel, "sample", lambda *_, **__: pytest.fail("it was drawn from"))
+    with pytest.raises(NodeBudgetExceeded, match="1 nodes, 3 actions, 900000 outcomes of each"):
+        sampled(model, ROOT, depth=0, v_leaf=zeros, samples=900_000, generator=stream(0, "s"), max_bytes=10**8)
 
 
 @pytest.mark.parametrize("kind", [AutoSearch, ExpectimaxSearch, SampledSearch, MCTSSearch])
@@ -145,7 +190,7 @@ def test_every_kind_of_search_has_the_limit_also_after_it_has_forgotten(kind):
         return False
 
     model = TabularModel(GARNET)
-    search = kind(model, max_bytes=2_000)
+    search = kind(model, max_bytes=150_000)
     for _ in range(2):
         assert refuses(search, torch.arange(40))
         search.forget()

@@ -257,7 +257,7 @@ class Liar(EnumeratingModel):
 
     def __init__(self, change: str) -> None:
         self.model, self.change = TabularModel(ladder(5)), change
-        self.num_states, self.num_actions = 5, 2
+        self.num_states, self.num_actions, self.num_outcomes = 5, 2, 1
         self.device, self.dtype = self.model.device, self.model.dtype
 
     def outcomes(self, state_N: Tensor) -> Outcomes:

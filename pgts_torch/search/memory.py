@@ -1,0 +1,104 @@
+"""How much memory a search takes: the one place where it is counted."""
+
+from dataclasses import dataclass
+
+import torch
+
+from pgts_torch.errors import NodeBudgetExceeded
+
+GROWTH = 1.5
+"""By how much a table that is full becomes longer."""
+
+RESAMPLED = 96
+"""Bytes of a sample that is drawn again, with all that is made on the way."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What one state, or one node, takes: A actions with K outcomes each, numbers in `dtype`.
+
+    outcomes: the row of a table of `Outcomes`.
+    """
+
+    num_actions: int
+    num_outcomes: int
+    dtype: torch.dtype
+
+    @property
+    def outcomes(self) -> int:
+        s, A, E = self._parts
+        return A * s + E * (2 * s + 8)
+
+    @property
+    def known(self) -> int:
+        """The row of `KnownStates`."""
+        s, A, E = self._parts
+        return 2 * s + 8 + A * (4 * s + 8) + E * (4 * s + 16)
+
+    @property
+    def node(self) -> int:
+        """The row of a `Tree`."""
+        s, A, E = self._parts
+        return 2 * s + 16 + A * (2 * s + 8) + E * (2 * s + 16)
+
+    @property
+    def _parts(self) -> tuple[int, int, int]:
+        return self.dtype.itemsize, self.num_actions, self.num_actions * self.num_outcomes
+
+
+def search_bytes(
+    sizes: Sizes,
+    *,
+    numbered: int = 0,
+    answered: int = 0,
+    asked: int = 0,
+    kept: int = 0,
+    drawn: int = 0,
+    drawing: int = 0,
+    resampled: int = 0,
+    learned: int = 0,
+    nodes: int = 0,
+    places: int = 0,
+    arms: int = 0,
+) -> int:
+    """The most memory, in bytes, that a search holds at once while it takes its next step.
+
+    Tables that grow are half empty at worst by `GROWTH`, and while a column is copied its old form is there too. What
+    a step makes and drops again (masks, positions, sorted children, products) is counted by its widest moment.
+
+    Args:
+        numbered: states of the model, which have two tables of numbers.
+        answered: states whose outcomes are remembered, after the step.
+        asked: states that the step asks about or looks up.
+        kept: rows of outcomes of levels, with their sparse weights, after the step.
+        drawn: nodes whose outcomes were sampled, after the step.   drawing: those that the step samples.
+        resampled: nodes whose samples are drawn again at once.
+        learned: rows of `KnownStates`.
+        nodes: rows of a `Tree`.   places: of its table by (state, level).   arms: that a wave passes at once.
+    """
+    s, A, E = sizes.dtype.itemsize, sizes.num_actions, sizes.num_actions * sizes.num_outcomes
+    widest = max(s, 8) * E
+    total = 32.0 * numbered  # two tables of int64, twice while they grow
+    total += answered * (GROWTH * sizes.outcomes + widest)
+    total += asked * (sizes.outcomes + 56 * E + 4 * A * s + 64)
+    total += kept * (sizes.outcomes + E * (s + 4) + A * (2 * s + 4) + 24)
+    total += drawn * (2 * (s + 16) * E + 48) + drawing * 64 * E + resampled * RESAMPLED * E
+    total += learned * (GROWTH * sizes.known + widest)
+    total += nodes * (GROWTH * sizes.node + widest + E * (4 * s + 16) + 40 * A)
+    total += 8.0 * places
+    total += arms * (96 * sizes.num_outcomes + 160)
+    return int(total)
+
+
+def check_memory(needed: int, most: int, what: str) -> None:
+    """NodeBudgetExceeded if a search would take more than that."""
+    if needed > most:
+        raise NodeBudgetExceeded(
+            f"{what} would take up to {gib(needed)}; max_bytes is {gib(most)}: set a smaller depth or max_width, fewer "
+            "simulations, samples or environments, or a larger max_bytes"
+        )
+
+
+def gib(num_bytes: float) -> str:
+    """As a person reads it."""
+    return f"{num_bytes / 2**30:.3g} GiB"
