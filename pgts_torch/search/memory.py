@@ -94,7 +94,7 @@ def check_memory(needed: int, most: int, what: str) -> None:
     """NodeBudgetExceeded if a search would take more than that."""
     if needed > most:
         raise NodeBudgetExceeded(
-            f"{what} would take up to {gib(needed)}; max_bytes is {gib(most)}: set a smaller depth or max_width, fewer "
+            f"{what} would take up to {gib(needed)}; the limit is {gib(most)}: set a smaller depth or max_width, fewer "
             "simulations, samples or environments, or a larger max_bytes"
         )
 

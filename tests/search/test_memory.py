@@ -79,7 +79,7 @@ def test_a_search_stays_below_the_limit_and_is_refused_just_below_what_it_needs(
     enough = least_bytes(kind, model, monkeypatch)
     peak = peak_bytes(lambda: look_of(kind, model, enough))
     assert enough / 5 < peak <= enough
-    with pytest.raises(NodeBudgetExceeded, match=r"would take up to .* GiB; max_bytes is .* GiB: set a smaller depth"):
+    with pytest.raises(NodeBudgetExceeded, match=r"would take up to .* GiB; the limit is .* GiB: set a smaller depth"):
         look_of(kind, model, enough - 1)
 
 
