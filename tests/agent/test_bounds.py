@@ -42,6 +42,7 @@ OPTIONS: dict[str, tuple[Any, Range]] = {
         lambda x: {"depth": 0, "policy": NET, "estimator": {"type": "sampled", "lambda": x}},
         CLOSED,
     ),
+    "floor of a mirror step": (lambda x: {"update": {"type": "mirror", "floor": x}}, POSITIVE),
     "step size of a critic": (lambda x: critic(step_size=x), SHARE),
     "probability of a biased policy": (
         lambda x: {"policy": {"type": "softmax", "init": {"type": "biased", "action": 0, "probability": x}}},
