@@ -91,6 +91,9 @@ FAULTS: dict[str, dict[str, str]] = {
         "step that overflows": "taken back: policy and optimiser as before",
     },
     "Learning": {
+        "rewards in another unit, tables": "times 2^k, every bit of the policy is the same",
+        "a constant in all rewards of a continuing task, tables": "moves no policy",
+        "rewards or actions that are all equal, tables": "rounding is no step: every bit of the policy stays",
         "rewards in another unit, networks": "times 2^k, every bit of the policy is the same",
         "a policy that hardly moves": "the summary says so, with what to change",
         "a greedy policy that is worse than drawn actions": "the summary says so",
