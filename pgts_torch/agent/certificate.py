@@ -28,12 +28,12 @@ CONFIDENCE = 0.95
 class Bound(NamedTuple):
     """certificate: an upper bound on J* - J^pi; infinite where there is none.
 
-    estimate: what is likely to be missing, by which an adaptive depth is chosen: the certificate where all starts are
-        known, else the mean over those that were drawn; infinite where no largest value is known.
+    visited: what may be missing at the visited states, sum_s d(s) (v_hat(s) - v(s)) over their occupancy d, by which an
+        adaptive depth is chosen; infinite where no largest value is known.
     """
 
     certificate: float
-    estimate: float
+    visited: float
 
 
 class _Starts(NamedTuple):
@@ -65,7 +65,7 @@ class Certificates:
 
     The certificate has v in place of v^pi, which the critic has fitted to these very episodes: it is off by the mean of
     v - v^pi over the drawn starts. A bound of w - l or more says nothing and is infinite, as it is where the lookahead
-    has left out nodes: then T^n w would depend on what the other starts are. `estimate` is the mean of v_hat - v.
+    has left out nodes: then T^n w would depend on what the other starts are.
 
     Several ranks have asked about different states. Each makes v_hat from its own, and the smallest counts.
 
@@ -141,34 +141,48 @@ class Certificates:
             return _Starts(starts, start_S[starts], None)
         return _Starts(starts, start_S[starts], v_of_starts.double())
 
-    def bound(self, starts: _Starts, *, expansions: int, complete: bool, experience: Rollout, number: int) -> Bound:
+    def bound(
+        self,
+        starts: _Starts,
+        visited: tuple[Int[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N"]],
+        *,
+        expansions: int,
+        complete: bool,
+        experience: Rollout,
+        number: int,
+    ) -> Bound:
         """What is missing at most, after a lookahead.
 
         Args:
+            starts: see `starts`.
+            visited: the visited states, v there, and their occupancy.
             expansions: n, how many levels it has expanded.
             complete: whether it has left out no node of them.
             number: of the iteration, from 1.
         """
         state_N, share_N, v_N = starts
-        if self._search.topology is None or v_N is None:
+        if self._search.topology is None:
             return Bound(math.inf, math.inf)
+        visited_N, v_of_visited_N, occupancy_N = visited
 
         def tightened(upper: UpperBound) -> Tensor:
             upper.tighten(expansions)
-            return upper.at(state_N)
+            return torch.cat([upper.at(state_N), upper.at(visited_N)])
 
-        upper_N = self._together(tightened)
+        upper_N, upper_of_visited_N = self._together(tightened).split([len(state_N), len(visited_N)])
+        missing = float(occupancy_N.double() @ (upper_of_visited_N - v_of_visited_N.double()).abs())
+        if v_N is None:
+            return Bound(math.inf, missing)
         if self._world.start_S is not None:
-            certificate = self._over_all(share_N, upper_N, v_N)
-            return Bound(certificate, certificate)
+            return Bound(self._over_all(share_N, upper_N, v_N), missing)
         estimate = float(share_N @ (upper_N - v_N).abs())
         span = self._search.model.highest_value - self._search.model.lowest_value
         width = self.width(experience.num_episodes, number)
         if not (complete and estimate + width < span):  # T^n w is no smaller than v_hat
-            return Bound(math.inf, estimate)
+            return Bound(math.inf, missing)
         swept_N = self._together(lambda upper: upper.swept(state_N, expansions))
         certificate = float(share_N @ (swept_N - v_N).abs()) + width
-        return Bound(certificate if certificate < span else math.inf, estimate)
+        return Bound(certificate if certificate < span else math.inf, missing)
 
     def width(self, num_episodes: int, number: int = 1) -> float:
         """What drawn starts put in doubt in an iteration, which no certificate from them is below: see above."""

@@ -85,9 +85,10 @@ class PGTS:
             (pgts/*, or a P table), else its dynamics in torch (CartPole, Acrobot, MountainCar, Pendulum), else a
             simulator that is restored from snapshots.
         depth: m. 0 is plain policy gradient. "adaptive": in each iteration the smallest m at which the policy is far
-            from stationary, because then it deserves no deeper look: sum_s d(s) g_m(s) > tolerance * certificate.
+            from stationary, because then it deserves no deeper look: sum_s d(s) g_m(s) >
+            tolerance * sum_s d(s) (v_hat(s) - v(s)), where v_hat >= v* is that of the certificate.
         max_depth: the largest m of an adaptive depth (default 64).
-        tolerance: which share of what may be missing to J* a lookahead must see to be deep enough (default 0.1).
+        tolerance: which share of what may be missing to J* a lookahead must see to be deep enough (default 0.05).
         stop_at: `learn` ends, with the policy in question, once the certificate says J* - J^pi <= stop_at. That is a
             proof only where `certificates.trust` says so. Default: never.
         search: how the lookahead is made (`search.engine`): "auto", {"type": "sampled", "samples": 8}, ...
@@ -280,14 +281,15 @@ class PGTS:
         for depth in self.depths:
             look = self._look_together(states, depth) if depth else shallow
             gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
-            bound, estimate = self.certificates.bound(
+            bound, missing = self.certificates.bound(
                 starts,
+                (states, v_N, occupancy_N),
                 expansions=depth + (self.critic.target == "v"),
                 complete=float(look.pruned_BA.max()) == 0,
                 experience=experience,
                 number=self.num_iterations + 1,
             )
-            if float(gap_N @ occupancy_N) > self.tolerance * estimate or self._is_enough(bound):
+            if float(gap_N @ occupancy_N) > self.tolerance * missing or self._is_enough(bound):
                 break
         advantage_NA = centred(look.q_BA, pi_NA, rounding=self._rounding(look))
         return Seen(states, weight_N, pi_NA, advantage_NA, depth, look, gap_N, bound, look.noise)

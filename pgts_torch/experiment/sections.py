@@ -330,8 +330,8 @@ class SearchConfig(Section):
     """The largest adaptive depth; null: 64. Only with search.depth adaptive."""
 
     tolerance: NonNegative | None = None
-    """An adaptive depth is enough if the gap that it sees, summed over the occupancy, is more than this share of the
-    certificate; null: 0.1. Only with search.depth adaptive."""
+    """An adaptive depth is enough if the gap that it sees, summed over the occupancy, is more than this share of
+    what may be missing at the visited states; null: 0.05. Only with search.depth adaptive."""
 
     stop_at: NonNegative | None = None
     """Training ends once the certificate says that the policy is this close to the optimal return; null: never. It is a

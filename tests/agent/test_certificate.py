@@ -99,6 +99,15 @@ def test_a_policy_that_is_bad_from_a_start_that_was_not_drawn_is_not_proved():
     assert exact.optimal(model.mdp).J - exact.evaluate(model.mdp, model.policy_table()).J <= 20
 
 
+@pytest.mark.long
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("critic", ["exact", "tabular"])
+def test_taxi_ends_by_its_certificate_and_is_within_it(critic):
+    model = PGTS("Taxi-v4", gamma=0.99, depth="adaptive", stop_at=0.05, critic=critic, seed=0).learn(200_000)
+    assert model.num_env_steps < 200_000
+    assert exact.optimal(model.mdp).J - exact.evaluate(model.mdp, model.policy_table()).J <= 0.05
+
+
 def test_a_start_that_no_search_has_met_counts_as_the_highest_value():
     apart = TabularMDP.from_dense(
         np.eye(2)[:, None].repeat(2, 1), np.array([[1.0, 0.0], [0.0, 1.0]]), 0.5, start=None, order="SAS"
