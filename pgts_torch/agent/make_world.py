@@ -247,7 +247,7 @@ def _dynamics(sought: _Sought) -> DynamicsWorld | None:
     if why := kind.obstacle(env) or _own(sought, kind.constants):
         raise MissingModel(f"the dynamics in torch of {kind.env_class.__name__} are not used: {why}")
     env = sought.fresh()
-    if why := dynamics_contradiction(kind(env, gamma=sought.gamma), env, sought.random):
+    if why := dynamics_contradiction(kind(env, gamma=sought.gamma), env, sought.random)[0]:
         raise MissingModel(f"the dynamics in torch of {kind.env_class.__name__} are not used: {why}")
     model = kind(env, gamma=sought.gamma, action_repeat=sought.action_repeat, device=sought.device)
     return DynamicsWorld(sought.envs, model, observation_key=sought.observation_key)

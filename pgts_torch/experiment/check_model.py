@@ -9,7 +9,7 @@ import torch
 
 from pgts_torch.errors import MissingModel
 from pgts_torch.models.environments import make_env
-from pgts_torch.models.fidelity import Report, check_model
+from pgts_torch.models.fidelity import Check, Report, check_model, held
 from pgts_torch.models.tabular import tabular_truth
 
 _WIDTH = 79
@@ -17,18 +17,26 @@ _WIDTH = 79
 
 @dataclass(frozen=True)
 class Table:
-    """The answer where an environment cannot be restored and need not be, for its transitions are known."""
+    """The answer where an environment cannot be restored and need not be, for its transitions are known; and whether
+    its steps agree with them."""
 
     env: str
     num_states: int
     num_actions: int
+    checks: tuple[Check, ...]
     family: str = "table"
-    usable: bool = True
+
+    @property
+    def usable(self) -> bool:
+        """Whether it can be a model."""
+        return all(check.passed for check in self.checks)
 
     @property
     def verdict(self) -> str:
-        """One line."""
-        return f"{self.env}: a table of {self.num_states} states and {self.num_actions} actions, no snapshot is needed"
+        """What it is, and what is said of its steps."""
+        size = f"{self.env}: a table of {self.num_states} states and {self.num_actions} actions"
+        said = "; ".join(check.detail for check in self.checks)
+        return f"{size}, {'no snapshot is needed' if self.usable else 'which cannot serve as a model'}; {said}"
 
 
 def answer(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Report | Table:
@@ -41,7 +49,8 @@ def answer(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Report | Tab
             mdp = tabular_truth(make_env(env_id, **kwargs), gamma=1.0)
         except MissingModel:
             raise missing from None
-        return Table(env_id, mdp.num_states, mdp.num_actions)
+        checks = held(make_env(env_id, **kwargs), seed=seed)
+        return Table(env_id, mdp.num_states, mdp.num_actions, tuple(checks))
 
 
 def to_json(report: Report | Table) -> dict[str, Any]:
@@ -52,7 +61,7 @@ def to_json(report: Report | Table) -> dict[str, Any]:
 def describe(report: Report | Table) -> str:
     """The report for people: at most 79 columns."""
     if isinstance(report, Table):
-        return report.verdict
+        return textwrap.fill(report.verdict, _WIDTH, break_on_hyphens=False)
     return "\n".join(_lines(report))
 
 

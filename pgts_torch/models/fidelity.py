@@ -4,11 +4,12 @@ import functools
 import itertools
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -17,6 +18,7 @@ from pgts_torch.errors import PgtsError, text_of
 from pgts_torch.models.attributes import changing, own_to_each
 from pgts_torch.models.environments import EnvSource, all_actions, make_env, sampled_actions
 from pgts_torch.models.snapshots import adapter_for, env_name, generator_state, methods_for
+from pgts_torch.models.trial import claims
 from pgts_torch.models.walks import Setup, Walk, again, live, replays, walks_of
 from pgts_torch.models.wrappers import transforms_of
 from pgts_torch.seeding import SharedGenerators, draw_keys, numpy_stream, stream
@@ -117,6 +119,8 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
                     cannot foresee what the environment is about to draw
         untouched   a search from the state of a real environment leaves it and its generator as they were: it goes on
                     like a twin that nobody searched from
+        table       where there is one: steps and starts of a short walk are among its outcomes, bit for bit
+        dynamics    where they are known in torch: they give the steps of a short walk up to rounding
 
     Args:
         env: an id, a spec, an environment with a spec, or a function that makes one; only fresh instances are used.
@@ -153,6 +157,7 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
         _check("merge", lambda: _merge(walks, repeated()), needed=False),
         _check("chance", lambda: _chance(setup, walks)),
         _check("untouched", lambda: _untouched(setup, length)),
+        *held(make_env(env), seed=seed),
     )
     report = Report(setup.name, setup.adapter.name, len(actions), tried.random_share, checks, cost=None)
     try:
@@ -161,6 +166,18 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
         if report.usable:
             raise PgtsError(f"{setup.name} fails where its calls are timed: {_told(error)}") from error
         return report
+
+
+def held(env: gymnasium.Env, *, seed: int) -> Iterator[Check]:
+    """A table or dynamics of an environment, held to its steps.
+
+    Args:
+        env: an instance that nobody else needs.
+        seed: of the walk.
+    """
+    for kind, why, steps in claims(env, numpy_stream(seed, "claims")):
+        agreement = f"{steps} steps agree, " + ("bit for bit" if kind == "table" else "within 1e-12")
+        yield Check(kind, True, not why, why or agreement)
 
 
 def why_not(setup: Setup, *, seconds: float = 0.4) -> str:

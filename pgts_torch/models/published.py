@@ -70,7 +70,7 @@ def table_of(env: gymnasium.Env, *, gamma: float, generator: np.random.Generator
             f"the table {attribute} of {name} is not used: it has {sizes[0]} states and {sizes[1]} actions, and its "
             f"spaces are {env.observation_space} and {env.action_space}"
         )
-    if why := table_contradiction(mdp, env, gamma, generator):
+    if why := table_contradiction(mdp, env, gamma, generator)[0]:
         raise MissingModel(f"the table {attribute} of {name} is not used, for its steps contradict it: {why}")
     return mdp, starts_known
 

@@ -1,5 +1,7 @@
 """Models that claim to be an environment, held to its steps for a moment before they are believed."""
 
+import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -8,19 +10,26 @@ import gymnasium
 import numpy as np
 from jaxtyping import Float
 
+from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import DENIED, ExactModel, Happened, step_text
-from pgts_torch.models.classic import ClassicModel
+from pgts_torch.models.classic import ClassicModel, dynamics_of
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
-from pgts_torch.models.tabular import TabularModel
+from pgts_torch.models.tabular import TabularModel, tabular_truth
 from pgts_torch.tabular.mdp import TabularMDP
+
+_GAMMA = 0.5
+"""Any discount serves where an end is to be told from going on."""
 
 _STEPS, _LONGEST_EPISODE, _RESETS = 400, 40, 1000
 _SECONDS = 0.3
 """After which a trial ends in a slow environment, though never before its first step."""
 
 
-def table_contradiction(mdp: TabularMDP, env: gymnasium.Env, gamma: float, generator: np.random.Generator) -> str:
-    """The first thing in a short random walk that cannot be by a table; empty where there is none.
+def table_contradiction(
+    mdp: TabularMDP, env: gymnasium.Env, gamma: float, generator: np.random.Generator, *, seconds: float = _SECONDS
+) -> tuple[str, int]:
+    """The first thing in a short random walk that cannot be by a table, empty where there is none; and how many steps
+    were held to it.
 
     Starts must have positive probability, and each step must be one of the outcomes that have (`TabularModel.hold`).
 
@@ -39,20 +48,38 @@ def table_contradiction(mdp: TabularMDP, env: gymnasium.Env, gamma: float, gener
             raise _NoState(f"it starts in state {state}, which has probability 0 there")
 
     try:
-        return _denied(TabularModel(mdp), _walk(env, gamma, generator, state_of, began))
+        return _denied(TabularModel(mdp), _walk(env, gamma, generator, state_of, began, seconds))
     except _NoState as off:
-        return str(off)
+        return str(off), 0
 
 
-def dynamics_contradiction(model: ClassicModel, env: gymnasium.Env, generator: np.random.Generator) -> str:
-    """The first step of a short random walk that dynamics in torch do not give too (`TensorModel.hold`); empty where
-    there is none.
+def dynamics_contradiction(
+    model: ClassicModel, env: gymnasium.Env, generator: np.random.Generator, *, seconds: float = _SECONDS
+) -> tuple[str, int]:
+    """The first step of a short random walk that dynamics in torch do not give too (`TensorModel.hold`), empty where
+    there is none; and how many steps were held to them.
 
     Args:
         model: of its own, for it numbers the states that are met.
         env: an instance that nobody else needs, in the wrappers that the dynamics are meant to hold for.
     """
-    return _denied(model, _walk(env, model.gamma, generator, lambda _: int(model.roots([env])), lambda _: None))
+    numbers = _walk(env, model.gamma, generator, lambda _: int(model.roots([env])), lambda _: None, seconds)
+    return _denied(model, numbers)
+
+
+def claims(env: gymnasium.Env, generator: np.random.Generator) -> Iterator[tuple[str, str, int]]:
+    """What claims to be an environment, "table" or "dynamics", with what is found of it as above.
+
+    Args:
+        env: an instance that nobody else needs. What is inside its wrappers is held to its table.
+    """
+    base: Any = env.unwrapped
+    with contextlib.suppress(PgtsError):  # what is called P is no table
+        mdp = tabular_truth(base, gamma=_GAMMA)
+        yield "table", *table_contradiction(mdp, base, _GAMMA, generator, seconds=math.inf)
+    if (kind := dynamics_of(env)) is not None:
+        model = kind(env, gamma=_GAMMA)
+        yield "dynamics", *dynamics_contradiction(model, env, generator, seconds=math.inf)
 
 
 def counted_starts(env: gymnasium.Env, num_states: int, generator: np.random.Generator) -> Float[np.ndarray, "S"]:
@@ -80,21 +107,21 @@ _Step = tuple[int, int, float, float, int]
 """State, number of the action, reward, discount and next state."""
 
 
-def _denied(model: ExactModel, steps: Iterator[_Step]) -> str:
-    """The first step that a model denies, in words."""
+def _denied(model: ExactModel, steps: Iterator[_Step]) -> tuple[str, int]:
+    """The first step that a model denies, in words, and how many steps there were."""
     columns = list(zip(*steps, strict=True))
     if not columns:
-        return ""
+        return "", 0
     state_N, action_N, reward_N, discount_N, next_N = map(np.array, columns)
     happened = Happened(state_N, action_N, reward_N, discount_N, next_N, np.zeros(len(state_N), dtype=bool))
     off = np.flatnonzero(model.hold(happened) == DENIED)
     if not off.size:
-        return ""
+        return "", len(state_N)
     state, action, reward, discount, following = (column[off[0]] for column in columns)
     return (
         f"after action {action} in {model.shown(state)} came {step_text(reward, discount, model.shown(following))}; "
         f"it has {model.told(state, action)}"
-    )
+    ), len(state_N)
 
 
 def _walk(
@@ -103,10 +130,11 @@ def _walk(
     generator: np.random.Generator,
     state_of: Callable[[Any], int],
     began: Callable[[int], None],
+    seconds: float,
 ) -> Iterator[_Step]:
     """Random episodes, up to where the environment raises: that is no contradiction, and is told where it stops a
     training."""
-    until, taken, named = time.monotonic() + _SECONDS, 0, names_discounts(env)
+    until, taken, named = time.monotonic() + seconds, 0, names_discounts(env)
     try:
         while taken < _STEPS and (time.monotonic() < until or taken == 0):
             shown, _ = env.reset(seed=_seed(generator))

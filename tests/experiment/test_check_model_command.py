@@ -16,7 +16,17 @@ HELP = "(see pgts check-model --help)"
 OWN = """\
 import gymnasium
 from tests.models.corridors import Bare, Corridor, Forgetful
-for kind in (Bare, Corridor, Forgetful):
+from gymnasium.envs.toy_text import CliffWalkingEnv
+class Liar(CliffWalkingEnv):
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, 0.5, *rest
+    def __init__(self):
+        super().__init__()
+        for rows in self.P.values():
+            for a, [(p, t, _, end)] in rows.items():
+                rows[a] = [(p, t, 0.0, end)]
+for kind in (Bare, Corridor, Forgetful, Liar):
     gymnasium.register(f"{kind.__name__}-v0", kind)
 """
 
@@ -43,17 +53,19 @@ def test_a_usable_environment_is_told_in_a_table_with_exit_code_0(capsys):
     assert max(map(len, lines)) < 80
     assert lines[0] == "CliffWalking-v1: toy text, 4 actions"
     assert [line.split()[:2] for line in lines if line.split()[1:2] == ["yes"]] == [
-        [name, "yes"] for name in ("answers", "restore", "merge", "chance", "untouched")
+        [name, "yes"] for name in ("answers", "restore", "merge", "chance", "untouched", "table")
     ]
     assert lines[-1] == "CliffWalking-v1 can serve as a model: its outcomes can be listed"
 
 
 @pytest.mark.parametrize(("kwargs", "states"), [([], 100), (["--kwargs", '{"size": 4, "traps": []}'], 16)])
-def test_a_table_is_told_in_one_line_to_need_no_snapshot(kwargs, states, capsys):
+def test_a_table_is_told_to_need_no_snapshot_and_to_agree_with_the_steps(kwargs, states, capsys):
     assert main(["check-model", "pgts/Grid-v0", *kwargs]) == 0
-    verdict = f"pgts/Grid-v0: a table of {states} states and 4 actions, no snapshot is needed"
-    assert capsys.readouterr().out == verdict + "\n"
+    size = f"pgts/Grid-v0: a table of {states} states and 4 actions"
+    verdict = f"{size}, no snapshot is needed; 400 steps agree, bit for bit"
+    assert " ".join(capsys.readouterr().out.split()) == verdict
     told = answer(capsys, "pgts/Grid-v0", *kwargs)
+    checks = told.pop("checks")
     assert told == {
         "env": "pgts/Grid-v0",
         "family": "table",
@@ -62,6 +74,19 @@ def test_a_table_is_told_in_one_line_to_need_no_snapshot(kwargs, states, capsys)
         "usable": True,
         "verdict": verdict,
     }
+    assert checks == [{"name": "table", "needed": True, "passed": True, "detail": "400 steps agree, bit for bit"}]
+
+
+@pytest.mark.fault("environment that contradicts its model")
+def test_a_table_and_dynamics_that_step_contradicts_are_a_failed_check_with_the_step(own_environments, capsys):
+    assert main(["check-model", "corridors_of_mine:Liar-v0"]) == 1
+    words = " ".join(capsys.readouterr().out.split())
+    assert "after action" in words
+    assert "came reward 0.5, discount 0.5, then state" in words
+    assert "; it has reward 0, discount 0.5, then state" in words
+    [dynamics] = [check for check in answer(capsys, "CartPole-v1")["checks"] if check["name"] == "dynamics"]
+    assert dynamics["passed"]
+    assert dynamics["detail"] == "412 steps agree, within 1e-12"  # the last episode is taken to its end
 
 
 def test_the_json_holds_the_same_and_the_seed_decides_the_walks(capsys):
@@ -69,7 +94,7 @@ def test_the_json_holds_the_same_and_the_seed_decides_the_walks(capsys):
     assert (told["env"], told["family"], told["num_actions"]) == ("FrozenLake-v1", "toy text", 4)
     assert told["usable"] is True
     assert told["random_share"] == 1
-    assert [check["passed"] for check in told["checks"]] == [True] * 5
+    assert [check["passed"] for check in told["checks"]] == [True] * 6
     assert set(told["cost"]) == {"restore", "step", "snapshot", "bytes"}
     assert answer(capsys, "FrozenLake-v1", "--seed", "4")["checks"] == told["checks"]
     assert answer(capsys, "FrozenLake-v1", "--seed", "5")["checks"] != told["checks"]

@@ -59,7 +59,7 @@ def own_global_generators() -> Iterator[None]:
 )
 def test_a_faithful_simulator_is_usable(env, is_random):
     report = check_model(env, **FEW)
-    assert [check.name for check in report.checks] == ["answers", "restore", "merge", "chance", "untouched"]
+    assert [check.name for check in report.checks][:5] == ["answers", "restore", "merge", "chance", "untouched"]
     assert all(check.passed for check in report.checks), report.verdict
     assert report.usable
     assert (report.random_share > 0) == is_random
