@@ -59,17 +59,18 @@ class Frequencies:
     """
 
     def __init__(self, prob_RK: Float[Tensor, "R K"]) -> None:
-        self._prob_RK = prob_RK
-        self._is_random_R = ((prob_RK > 0).sum(-1) > 1).numpy()
+        # In numpy, where operations on so few numbers cost a third of what they do in torch.
+        self._prob_RK = prob_RK.numpy()
+        self._is_random_R = (self._prob_RK > 0).sum(-1) > 1
         self.has_chance = bool(self._is_random_R.any())
-        self._row_R = torch.full((len(prob_RK),), -1, dtype=torch.int64)
+        self._row_R = np.full(len(prob_RK), -1)
         self._waiting: list[np.ndarray] = []
         self._num_waiting = self._num_counted = 0
         # Of each row that has been seen, in the order in which they were: its number in prob_RK, how often each outcome
         # happened, and the logarithms of its wealth by margin and share.
-        self.id_N = torch.zeros(0, dtype=torch.int64)
-        self.count_NK = torch.zeros(0, prob_RK.shape[1], dtype=torch.float64)
-        self.log_wealth_NEG = torch.zeros(0, len(MARGINS), len(_SHARES), dtype=torch.float64)
+        self._id_N = np.zeros(0, dtype=np.int64)
+        self._count_NK = np.zeros((0, prob_RK.shape[1]))
+        self._log_wealth_NEG = np.zeros((0, len(MARGINS), len(_SHARES)))
         self.log_evidence = (0.0,) * len(MARGINS)
 
     def observe(self, row_V: Int[np.ndarray, "V"], outcome_V: Int[np.ndarray, "V"]) -> None:
@@ -78,81 +79,84 @@ class Frequencies:
         self._waiting.append(edge_V)
         self._num_waiting += len(edge_V)
         if self._num_waiting * _PATIENCE > self._num_counted:
-            self._bet(torch.from_numpy(np.concatenate(self._waiting)))
+            self._bet(np.concatenate(self._waiting))
             self._num_counted, self._num_waiting, self._waiting = self._num_counted + self._num_waiting, 0, []
 
-    def _bet(self, edge_V: Int[Tensor, "V"]) -> None:
+    def _bet(self, edge_V: Int[np.ndarray, "V"]) -> None:
         """Bet on steps by what was seen before them, and count them. edge = row * K + outcome."""
         K = self._prob_RK.shape[1]
-        edge_E, times_E = edge_V.unique(return_counts=True)
-        rows, which_E = edge_E.div(K, rounding_mode="floor").unique(return_inverse=True)
+        edge_E, times_E = np.unique(edge_V, return_counts=True)
+        rows, which_E = np.unique(edge_E // K, return_inverse=True)
         at = self._places(rows)
-        new_UK = torch.zeros(len(rows), K, dtype=torch.float64)
-        new_UK[which_E, edge_E % K] = times_E.double()
+        new_UK = np.zeros((len(rows), K))
+        new_UK[which_E, edge_E % K] = times_E
 
         # The event on which is bet: what was more frequent than listed.
-        prob_UK, count_UK = self._prob_RK[rows], self.count_NK[at]
-        total_U1 = count_UK.sum(-1, keepdim=True)
+        prob_UK, count_UK = self._prob_RK[rows], self._count_NK[at]
+        total_U1 = count_UK.sum(-1, keepdims=True)
         event_UK = count_UK > total_U1 * prob_UK
-        listed_U1 = (prob_UK * event_UK).sum(-1, keepdim=True)
-        frequency_U1 = (count_UK * event_UK).sum(-1, keepdim=True) / total_U1.clamp(min=1)
-        won_U1 = (new_UK * event_UK).sum(-1, keepdim=True)
-        lost_U1 = new_UK.sum(-1, keepdim=True) - won_U1
+        listed_U1 = (prob_UK * event_UK).sum(-1, keepdims=True)
+        frequency_U1 = (count_UK * event_UK).sum(-1, keepdims=True) / np.maximum(total_U1, 1)
+        won_U1 = (new_UK * event_UK).sum(-1, keepdims=True)
+        lost_U1 = new_UK.sum(-1, keepdims=True) - won_U1
 
         # Wealth by margin and share; no bet (factor 1) where the frequency says nothing against the margin.
-        margin_E, share_G = torch.tensor(MARGINS, dtype=torch.float64), torch.tensor(_SHARES, dtype=torch.float64)
-        most_UE = listed_U1 + margin_E
-        bets_UE1 = ((frequency_U1 > most_UE) & (most_UE < 1) & (listed_U1 > 0)).unsqueeze(-1)
-        odds_UE1 = ((1 - most_UE) / most_UE).unsqueeze(-1)
-        gain_UEG = won_U1.unsqueeze(-1) * (share_G * odds_UE1).log1p() + lost_U1.unsqueeze(-1) * (-share_G).log1p()
-        self.log_wealth_NEG[at] += torch.where(bets_UE1, gain_UEG, 0.0)
-        self.count_NK[at] = count_UK + new_UK
+        most_UE = listed_U1 + np.array(MARGINS)
+        bets_UE = (frequency_U1 > most_UE) & (most_UE < 1) & (listed_U1 > 0)
+        odds_UE = np.where(bets_UE, (1 - most_UE) / np.where(bets_UE, most_UE, 1), 0)
+        share_G = np.array(_SHARES)
+        gain_UEG = won_U1[..., None] * np.log1p(share_G * odds_UE[..., None]) + lost_U1[..., None] * np.log1p(-share_G)
+        self._log_wealth_NEG[at] += np.where(bets_UE[..., None], gain_UEG, 0)
+        self._count_NK[at] = count_UK + new_UK
         self.log_evidence = self._evidence()
 
-    def _places(self, rows: Int[Tensor, "U"]) -> Int[Tensor, "U"]:
+    def _places(self, rows: Int[np.ndarray, "U"]) -> Int[np.ndarray, "U"]:
         """Where these rows stand among those that were seen; new ones come last."""
         new = rows[self._row_R[rows] < 0]
         if len(new):
-            self._row_R[new] = len(self.id_N) + torch.arange(len(new))
-            self.id_N = torch.cat([self.id_N, new])
-            for name in ("count_NK", "log_wealth_NEG"):
-                known = getattr(self, name)
-                setattr(self, name, torch.cat([known, known.new_zeros(len(new), *known.shape[1:])]))
+            self._row_R[new] = len(self._id_N) + np.arange(len(new))
+            self._id_N = np.concatenate([self._id_N, new])
+            self._count_NK, self._log_wealth_NEG = (
+                np.concatenate([known, np.zeros((len(new), *known.shape[1:]))])
+                for known in (self._count_NK, self._log_wealth_NEG)
+            )
         return self._row_R[rows]
 
     def _evidence(self) -> tuple[float, ...]:
         """log E of each margin. Rows that were never seen have wealth 1."""
         G, R = len(_SHARES), len(self._prob_RK)
-        product_E = self.log_wealth_NEG.sum(0).logsumexp(-1) - math.log(G)
-        unseen_1E = torch.full((1, len(MARGINS)), math.log(max(R - len(self.id_N), 1e-300)), dtype=torch.float64)
-        each_NE = self.log_wealth_NEG.logsumexp(-1) - math.log(G)
-        mean_E = torch.cat([each_NE, unseen_1E]).logsumexp(0) - math.log(R)
-        return tuple((torch.logaddexp(product_E, mean_E) - math.log(2)).tolist())
+        product_E = _log_sum_exp(self._log_wealth_NEG.sum(0)) - math.log(G)
+        each_NE = _log_sum_exp(self._log_wealth_NEG) - math.log(G)
+        unseen_E = np.full((1, len(MARGINS)), math.log(max(R - len(self._id_N), 1e-300)))
+        mean_E = np.logaddexp.reduce(np.concatenate([each_NE, unseen_E]), 0) - math.log(R)
+        return tuple((np.logaddexp(product_E, mean_E) - math.log(2)).tolist())
 
     def worst(self) -> "Worst":
         """Of the row with most evidence of its own the outcome whose frequency is furthest from what is listed."""
-        n = int(self.log_wealth_NEG.logsumexp(-1).sum(-1).argmax())
-        row, count_K = int(self.id_N[n]), self.count_NK[n]
-        k = int((count_K / count_K.sum() - self._prob_RK[row]).abs().argmax())
+        n = int(_log_sum_exp(self._log_wealth_NEG).sum(-1).argmax())
+        row, count_K = int(self._id_N[n]), self._count_NK[n]
+        k = int(np.abs(count_K / count_K.sum() - self._prob_RK[row]).argmax())
         return Worst(row, k, int(count_K[k]), int(count_K.sum()), float(self._prob_RK[row, k]))
 
     def state_dict(self) -> dict[str, Any]:
-        """All that was seen."""
-        waiting = torch.from_numpy(np.concatenate([*self._waiting, np.zeros(0, dtype=np.int64)]))
-        return {
-            "rows": self.id_N.clone(),
-            "counts": self.count_NK.clone(),
-            "log_wealth": self.log_wealth_NEG.clone(),
-            "waiting": waiting,
-        }
+        """All that was seen: tensors on the CPU."""
+        waiting = np.concatenate([*self._waiting, np.zeros(0, dtype=np.int64)])
+        arrays = {"rows": self._id_N, "counts": self._count_NK, "log_wealth": self._log_wealth_NEG, "waiting": waiting}
+        return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from what `state_dict` gave."""
-        self.id_N, self.count_NK = state["rows"].clone(), state["counts"].clone()
-        self.log_wealth_NEG = state["log_wealth"].clone()
-        self._row_R.fill_(-1)
-        self._row_R[self.id_N] = torch.arange(len(self.id_N))
-        self._waiting = [state["waiting"].numpy()]
-        self._num_waiting, self._num_counted = len(state["waiting"]), int(self.count_NK.sum())
-        if len(self.id_N):
+        self._id_N, self._count_NK, self._log_wealth_NEG, waiting = (
+            state[name].numpy().copy() for name in ("rows", "counts", "log_wealth", "waiting")
+        )
+        self._row_R[:] = -1
+        self._row_R[self._id_N] = np.arange(len(self._id_N))
+        self._waiting = [waiting]
+        self._num_waiting, self._num_counted = len(waiting), int(self._count_NK.sum())
+        if len(self._id_N):
             self.log_evidence = self._evidence()
+
+
+def _log_sum_exp(x_XG: np.ndarray) -> np.ndarray:
+    """log sum_g exp(x_g)."""
+    return np.logaddexp.reduce(x_XG, -1)

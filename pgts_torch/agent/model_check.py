@@ -30,6 +30,9 @@ _FALSE_ALARM = 1e-9
 _KINDS = "steps", "starts"
 """Whose frequencies are held."""
 
+ENOUGH = math.log(len(_KINDS) * len(MARGINS) / _FALSE_ALARM)
+"""The log E from which on frequencies are called wrong: all tests of a run share the probability of a false alarm."""
+
 _WAY_OUT = (
     "One of the two is wrong, and a lookahead would be: mend it, give another model, or train without one (depth 0 and "
     "the estimator 'sampled'); with model_check 'warn' (search.model_check) training goes on"
@@ -169,12 +172,11 @@ class ModelCheck:
 
     def _hold_frequencies(self) -> None:
         """Whether outcomes and starts are as frequent as the table says. The same in all ranks."""
-        enough = math.log(len(_KINDS) * len(MARGINS) / _FALSE_ALARM)
         for what, frequencies in self._frequencies.items():
             kind, (surely, perhaps) = f"frequencies of {what}", frequencies.log_evidence
-            if surely >= enough and kind not in self._said:
+            if surely >= ENOUGH and kind not in self._said:
                 self._contradicted(kind, f"{self._unlikely(what)}. {_WAY_OUT}", 1)
-            elif perhaps >= enough and surely < 0:  # bets on more than the margin have lost
+            elif perhaps >= ENOUGH and surely < 0:  # bets on more than the margin have lost
                 self._say(kind, f"{self._unlikely(what)}; probabilities are off, but not by 2 %, as far as is known")
 
     def _unlikely(self, what: str) -> str:
