@@ -114,8 +114,8 @@ def teleports_after(steps: int) -> Callable[[Walk], None]:
 
 KINDS = {"table": (Listed, "softmax"), "simulator": (Restored, {"type": "mlp", "hidden": [8]})}
 LIES = {
-    "another reward": (pays_after(35, 0.5), r"gave reward 0\.5, discount 0\.99"),
-    "a reward off by 1e-9": (pays_after(35, 1e-9), r"gave reward 1e-09, discount 0\.99"),
+    "another reward": (pays_after(35, 0.5), r"gave reward 0\.5, (discount 0\.99|an end)"),
+    "a reward off by 1e-9": (pays_after(35, 1e-9), r"gave reward 1e-09, (discount 0\.99|an end)"),
     "another state": (teleports_after(35), r"gave reward 0, discount 0\.99, then state"),
 }
 
