@@ -1,24 +1,27 @@
 """What a stranger gets who gives no options: the defaults on problems that they have not been chosen on.
 
-    python benchmarks/defaults.py tables [--seeds 100 101 ...] [--short]
+    python benchmarks/defaults.py tables|networks [--seeds 100 101 ...] [--short]
 
 Prints the table of docs/benchmarks.md, section Defaults. `--short` (also `--quick`) takes less than a minute.
 """
 
 import argparse
 
+import defaults_networks
 import defaults_tables
 import torch
+
+TABLES = {"tables": defaults_tables.table, "networks": defaults_networks.table}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("part", choices=["tables"])
+    parser.add_argument("part", choices=list(TABLES))
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(100, 110)))
     parser.add_argument("--short", "--quick", action="store_true", help="less than a minute, for tests")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    defaults_tables.table(given.seeds[:2] if given.short else given.seeds, short=given.short)
+    TABLES[given.part](given.seeds[:2] if given.short else given.seeds, short=given.short)
 
 
 if __name__ == "__main__":

@@ -129,15 +129,24 @@ def make_update(
     return _make("update", choices, description)
 
 
-def make_critic(description: Description | None, world: World, policy: Policy, *, seed: int) -> Critic:
+def make_critic(
+    description: Description | None,
+    world: World,
+    policy: Policy,
+    estimator: Estimator = LookaheadAdvantages(),  # noqa: B008 - frozen
+    *,
+    seed: int,
+) -> Critic:
     """A critic: exact(target), tabular(target, method, step_size), rollout(samples, target, horizon) or
     network(network, target, method, ...), whose network may be "shared" with the policy's. Default: tabular where the
-    environment is, else a network like the policy's."""
+    environment is, else a network like the policy's, whose learning rate is 1e-3 with a lookahead and 3e-4 with sampled
+    advantages."""
     if description is None:
         description = "tabular" if isinstance(world, TabularWorld) else "network"
     kind, options = _parts("critic", _CRITICS, description)
     nested: dict[str, _Choices] = {"method": _METHODS, "horizon": _HORIZONS}
     if kind == "network":
+        options.setdefault("learning_rate", 3e-4 if isinstance(estimator, SampledAdvantages) else 1e-3)
         if options.get("network") == "shared":
             if not isinstance(policy, NetworkPolicy):
                 raise PgtsError(f"critic.network is 'shared'; a {type(policy).__name__} has no network to share")

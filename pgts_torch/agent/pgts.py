@@ -178,7 +178,7 @@ class PGTS:
         if not isinstance(policy, Policy):
             policy = make_policy(policy, self.world, seed=seed)
         if not isinstance(critic, Critic):
-            critic = make_critic(critic, self.world, policy, seed=seed)
+            critic = make_critic(critic, self.world, policy, self.estimator, seed=seed)
         if not isinstance(update, Update):
             update = make_update(update, policy, self.estimator)
         if not isinstance(horizon, Horizon):

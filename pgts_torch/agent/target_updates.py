@@ -91,7 +91,7 @@ class CMPOUpdate(TargetUpdate):
     """
 
     learning_rate: float = 1e-3
-    temperature: float = 0.2
+    temperature: float = 0.1
     clip: float = 3.0
 
     def check_options(self) -> None:
