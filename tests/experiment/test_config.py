@@ -465,6 +465,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a number > 0 or never": st.just("never") | st.floats(0, exclude_min=True, allow_infinity=False),
     "a number > 0 or never or null": st.sampled_from([None, "never", 0.25]),
     "a number >= 0": st.floats(0, allow_infinity=False),
+    "rms or none or null": st.sampled_from([None, "rms", "none"]),
     "adam or sgd or null": st.sampled_from([None, "adam", "sgd"]),
     "occupancy, visits or uniform or null": st.sampled_from([None, "occupancy", "visits", "uniform"]),
     "a key of dictionary observations or null": st.none() | st.from_regex(r"[A-Za-z0-9_.:-]{1,20}", fullmatch=True),
