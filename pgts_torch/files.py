@@ -29,7 +29,7 @@ def named(complaint: str) -> Iterator[None]:
     try:
         yield
     except UnicodeEncodeError as error:
-        reason = f"its name cannot be written in {error.encoding}, which this process uses; set PYTHONUTF8=1"
+        reason = "its name has letters that this locale lacks; set PYTHONUTF8=1, or LC_ALL to a locale of UTF-8"
         raise PgtsError(f"{complaint}: {reason}") from error
     except (OSError, ValueError) as error:  # ValueError: a null byte
         if isinstance(error, PgtsError):
@@ -54,20 +54,24 @@ def kind(path: str | Path, *, follow: bool = False) -> str | None:
         return _KINDS.get(stat.S_IFMT(mode), "special file")
 
 
-def read(path: str | Path, *, most: int | None = None) -> bytes:
+def read(path: str | Path, *, most: int | None = None, name: str | None = None) -> bytes:
     """What is in a file, `most` bytes of it. What a pipe or a device at that path holds is not waited for, unless it
     was handed to this process, as by `<(...)` of a shell.
+
+    Args:
+        name: what errors call it; default its path.
 
     Raises:
         PgtsError: it is no file, or cannot be read.
     """
-    with named(f"{path} cannot be read"):
+    name = str(path) if name is None else name
+    with named(f"{name} cannot be read"):
         is_stream = str(path).startswith(_STREAMS)
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | (0 if is_stream else _NO_WAITING))
         with open(handle, "rb") as file:
             mode = os.fstat(handle).st_mode
             if not (is_stream or stat.S_ISREG(mode)):
-                raise PgtsError(f"{path} is a {_KINDS.get(stat.S_IFMT(mode), 'special file')}; it must be a file")
+                raise PgtsError(f"{name} is a {_KINDS.get(stat.S_IFMT(mode), 'special file')}; it must be a file")
             return file.read(-1 if most is None else most)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from pgts_torch import files
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.fields import INT64_MAX
 from pgts_torch.experiment.schema import Option
@@ -134,18 +135,29 @@ def start(text: str) -> int | str:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a state nor uniform") from None
 
 
+def _kind(text: str) -> str | None:
+    """What is at a path that the system can tell of."""
+    try:
+        text.encode()
+        return files.kind(text, follow=True)
+    except UnicodeEncodeError:
+        reason = "its name has letters that this locale lacks; set PYTHONUTF8=1, or LC_ALL to a locale of UTF-8"
+        raise argparse.ArgumentTypeError(f"{text!a}: {reason}") from None
+    except PgtsError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
 def output_folder(text: str) -> Path:
     """An argparse type: a folder, or where one can be made."""
-    path = Path(text)
-    if path.exists() and not path.is_dir():
+    if _kind(text) not in (None, "folder"):
         raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
-    return path
+    return Path(text)
 
 
 def html_file(text: str) -> Path:
     """An argparse type: a file that ends in .html, in a folder that exists."""
     path = Path(text)
-    if path.suffix != ".html" or path.is_dir():
+    if path.suffix != ".html" or _kind(text) == "folder":
         raise argparse.ArgumentTypeError(f"{text!r} is not a file that ends in .html")
     if not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f"{text!r}: {str(path.parent)!r} is not a folder")
@@ -155,7 +167,7 @@ def html_file(text: str) -> Path:
 def run_folder(text: str) -> Path:
     """An argparse type: a folder with the configuration of a run in it."""
     path = Path(text)
-    if not path.is_dir():
+    if _kind(text) != "folder":
         raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
     if not (path / "config.yaml").is_file():
         raise argparse.ArgumentTypeError(f"{text!r} is not the folder of a run: it has no config.yaml")

@@ -30,7 +30,9 @@ from pgts_torch.experiment.arguments import (
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.ownership import SUMMARY_FILE
 from pgts_torch.experiment.schema import Schema
+from pgts_torch.experiment.terminal import tell, telling
 from pgts_torch.trust import check_imports
 
 CHECK_FAILED = TRAINING_FAILED = 1
@@ -55,11 +57,13 @@ def main(arguments: Arguments | None = None) -> int:
         was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C, 143
         after SIGTERM, 129 after SIGHUP.
     """
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by whoever started us: what is said goes nowhere
-            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+    with telling():
+        return _main(sys.argv[1:] if arguments is None else arguments)
+
+
+def _main(arguments: Arguments) -> int:
     try:
-        code = _dispatch(sys.argv[1:] if arguments is None else arguments)
+        code = _dispatch(arguments)
         sys.stdout.flush()  # meets a broken pipe here, not while the interpreter shuts down
         return code
     except PgtsError as error:
@@ -69,8 +73,6 @@ def main(arguments: Arguments | None = None) -> int:
                 print(f"error: {f'[rank {rank}] ' if rank else ''}{line}", file=sys.stderr)
         return TRAINING_FAILED if isinstance(error, NotFinite | RankLost) else USAGE_ERROR
     except BrokenPipeError:
-        # Nobody reads on: what is still in the buffer goes nowhere.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except Stopped as stopped:
         if _rank() == 0:
@@ -124,7 +126,7 @@ def train(arguments: Arguments) -> None:
 
     summary = run.train(config, strict_resume=fixed.strict_resume, any_world_size=fixed.any_world_size)
     if _rank() == 0:
-        print(json.dumps(asdict(summary)) if fixed.json else describe(summary))
+        tell(json.dumps(asdict(summary)) if fixed.json else describe(summary), kept=f"{summary.run}/{SUMMARY_FILE}")
 
 
 @command
@@ -145,7 +147,7 @@ def sweep(arguments: Arguments) -> None:
 
     runs = sweeping.plan(fixed.config, overrides, depths=fixed.depths, num_seeds=fixed.seeds, out=fixed.out)
     answer = sweeping.sweep(runs, jobs=fixed.jobs, out=fixed.out)
-    print(json.dumps(asdict(answer)) if fixed.json else sweeping.describe(answer))
+    tell(json.dumps(asdict(answer)) if fixed.json else sweeping.describe(answer), kept=f"{fixed.out}/table.json")
     for name, mistake in answer.failures.items():
         print(f"error: {name}: {mistake}", file=sys.stderr)
     if answer.failures:

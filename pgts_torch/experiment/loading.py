@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from pgts_torch import files
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import strict_yaml
 from pgts_torch.experiment.config import Config, with_types
@@ -230,10 +231,9 @@ class _Loader:
 
 def _read(path: Path) -> str:
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise YamlMistake(f"the configuration cannot be read: {error.strerror}", None) from None
+        content = files.read(path, most=MAX_BYTES + 1, name="the configuration")
+    except PgtsError as error:
+        raise YamlMistake(str(error), None) from None
     if len(content) > MAX_BYTES:
         raise YamlMistake(f"the configuration is larger than {MAX_BYTES} bytes", None)
     try:

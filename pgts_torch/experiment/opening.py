@@ -35,6 +35,8 @@ RUNS = Path("runs")
 def check_dir(config: Config) -> None:
     """PgtsError if the folder that a configuration names cannot be a run's; nothing was written."""
     if config.run.dir:
+        with files.named(f"run.dir {config.run.dir!a}"):
+            config.run.dir.encode()  # it is written down in config.yaml
         check_folder(Path(config.run.dir))
     elif int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")):
         raise PgtsError("run.dir is not set; torchrun --max-restarts needs it, so that a restart finds the run")

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -113,6 +114,7 @@ def plan(
             arguments = [*overrides, *(f"--{key}={value}" for key, value in own.items())]
             runs.append(Run(depth, seed, load(path, arguments), (*shared, *arguments)))
     for run in runs:
+        _summary(run)
         if (run.folder / "config.yaml").is_file() and not _same(load(run.folder / "config.yaml"), run.config):
             raise PgtsError(f"{run.folder} holds a run of another configuration; choose another --out")
     return runs
@@ -197,11 +199,22 @@ def _same(first: Config, second: Config) -> bool:
 
 
 def _summary(run: Run) -> dict[str, Any] | None:
-    """What a finished run came to; None if it is not finished."""
-    try:
-        return json.loads((run.folder / "summary.json").read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    """What a finished run came to; None if it is not finished; PgtsError where that is damaged."""
+    path = run.folder / "summary.json"
+    if files.kind(path) is None:
         return None
+    try:
+        content = json.loads(files.read(path))
+        numbers = [content[name] for name in ("env_steps", "model_calls", "seconds")]
+        numbers += [content[kind]["episodic_return"]["mean"] for kind in ("sampled", "deterministic")]
+        numbers += [] if content["J"] is None else [content["J"]]
+        if not all(isinstance(number, int | float) and math.isfinite(number) for number in numbers):
+            raise TypeError("a number is missing")
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise PgtsError(
+            f"{path} is damaged ({error}): remove it, and the run is summed up again from its last checkpoint"
+        ) from error
+    return dict(content)
 
 
 def _score_is(runs: Iterable[Run]) -> str:
@@ -263,8 +276,12 @@ def _curves(runs: Sequence[Run]) -> bytes:
 
 def _history(run: Run) -> tuple[str, np.ndarray, np.ndarray]:
     """The tag of a learning curve, its steps and its values."""
-    lines = [json.loads(line) for line in (run.folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
-    tag = "exact/J" if "exact/J" in lines[0] else "charts/episodic_return"
-    points = [(line["step"], line[tag]) for line in lines if line.get(tag) is not None]
+    from pgts_torch.experiment.tracking import read_metrics
+
+    lines = read_metrics(run.folder)
+    tag = "exact/J" if lines and "exact/J" in lines[0] else "charts/episodic_return"
+    points = [(line["step"], line[tag]) for line in lines if "step" in line and line.get(tag) is not None]
+    if not points:
+        raise PgtsError(f"{run.folder / 'metrics.jsonl'} has no line of {tag}")
     step_K, value_K = np.array(points, dtype=np.float64).T
     return tag, step_K, value_K

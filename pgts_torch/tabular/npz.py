@@ -10,6 +10,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from pgts_torch import files
 from pgts_torch.errors import PgtsError
 
 MOST_BYTES = 2**31
@@ -44,6 +45,8 @@ def write_arrays(path: str | Path, arrays: dict[str, Any]) -> None:
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
     """The arrays of an MDP in a file; anything but plain numbers under the known names is refused, and so is what
     would take more than `MOST_BYTES`, before any of it is unpacked."""
+    if (found := files.kind(path, follow=True)) not in (None, "file", "folder"):
+        raise PgtsError(f"{path}: is a {found}; it must be a file")
     try:
         with open(path, "rb") as file:
             if not zipfile.is_zipfile(file):

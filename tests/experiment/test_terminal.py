@@ -1,0 +1,126 @@
+"""Output that goes nowhere, pipes in place of files, names that are too long or not of this locale."""
+
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.cli import main
+from pgts_torch.experiment.terminal import Telling
+from pgts_torch.experiment.tracking import read_metrics
+from pgts_torch.tabular import TabularMDP
+from tests.experiment.test_surroundings import started
+
+SHORT = ["--total_steps=15", "--rollout.num_envs=1", "--rollout.horizon.length=5", "--eval.episodes=1"]
+BARE = [*SHORT, "--search.depth=0", "--run.tensorboard=false", "--run.dir=run"]
+
+
+@pytest.mark.fault("full output")
+@pytest.mark.parametrize(
+    ("redirections", "codes"),
+    [
+        (">/dev/full", [0]),
+        (">/dev/full 2>/dev/full", [0]),
+        (">&- 2>/dev/full", [0]),
+        ("2>&1 | head -1", [0]),
+        ("<&- >&- 2>&-", [0]),
+    ],
+)
+def test_output_that_cannot_be_written_ends_no_training(redirections, codes, tmp_path):
+    done = started(tmp_path, redirections, "train", *BARE)
+    assert done.returncode in codes, done.stderr
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["env_steps"] == 15
+    assert len(read_metrics(tmp_path / "run")) == 3
+    assert "Traceback" not in done.stderr
+    if redirections == ">/dev/full":
+        mistake = "warning: the answer cannot be written to stdout: No space left on device; it stands in run/summary"
+        assert mistake in done.stderr
+
+
+@pytest.mark.fault("full output")
+def test_an_answer_that_cannot_be_written_is_an_error_of_other_commands(tmp_path):
+    done = started(tmp_path, ">/dev/full", "train", "--print-config")
+    assert done.returncode == 2
+    assert done.stderr.endswith("error: the answer cannot be written to stdout: No space left on device\n")
+
+
+def test_a_stream_escapes_what_its_encoding_lacks_and_falls_silent_once_it_fails(tmp_path):
+    with (tmp_path / "told").open("w", encoding="ascii") as file:
+        print("run.dir ä日\udcc3", file=Telling(file, must=True))
+    assert (tmp_path / "told").read_text() == "run.dir \\xe4\\u65e5\\udcc3\n"
+    with Path("/dev/full").open("w") as full:
+        told = Telling(full, must=False)
+        print("x", file=told, flush=True)
+        print("x", file=told, flush=True)
+    with Path("/dev/full").open("w") as full, pytest.raises(PgtsError, match="cannot be written to stdout: No space"):
+        print("x", file=Telling(full, must=True), flush=True)
+
+
+@pytest.mark.fault("pipe in place of a file")
+def test_a_pipe_that_nobody_writes_to_is_named_and_not_waited_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("pipe", "pipe.npz"):
+        os.mkfifo(name)
+    before = signal.alarm(20)
+    for arguments, mistake in {
+        ("train", "--config=pipe"): "pipe: the configuration is a pipe; it must be a file",
+        ("train", "--run.dir=pipe"): "run.dir pipe is a pipe; it must be a folder or not exist",
+        ("stationary", "pipe.npz"): "'pipe.npz' is not a file",
+        ("sweep", "--out=pipe"): "'pipe' is not a folder",
+        ("evaluate", "pipe"): "'pipe' is not a folder",
+    }.items():
+        assert main(list(arguments)) == 2
+        assert mistake in capsys.readouterr().err
+    with pytest.raises(PgtsError, match="is a pipe"):
+        TabularMDP.load("pipe.npz")
+    signal.alarm(before)
+    assert sys.stdout.write
+
+
+@pytest.mark.fault("name of more than 255 bytes")
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train", "--config={}.yaml"],
+        ["train", "--run.dir={}"],
+        ["train", "--resume={}"],
+        ["sweep", "--out={}"],
+        ["evaluate", "{}"],
+        ["report", "{}"],
+        ["stationary", "{}.npz"],
+    ],
+)
+def test_a_name_that_is_too_long_is_one_line(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([argument.format("x" * 300) for argument in arguments]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if "no --config" not in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.fault("letters that the locale lacks")
+@pytest.mark.parametrize("arguments", [["train", "--run.dir=äß"], ["sweep", "--out=äß"], ["train", "--config=äß.yaml"]])
+def test_a_name_that_the_locale_lacks_is_one_line(arguments, tmp_path):
+    done = started(tmp_path, "", *arguments, *SHORT)
+    assert done.returncode == 2
+    [line] = [line for line in done.stderr.splitlines() if "no --config" not in line]
+    assert line.startswith("error: ")
+    assert ("LC_ALL to a locale of UTF-8" in line) == ("--config=äß.yaml" not in arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.fault("damaged summary in a sweep")
+@pytest.mark.parametrize("content", ["", "{", "[]", "{}", '{"J": "high"}'])
+def test_a_sweep_names_a_damaged_summary(content, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "out" / "depth-0" / "seed-0"
+    folder.mkdir(parents=True)
+    (folder / "summary.json").write_text(content)
+    assert main(["sweep", "--out=out", "--depths=0", "--seeds=1", *SHORT]) == 2
+    assert "error: out/depth-0/seed-0/summary.json is damaged (" in capsys.readouterr().err
+    assert (folder / "summary.json").read_text() == content
