@@ -126,7 +126,7 @@ def train(arguments: Arguments) -> None:
 
     summary = run.train(config, strict_resume=fixed.strict_resume, any_world_size=fixed.any_world_size)
     if _rank() == 0:
-        tell(json.dumps(asdict(summary)) if fixed.json else describe(summary), kept=f"{summary.run}/{SUMMARY_FILE}")
+        tell(json.dumps(asdict(summary)) if fixed.json else describe(summary), kept=f"{SUMMARY_FILE} of the run")
 
 
 @command

@@ -37,7 +37,7 @@ def test_output_that_cannot_be_written_ends_no_training(redirections, codes, tmp
     assert len(read_metrics(tmp_path / "run")) == 3
     assert "Traceback" not in done.stderr
     if redirections == ">/dev/full":
-        mistake = "warning: the answer cannot be written to stdout: No space left on device; it stands in run/summary"
+        mistake = "warning: the answer cannot be written to stdout: No space left on device; it stands in summary.json"
         assert mistake in done.stderr
 
 
