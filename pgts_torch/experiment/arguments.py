@@ -135,7 +135,7 @@ def start(text: str) -> int | str:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a state nor uniform") from None
 
 
-def _kind(text: str) -> str | None:
+def path_kind(text: str) -> str | None:
     """What is at a path that the system can tell of."""
     try:
         text.encode()
@@ -149,7 +149,7 @@ def _kind(text: str) -> str | None:
 
 def output_folder(text: str) -> Path:
     """An argparse type: a folder, or where one can be made."""
-    if _kind(text) not in (None, "folder"):
+    if path_kind(text) not in (None, "folder"):
         raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
     return Path(text)
 
@@ -157,7 +157,7 @@ def output_folder(text: str) -> Path:
 def html_file(text: str) -> Path:
     """An argparse type: a file that ends in .html, in a folder that exists."""
     path = Path(text)
-    if path.suffix != ".html" or _kind(text) == "folder":
+    if path.suffix != ".html" or path_kind(text) == "folder":
         raise argparse.ArgumentTypeError(f"{text!r} is not a file that ends in .html")
     if not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f"{text!r}: {str(path.parent)!r} is not a folder")
@@ -167,7 +167,7 @@ def html_file(text: str) -> Path:
 def run_folder(text: str) -> Path:
     """An argparse type: a folder with the configuration of a run in it."""
     path = Path(text)
-    if _kind(text) != "folder":
+    if path_kind(text) != "folder":
         raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
     if not (path / "config.yaml").is_file():
         raise argparse.ArgumentTypeError(f"{text!r} is not the folder of a run: it has no config.yaml")

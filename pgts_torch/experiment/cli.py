@@ -20,6 +20,7 @@ from pgts_torch.experiment.arguments import (
     html_file,
     json_object,
     output_folder,
+    path_kind,
     print_values,
     run_folder,
     share,
@@ -354,7 +355,7 @@ def _mdp_name(text: str) -> str:
         close = difflib.get_close_matches(text, names, n=1)
         hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(STATIONARY_OPTIONS)}"
         raise argparse.ArgumentTypeError(f"{text!r} is not an MDP; {hint}")
-    if not Path(text).is_file():
+    if path_kind(text) != "file":
         raise argparse.ArgumentTypeError(f"{text!r} is not a file")
     return text
 

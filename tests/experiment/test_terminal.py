@@ -24,10 +24,8 @@ BARE = [*SHORT, "--search.depth=0", "--run.tensorboard=false", "--run.dir=run"]
     ("redirections", "codes"),
     [
         (">/dev/full", [0]),
-        (">/dev/full 2>/dev/full", [0]),
         (">&- 2>/dev/full", [0]),
         ("2>&1 | head -1", [0]),
-        ("<&- >&- 2>&-", [0]),
     ],
 )
 def test_output_that_cannot_be_written_ends_no_training(redirections, codes, tmp_path):
@@ -76,7 +74,7 @@ def test_a_pipe_that_nobody_writes_to_is_named_and_not_waited_for(tmp_path, monk
         assert main(list(arguments)) == 2
         assert mistake in capsys.readouterr().err
     with pytest.raises(PgtsError, match="is a pipe"):
-        TabularMDP.load("pipe.npz")
+        TabularMDP.load_npz("pipe.npz")
     signal.alarm(before)
     assert sys.stdout.write
 
@@ -110,7 +108,7 @@ def test_a_name_that_the_locale_lacks_is_one_line(arguments, tmp_path):
     assert done.returncode == 2
     [line] = [line for line in done.stderr.splitlines() if "no --config" not in line]
     assert line.startswith("error: ")
-    assert ("LC_ALL to a locale of UTF-8" in line) == ("--config=äß.yaml" not in arguments)
+    assert r"\udcc3\udca4" in line
     assert list(tmp_path.iterdir()) == []
 
 
