@@ -10,7 +10,7 @@ from torch import Tensor
 from pgts_torch.agent.evaluate import Evaluation
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.policies import Policy, TabularPolicy
 from pgts_torch.agent.states import check_keys
 from pgts_torch.agent.target_updates import TargetUpdate
 from pgts_torch.agent.updates import TabularUpdate, Update
@@ -19,8 +19,14 @@ from pgts_torch.errors import PgtsError
 HARDLY = 0.05
 """A policy of which less than this share of probability is elsewhere than at first has hardly moved."""
 
+RESTLESS = 0.05
+"""A policy of which an iteration still moves more than this share of probability at the end has not come to rest."""
+
 LARGE = 0.1
 """What is missing is large if it is more than this share of what actions differ by."""
+
+_DECAY = 0.9
+"""What the average over iterations keeps from one to the next, so that it speaks of the last ten or so."""
 
 
 class Movement:
@@ -34,32 +40,55 @@ class Movement:
         self.first = first
         self.moved: float | None = None
         self.gap_share: float | None = None
+        self.pace: float | None = None
+
+    def follow(self, algorithm: PGTS, iteration: Iteration) -> None:
+        """Take in an iteration that was made just now: `pace`, a running mean over iterations of
+
+            sum_s w(s) 1/2 sum_a |pi_{k+1}(a|s) - pi_k(a|s)|,        in [0, 1], w the weights of the update, of sum 1
+
+        Of tables only, where it costs next to nothing.
+        """
+        if isinstance(algorithm.policy, TabularPolicy):
+            moved = self._apart(algorithm, iteration, iteration.pi_NA)
+            self.pace = moved if self.pace is None else _DECAY * self.pace + (1 - _DECAY) * moved
 
     def measure(self, algorithm: PGTS, iteration: Iteration) -> None:
         """At the states of an iteration that was made just now, by their weights in the update:
 
         moved = mean of 1/2 sum_a |pi - pi_first|, in [0, 1];   gap_share = mean g_m / mean (max_a q - min_a q)
         """
-        share_N = iteration.weight_N / iteration.weight_N.sum()
-        observation_N = algorithm.world.observe(iteration.state_N)
-        apart_NA = (algorithm.policy.probs(observation_N) - self.first.probs(observation_N)).abs()
-        self.moved = float(apart_NA.sum(-1).to(share_N.dtype) @ share_N) / 2
+        share_N = _shares(iteration)
+        first_NA = self.first.probs(algorithm.world.observe(iteration.state_N))
+        self.moved = self._apart(algorithm, iteration, first_NA)
         self.gap_share = None
         if iteration.look is not None:
             span = float(span_of(iteration.look.q_BA) @ share_N.to(iteration.look.q_BA.dtype))
             gap = float(iteration.gap_N @ share_N.to(iteration.gap_N.dtype))
             self.gap_share = gap / span if 0 < span < math.inf else None
 
+    @staticmethod
+    def _apart(algorithm: PGTS, iteration: Iteration, other_NA: Tensor) -> float:
+        """Which share of probability the policy has elsewhere than another one has it."""
+        probs_NA = algorithm.policy.probs(algorithm.world.observe(iteration.state_N))
+        share_N = _shares(iteration)
+        return float((probs_NA - other_NA).abs().sum(-1).to(share_N.dtype) @ share_N) / 2
+
     def state_dict(self) -> dict[str, Any]:
         """Plain values."""
-        return {"moved": self.moved, "gap_share": self.gap_share}
+        return {"moved": self.moved, "gap_share": self.gap_share, "pace": self.pace}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` gave; PgtsError if it is something else."""
-        check_keys("movement", state, {"moved", "gap_share"})
+        check_keys("movement", state, {"moved", "gap_share", "pace"})
         if not all(isinstance(value, float | None) for value in state.values()):
             raise PgtsError(f"movement is {state}; it must be numbers")
-        self.moved, self.gap_share = state["moved"], state["gap_share"]
+        self.moved, self.gap_share, self.pace = state["moved"], state["gap_share"], state["pace"]
+
+
+def _shares(iteration: Iteration) -> Float[Tensor, "N"]:
+    """w(s), of sum 1."""
+    return iteration.weight_N / iteration.weight_N.sum()
 
 
 def span_of(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
@@ -95,6 +124,25 @@ def stuck(
     if stationary_share is not None and stationary_share <= LARGE * share:
         return f"{told}. Such a lookahead sees nothing better: set a deeper one, search.depth above {depth}"
     return f"{told}. Set {_longer_steps(update)}, more total_steps, or a deeper lookahead, search.depth above {depth}"
+
+
+def restless(movement: Movement, update: Update, *, missing_share: float | None) -> str | None:
+    """That the policy of a table has not come to rest though much is missing: it may go round for ever, because its
+    steps do not shrink, or it is still on its way. None where that is not so.
+
+    Args:
+        missing_share: as in `stuck`.
+    """
+    share = movement.gap_share if missing_share is None else missing_share
+    if movement.pace is None or movement.pace < RESTLESS or share is None or share <= LARGE:
+        return None
+    smaller = ""
+    if isinstance(update, TabularUpdate):
+        smaller = f", or with a smaller update.step_size than {update.step_size:g}"
+    return (
+        f"the policy has not come to rest: the last iterations moved {movement.pace:.0%} of its probability each, and "
+        f"much is missing. Train for more total_steps; if J goes up and down, with more rollout.num_envs{smaller}"
+    )
 
 
 def _longer_steps(update: Update) -> str:

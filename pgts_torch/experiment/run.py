@@ -23,7 +23,7 @@ from pgts_torch.agent.ranks import joined_ranks
 from pgts_torch.agent.states import check_keys, take_over
 from pgts_torch.errors import Failed, ModelMismatch, NotFinite, PgtsError, Stopped, check_count, failure
 from pgts_torch.experiment import checkpoint, diagnostics
-from pgts_torch.experiment.advice import Movement, greedy_is_worse, span_of, stuck
+from pgts_torch.experiment.advice import Movement, greedy_is_worse, restless, span_of, stuck
 from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import KINDS
@@ -205,6 +205,7 @@ class _Recorder:
         k, step = algorithm.num_iterations, algorithm.num_env_steps
         self._deepest, self._certificate = max(self._deepest, iteration.depth), iteration.certificate
         self._last = iteration
+        self.movement.follow(algorithm, iteration)
         if k % self.config.log.every == 0 and algorithm.ranks.leads:
             tags = diagnostics.metrics(algorithm, iteration)
             if self.truth is not None and self._pi_SA is not None:
@@ -354,18 +355,21 @@ class _Recorder:
             deterministic=deterministic,
             sampled=sampled,
             parts=", ".join(type(part).__name__ for part in (algorithm.policy, algorithm.critic, algorithm.update)),
-            notes=tuple(filter(None, (self._advice(exactly), greedy_is_worse(deterministic, sampled)))),
+            notes=(*self._advice(exactly), *filter(None, [greedy_is_worse(deterministic, sampled)])),
         )
 
-    def _advice(self, exactly: Mapping[str, float | None]) -> str | None:
-        """That the policy hardly moved, if it did not and should have."""
+    def _advice(self, exactly: Mapping[str, float | None]) -> list[str]:
+        """That the policy hardly moved, if it did not and should have, or that it has not come to rest."""
         missing = stationary_gap = None
         if self.truth is not None:
             span = float(span_of(self.truth.optimum.q_SA.reshape(1, -1)))
             J, best, gap = (exactly[name] or 0.0 for name in ("J", "J_optimal", "stationarity_gap"))
             missing, stationary_gap = ((best - J) / span, gap / span) if span > 0 else (0.0, 0.0)
-        shares = {"missing_share": missing, "stationary_share": stationary_gap}
-        return stuck(self.movement, self.algorithm.update, depth=self._deepest, **shares)
+        movement, update = self.movement, self.algorithm.update
+        told = stuck(
+            movement, update, depth=self._deepest, missing_share=missing, stationary_share=stationary_gap
+        ) or restless(movement, update, missing_share=missing)
+        return [] if told is None else [told]
 
 
 def _evaluations(config: EvalConfig, seed: int, folder: Folder) -> dict[str, EvalCallback]:

@@ -69,6 +69,17 @@ def test_a_network_that_hardly_moves_says_so_and_one_that_learns_does_not(tmp_pa
     assert not any("hardly moved" in note for note in moving.notes)
 
 
+@pytest.mark.fault("a policy that does not come to rest")
+def test_a_policy_that_still_moves_at_the_end_is_told_to_train_on_or_to_take_smaller_steps(tmp_path: Path):
+    restless = trained(tmp_path / "a", "--env.id", "pgts/RiverSwim-v0")
+    [note] = restless.notes
+    assert note.startswith("the policy has not come to rest: the last iterations moved ")
+    assert "a smaller update.step_size than 1" in note
+    arrived = trained(tmp_path / "b", "--env.id", "pgts/Ladder-v0", "--critic.type", "exact", "--total_steps", "3000")
+    assert arrived.J == pytest.approx(arrived.J_optimal, rel=1e-3)
+    assert arrived.notes == ()
+
+
 def evaluation(mean: float, half_width: float | None) -> Evaluation:
     score = Score(mean, half_width)
     return Evaluation(10, score, score, score)
