@@ -57,7 +57,8 @@ class TargetUpdate(NetworkUpdate):
 class NetworkMirrorUpdate(TargetUpdate):
     """The mirror step, step(s, a) = adv(s, a) / temperature (Tomar et al. 2022; Protopapas and Barakat 2024).
 
-    A network that can be any policy ends where `MirrorUpdate` with step_size * w(s) = 1 / temperature does.
+    A network that can be any policy ends where `MirrorUpdate` in reward units (normalize "none", floor None) with
+    step_size * w(s) = 1 / temperature does.
 
     Args:
         temperature: in reward units; small ones make long steps.

@@ -17,7 +17,7 @@ from pgts_torch.tabular import TabularMDP
 def following(pi_SA: Tensor) -> SimplexPolicy:
     """The policy with these probabilities."""
     policy = SimplexPolicy(*pi_SA.shape)
-    policy.load_state_dict({"probs_SA": pi_SA})
+    policy.load_state_dict({"probs_SA": pi_SA.double()})  # a state of another dtype is refused
     return policy
 
 
