@@ -14,6 +14,10 @@ class NodeBudgetExceeded(PgtsError):
     """A lookahead would need more nodes than its budget allows."""
 
 
+class MemoryBudgetExceeded(NodeBudgetExceeded):
+    """A lookahead would need more memory than its budget allows."""
+
+
 class MissingModel(PgtsError):
     """An environment offers no model that a lookahead could ask."""
 

@@ -211,9 +211,9 @@ def _told_where_it_stops_a_training() -> Iterator[None]:
     and seed."""
     try:
         yield
-    except MissingModel:
+    except (MissingModel, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit):
+    except BaseException:
         return
 
 

@@ -1,5 +1,6 @@
 """Environments as models need them: made anew, their actions in a list, what they say held to what they declare."""
 
+import contextlib
 import importlib
 import itertools
 from collections.abc import Callable, Iterator
@@ -202,6 +203,20 @@ def _check_observation(space: spaces.Space, value: Any) -> None:
             _check_observation(part, content)
     elif isinstance(space, spaces.Discrete) and not space.contains(value):
         raise PgtsError(f"the observation is {value!r}, which is not in {space}")
+
+
+def as_declared(space: spaces.Space, value: Any) -> Any:
+    """An observation in the dtypes that its space declares, in which a policy sees it; what the space cannot hold stays
+    as it is."""
+    if isinstance(space, spaces.Dict) and isinstance(value, dict):
+        return {name: as_declared(space[name], part) if name in space.spaces else part for name, part in value.items()}
+    if isinstance(space, spaces.Tuple) and isinstance(value, tuple) and len(value) == len(space):
+        return tuple(map(as_declared, space, value))
+    if isinstance(space, spaces.Box):
+        with contextlib.suppress(PgtsError), np.errstate(over="ignore"):
+            _check_observation(space, value)
+            return np.asarray(value).astype(space.dtype)
+    return value
 
 
 def with_torques(env: gymnasium.Env, count: int = 5) -> gymnasium.Env:

@@ -112,8 +112,8 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
     """Try out whether an environment can serve as a `SimulatorModel`.
 
         answers     rewards and observations are finite and fit the spaces that the environment declares
-        restore     from a snapshot, the same actions and draws give the same observations, rewards and ends, bit for
-                    bit, in another instance that has been elsewhere since
+        restore     from a snapshot, the same actions and draws give the same observations (in the dtypes declared),
+                    rewards and ends, bit for bit, in another instance that has been elsewhere since
         merge       equal states have equal snapshots, so that a search can merge them
         chance      what follows is a function of state, action and key, and no generator is in a snapshot: a search
                     cannot foresee what the environment is about to draw
@@ -202,7 +202,9 @@ def why_not(setup: Setup, *, seconds: float = 0.4) -> str:
         _untouched(short, min(longest, _SHORT_LENGTH), width=max(1, min(_WIDTH, longest // _WIDTH)))
     except _Missing as missing:
         return str(missing)
-    except (Exception, SystemExit):
+    except KeyboardInterrupt:
+        raise
+    except BaseException:
         return ""
     return ""
 

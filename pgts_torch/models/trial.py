@@ -149,9 +149,9 @@ def _walk(
                 taken += 1
                 if terminated or truncated or time.monotonic() > until:
                     break
-    except _NoState:
+    except (_NoState, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit):
+    except BaseException:
         return
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from pgts_torch.models.environments import as_declared
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter
 from pgts_torch.models.steps import number_of
@@ -88,7 +89,7 @@ def walk_on(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
     seen, states = [], []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
-        seen.append(bits((observation, number_of("reward", reward), bool(terminated), bool(truncated))))
+        seen.append(_seen(env, observation, reward, terminated, truncated))
         states.append(setup.adapter.get_state(env).key)
         if terminated or truncated:
             break
@@ -98,6 +99,12 @@ def walk_on(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
 def again(setup: Setup, env: Any, walk: Walk) -> Walk:
     setup.adapter.set_state(env, walk.start.data)
     return walk_on(setup, env, walk.key, walk.actions)
+
+
+def _seen(env: gymnasium.Env, observation: Any, reward: Any, terminated: Any, truncated: Any) -> bytes:
+    """A step as an agent sees it, to the bit."""
+    shown = as_declared(env.observation_space, observation)
+    return bits((shown, number_of("reward", reward), bool(terminated), bool(truncated)))
 
 
 def bits(value: Any) -> bytes:
@@ -135,7 +142,7 @@ def live(env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
     seen = []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
-        seen.append(bits((observation, number_of("reward", reward), terminated, truncated)))
+        seen.append(_seen(env, observation, reward, terminated, truncated))
         if terminated or truncated:
-            seen.append(bits(env.reset()[0]))
+            seen.append(bits(as_declared(env.observation_space, env.reset()[0])))
     return seen

@@ -7,7 +7,7 @@ from typing import Any, final
 import torch
 from torch import Tensor
 
-from pgts_torch.errors import NodeBudgetExceeded, PgtsError, RandomOutcomes
+from pgts_torch.errors import MemoryBudgetExceeded, NodeBudgetExceeded, PgtsError, RandomOutcomes
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.engine import SampledSearch, Search
 from pgts_torch.search.expectimax import expectimax
@@ -95,15 +95,16 @@ class AutoSearch(Search):
             try:
                 narrow = look(self._width)
                 break
-            except NodeBudgetExceeded:
-                # What was found before, or by this attempt, takes memory too; the next one begins without it.
-                calls_left_behind += topology.model_calls - calls_before
-                is_full = topology.num_expanded > 0
-                topology = self.topology = topology.anew()
-                calls_before = 0
-                if is_full and not begun_anew:
-                    begun_anew = True
-                    continue
+            except NodeBudgetExceeded as error:
+                if isinstance(error, MemoryBudgetExceeded):
+                    # What was found before, or by this attempt, takes memory too; the next one begins without it.
+                    calls_left_behind += topology.model_calls - calls_before
+                    is_full = topology.num_expanded > 0
+                    topology = self.topology = topology.anew()
+                    calls_before = 0
+                    if is_full and not begun_anew:
+                        begun_anew = True
+                        continue
                 if self._width == 1:
                     raise
                 self._width //= 2

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from pgts_torch.errors import NodeBudgetExceeded
+from pgts_torch.errors import MemoryBudgetExceeded
 
 GROWTH = 1.5
 """By how much a table that is full becomes longer."""
@@ -91,9 +91,9 @@ def search_bytes(
 
 
 def check_memory(needed: int, most: int, what: str) -> None:
-    """NodeBudgetExceeded if a search would take more than that."""
+    """MemoryBudgetExceeded if a search would take more than that."""
     if needed > most:
-        raise NodeBudgetExceeded(
+        raise MemoryBudgetExceeded(
             f"{what} would take up to {gib(needed)}; the limit is {gib(most)}: set a smaller depth or max_width, fewer "
             "simulations, samples or environments, or a larger max_bytes"
         )

@@ -120,7 +120,7 @@ def test_an_id_that_names_its_module_is_imported_from_there(tmp_path, monkeypatc
     model = PGTS("fields_of_mine:Field-v0", **SHORT, actions_per_dimension=2)
     assert model.iterate().experience.num_steps == 10
     model.save(tmp_path / "model.pt")
-    assert PGTS.load(tmp_path / "model.pt").num_env_steps == 10
+    assert PGTS.load(tmp_path / "model.pt", trust_imports=True).num_env_steps == 10
     with pytest.raises(PgtsError, match="nothing_of_mine:Field-v0 cannot be made: No module named"):
         PGTS("nothing_of_mine:Field-v0")
 

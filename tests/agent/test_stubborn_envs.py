@@ -7,11 +7,12 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 
 from pgts_torch import PGTS, evaluate
 from pgts_torch.agent.policies import SoftmaxPolicy
 from pgts_torch.agent.rollout import FixedHorizon, simulated_returns
-from pgts_torch.errors import Failed, NotFinite, PgtsError
+from pgts_torch.errors import Failed, MissingModel, NotFinite, PgtsError
 from pgts_torch.experiment.cli import main
 from pgts_torch.models import check_model
 from pgts_torch.models.tensor import TensorModel
@@ -71,6 +72,8 @@ def test_ctrl_c_is_the_users_wherever_it_comes():
     for where in ("step", "reset", "__init__"):
         with pytest.raises(KeyboardInterrupt):
             make(raising(KeyboardInterrupt(), where)).iterate()
+    with pytest.raises(KeyboardInterrupt):
+        make(raising(KeyboardInterrupt(), "set_state"), **LOOKAHEAD)
 
 
 @pytest.mark.fault("environment leaves the process, or raises what cannot be printed")
@@ -107,7 +110,9 @@ def test_an_error_in_close_is_a_warning():
 
 
 class Restored(Clock):
-    """Shows something else once its state was restored."""
+    """Shows something else once its state was restored; not yet while it is tried out, if `patient`."""
+
+    patient: ClassVar[bool] = False
 
     def set_state(self, state):
         super().set_state(state)
@@ -115,7 +120,8 @@ class Restored(Clock):
 
     def step(self, action):
         observation, *rest = super().step(action)
-        return type(self).show(observation) if getattr(self, "restored", False) else observation, *rest
+        changed = getattr(self, "restored", False) and not self.patient
+        return type(self).show(observation) if changed else observation, *rest
 
 
 CHANGES = {
@@ -134,9 +140,18 @@ CHANGES = {
     "search", ["expectimax", {"type": "sampled", "samples": 2}, {"type": "mcts", "simulations": 4}]
 )
 def test_an_observation_of_another_shape_or_dtype_inside_the_lookahead_is_refused(message, search):
-    env = type("Changed", (Restored,), {"show": staticmethod(CHANGES[message])})
+    env = type("Changed", (Restored,), {"show": staticmethod(CHANGES[message]), "patient": True})
+    model = make(env, **LOOKAHEAD, search=search)
+    env.patient = False
     with pytest.raises(Failed, match=rf"Changed failed in state \d+ under action \d .* with key .*: {message}"):
-        make(env, **LOOKAHEAD, search=search).iterate()
+        model.iterate()
+
+
+@pytest.mark.parametrize("message", CHANGES)
+def test_an_observation_that_changes_at_once_is_refused_where_the_simulator_is_tried_out(message):
+    env = type("Changed", (Restored,), {"show": staticmethod(CHANGES[message])})
+    with pytest.raises(MissingModel, match="Changed cannot serve as a model: a restored state goes on differently"):
+        make(env, **LOOKAHEAD)
 
 
 def test_numbers_that_a_space_can_hold_are_no_other_dtype():
@@ -144,6 +159,26 @@ def test_numbers_that_a_space_can_hold_are_no_other_dtype():
         same = type("Same", (Restored,), {"show": staticmethod(lambda o, dtype=dtype: o.astype(dtype))})
         ours, clean = make(same, **LOOKAHEAD), make(Clock, **LOOKAHEAD)
         assert torch.equal(ours.iterate().look.q_BA, clean.iterate().look.q_BA)
+
+
+class Parts(Restored):
+    """Shows its time twice, with parts of its own dtype or value once its state was restored."""
+
+    observation_space = spaces.Dict(at=Clock.observation_space, two=spaces.Tuple([Clock.observation_space]))
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        return {"at": observation, "two": (observation,)}, info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return {"at": observation, "two": (observation,)}, *rest
+
+
+@pytest.mark.parametrize(("added", "usable"), [(0.0, True), (1e-12, True), (0.5, False)])
+def test_parts_of_an_observation_are_compared_as_a_policy_sees_them(added, usable):
+    env = type("Parts", (Parts,), {"show": staticmethod(lambda o: o.astype(np.float64) + added)})
+    assert check_model(env, continuations=3, length=4).usable is usable
 
 
 # Grad that was switched off
