@@ -180,15 +180,16 @@ class TabularCritic(Critic):
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
         """Move every visited cell toward the mean of its targets; returns the mean squared error before."""
         self._policy = policy
+        value_C = self._value_C
         if self.initial == "mean":
-            self._value_C = torch.where(self._count_C > 0, self._value_C, self._mean_target(rollout))
-        target_TB = self._targets(rollout, self.v)[rollout.alive_TB]
+            value_C = torch.where(self._count_C > 0, value_C, self._mean_target(rollout))
+        target_TB = self._targets(rollout, partial(self._read, value_C))[rollout.alive_TB]
         check_targets(target_TB)
         cell_TB = rollout.state_TB
         if self.target == "q":
             cell_TB = cell_TB * self.num_actions + rollout.action_TB
         cell_V = cell_TB[rollout.alive_TB]
-        loss = float((target_TB - self._value_C[cell_V]).square().mean())
+        loss = float((target_TB - value_C[cell_V]).square().mean())
         ones_V = torch.ones_like(target_TB)
         count_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, ones_V)
         sum_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, target_TB)
@@ -196,7 +197,7 @@ class TabularCritic(Critic):
         alpha_C = count_C / self._count_C.clamp(min=1) if self.step_size == "mean" else self.step_size
         seen_C = count_C > 0
         mean_C = sum_C / count_C.clamp(min=1)
-        self._value_C = torch.where(seen_C, self._value_C + alpha_C * (mean_C - self._value_C), self._value_C)
+        self._value_C = torch.where(seen_C, value_C + alpha_C * (mean_C - value_C), value_C)
         return {"value": loss}
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:

@@ -161,7 +161,7 @@ class SimplexPolicy(TabularPolicy):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         probs_SA = fitting(state, "probs_SA", self.probs_SA)
-        if bool((probs_SA < 0).any() or ((probs_SA.sum(-1) - 1).abs() > 1e-6).any()):
+        if not bool((probs_SA >= 0).all() and ((probs_SA.sum(-1) - 1).abs() <= 1e-6).all()):
             raise PgtsError("probs_SA has rows that are no distributions")
         self.probs_SA = probs_SA
 

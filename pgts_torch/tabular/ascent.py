@@ -65,14 +65,19 @@ def centred(q_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"], *, rounding
     The largest value of a state is taken off first. So actions of equal values have advantages of exactly 0, the
     rounding is that of the differences and not of q, and q times 2^k gives exactly 2^k times the advantages.
 
+    The average is that of the policy given that it takes an allowed action, one with q > -inf.
+
     Args:
-        q_NA: (T^m Q)(s, .); -inf where an action is not allowed, whose probability must be 0.
+        q_NA: (T^m Q)(s, .); -inf where an action is not allowed, and so is its advantage.
         pi_NA: the policy.
         rounding: advantages of at most this size are 0.
     """
     below_NA = q_NA - q_NA.amax(-1, keepdim=True)
-    share_NA = torch.where(pi_NA > 0, pi_NA * below_NA, 0.0)
-    advantage_NA = below_NA - share_NA.sum(-1, keepdim=True)
+    allowed_NA = below_NA > -math.inf
+    share_N1 = torch.where(allowed_NA & (pi_NA > 0), pi_NA * below_NA, 0.0).sum(-1, keepdim=True)
+    mass_N1 = torch.where(allowed_NA, pi_NA, 0.0).sum(-1, keepdim=True)
+    is_part_N1 = (~allowed_NA & (pi_NA > 0)).any(-1, keepdim=True) & (mass_N1 > 0)
+    advantage_NA = below_NA - torch.where(is_part_N1, share_N1 / mass_N1, share_N1)
     return torch.where(advantage_NA.abs() > rounding, advantage_NA, 0.0)
 
 
@@ -84,13 +89,14 @@ def normalised(
         A(s, a) / max(noise, sqrt(mean_s sum_a pi(a|s) A(s, a)^2))
 
     0 where all are 0. The largest |A| is divided by first, so that squares neither overflow nor vanish, and a factor of
-    2^k on advantages and noise changes no bit.
+    2^k on advantages and noise changes no bit. Actions that are not allowed stay at -inf and do not count.
     """
-    largest = advantage_NA[advantage_NA.isfinite()].abs().amax()
+    allowed_NA = advantage_NA > -math.inf
+    largest = advantage_NA[allowed_NA].abs().amax()
     if not largest > 0:
-        return torch.zeros_like(advantage_NA)
+        return advantage_NA
     unit_NA = advantage_NA / largest
-    square_NA = torch.where(pi_NA > 0, pi_NA * unit_NA.square(), 0.0)
+    square_NA = torch.where(allowed_NA & (pi_NA > 0), pi_NA * unit_NA.square(), 0.0)
     size = square_NA.sum(-1).mean().sqrt().clamp(min=float(noise / largest))
     return unit_NA / torch.where(size > 0, size, 1.0)  # 0: only actions that the policy never takes are better
 

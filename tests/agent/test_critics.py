@@ -16,7 +16,7 @@ from pgts_torch.agent.critics import (
     lambda_returns,
 )
 from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Rollout
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models import TabularModel
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder, random_mdp
@@ -140,8 +140,7 @@ def test_tabular_critics_converge_to_the_values_of_a_policy_that_stands_still(ta
 def test_a_terminal_outcome_is_not_bootstrapped(method):
     mdp = deep_sea(3, gamma=0.9, stochastic=True)
     pi_SA = right_with(*[0.9] * 9)
-    critic = TabularCritic(9, 2, method=method, step_size="mean")
-    critic.load_state_dict({"value_C": torch.full((9,), 100.0), "count_C": torch.zeros(9)})
+    critic = TabularCritic(9, 2, method=method, step_size="mean", initial=100.0)
     for seed in range(5):
         fit(critic, mdp, pi_SA, FixedHorizon(3), episodes=2000, seed=seed)
     last_row = torch.tensor([6, 7, 8])
@@ -212,12 +211,23 @@ def test_a_step_moves_each_value_by_its_share_toward_the_mean_of_its_targets():
     made = by_hand()
     critic = TabularCritic(4, 1, method=TDLambda(0.0), step_size=0.25, initial=0.0)
     value_S = torch.tensor([8.0, 10.0, 10.0, 10.0], dtype=torch.float64)
-    critic.load_state_dict({"value_C": value_S, "count_C": torch.zeros(4)})
+    critic.load_state_dict({"value_C": value_S, "count_C": torch.zeros(4, dtype=torch.float64)})
     loss = critic.fit(following(torch.ones(4, 1, dtype=torch.float64)), made, generator=stream(0, "critic"))
     # Targets: 6 at state 0, 7 at state 1, 9 and 4 at state 2 (the third episode was over by then).
     expected_S = torch.tensor([8 - 0.25 * 2, 10 - 0.25 * 3, 10 - 0.25 * 3.5, 10.0], dtype=torch.float64)
     torch.testing.assert_close(critic.v(torch.arange(4)), expected_S)
     assert loss["value"] == pytest.approx((3 * 2**2 + 3 * 3**2 + 1**2 + 6**2) / 8)
+
+
+@pytest.mark.parametrize("initial", [0.0, "mean"])
+def test_targets_that_are_not_finite_leave_the_table_as_it_is(initial):
+    made = by_hand()
+    critic = TabularCritic(4, 1, initial=initial)
+    before = critic.state_dict()
+    spoiled = replace(made, reward_TB=made.reward_TB + math.nan)
+    with pytest.raises(NotFinite):
+        critic.fit(following(torch.ones(4, 1, dtype=torch.float64)), spoiled, generator=stream(0, "critic"))
+    assert all(torch.equal(value, before[name]) for name, value in critic.state_dict().items())
 
 
 def test_a_q_critic_answers_v_as_the_mean_over_the_policy():

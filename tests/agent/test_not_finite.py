@@ -18,7 +18,7 @@ from pgts_torch.agent.optimisers import Optimiser
 from pgts_torch.agent.policies import Biased, SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import NotFinite
+from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.seeding import stream
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -102,8 +102,8 @@ def in_values(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
 def in_targets(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
     targets = model.critic._targets
 
-    def wrapped(rollout):
-        answer = targets(rollout)
+    def wrapped(*args):
+        answer = targets(*args)
         answer = answer[-1] if isinstance(answer, tuple) else answer
         answer = torch.full_like(answer, value)
         return (answer, answer) if "Network" in type(model.critic).__name__ else answer
@@ -129,9 +129,9 @@ def in_logits(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
 
 
 def in_parameters(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
-    state = model.policy.state_dict()
-    state[list(state)[-1]].view(-1)[:] = value
-    model.policy.load_state_dict(state)
+    """In the table itself: a saved one with such numbers may be refused."""
+    name = "logits_SA" if isinstance(model.policy, SoftmaxPolicy) else "probs_SA"
+    getattr(model.policy, name)[:] = value
 
 
 def in_losses(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
@@ -237,13 +237,30 @@ def test_a_direction_that_overflows_leaves_the_table_as_it_is():
     assert torch.equal(policy.table(), before)
 
 
-def test_an_action_that_is_not_allowed_may_be_worth_minus_infinity():
-    policy, states, weight_N = SoftmaxPolicy(3, 2), torch.tensor([1]), torch.ones(1, dtype=torch.float64)
-    advantage_NA = torch.tensor([[0.0, -math.inf]], dtype=torch.float64)
-    MirrorUpdate(1.0)(policy, states, advantage_NA, weight_N, generator=stream(0, "update"))
-    assert policy.table()[1].tolist() == [1.0, 0.0]
-    with pytest.raises(NotFinite, match=r"the step along the advantages of state 1 is \[-inf, -inf\]"):
+@pytest.mark.parametrize("make", [SoftmaxPolicy, SimplexPolicy])
+@pytest.mark.parametrize("options", [{}, {"normalize": "none"}, {"floor": None}, {"normalize": "none", "floor": None}])
+def test_an_action_that_is_not_allowed_may_be_worth_minus_infinity(make, options):
+    policy, states, weight_N = make(4, 3), torch.tensor([1, 2]), torch.ones(2, dtype=torch.float64)
+    advantage_NA = torch.tensor([[0.0, -math.inf, -math.inf], [1.0, -1.0, -math.inf]], dtype=torch.float64)
+    MirrorUpdate(1.0, **options)(policy, states, advantage_NA, weight_N, generator=stream(0, "update"))
+    assert policy.table()[1].tolist() == [1.0, 0.0, 0.0]
+    # State 2: pi is (1/2, 1/2) on what is allowed. The mean over both states of sum_a pi A^2, pi = 1/3, is 1/3.
+    size = 1.0 if "normalize" in options else math.sqrt(1 / 3)
+    better = 1 / (1 + math.exp(-2 / size))
+    assert policy.table()[2].tolist() == pytest.approx([better, 1 - better, 0.0], abs=1e-12)
+    assert torch.equal(policy.table()[[0, 3]], make(4, 3).table()[[0, 3]])
+    with pytest.raises(NotFinite, match=r"the step along the advantages of state 1 is \[-inf, -inf, -inf\]"):
         MirrorUpdate(1.0)(policy, states, advantage_NA.fill_(-math.inf), weight_N, generator=stream(0, "update"))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_saved_probabilities_that_are_not_finite_are_refused(value):
+    policy = SimplexPolicy(3, 2)
+    spoiled_SA = policy.table()
+    spoiled_SA[1, 0] = value
+    with pytest.raises(PgtsError, match="probs_SA has rows that are no distributions"):
+        policy.load_state_dict({"probs_SA": spoiled_SA})
+    assert torch.equal(policy.table(), SimplexPolicy(3, 2).table())
 
 
 @pytest.mark.fault("step that overflows")
