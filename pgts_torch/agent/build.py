@@ -29,7 +29,7 @@ from pgts_torch.tabular.exact import check_depth
 Description = str | Mapping[str, Any]
 
 DEFAULT_MAX_DEPTH = 64
-DEFAULT_TOLERANCE = 0.05
+DEFAULT_TOLERANCE = 0.7
 
 _Choices = Mapping[str, Callable[..., Any]]
 

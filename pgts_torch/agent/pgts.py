@@ -88,7 +88,7 @@ class PGTS:
             from stationary, because then it deserves no deeper look: sum_s d(s) g_m(s) >
             tolerance * sum_s d(s) (v_hat(s) - v(s)), where v_hat >= v* is that of the certificate.
         max_depth: the largest m of an adaptive depth (default 64).
-        tolerance: which share of what may be missing to J* a lookahead must see to be deep enough (default 0.05).
+        tolerance: which share of what may be missing to J* a lookahead must see to be deep enough (default 0.7).
         stop_at: `learn` ends, with the policy in question, once the certificate says J* - J^pi <= stop_at. That is a
             proof only where `certificates.trust` says so. Default: never.
         search: how the lookahead is made (`search.engine`): "auto", {"type": "sampled", "samples": 8}, ...

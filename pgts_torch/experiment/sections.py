@@ -324,14 +324,14 @@ class SearchConfig(Section):
 
     depth: Natural | Literal["adaptive"] = 4
     """m, how often the Bellman optimality operator is applied; 0 is plain policy gradient. adaptive: in each iteration
-    the smallest m at which the policy is not stationary."""
+    the smallest m that sees most of what may be missing, see tolerance."""
 
     max_depth: Natural | None = None
     """The largest adaptive depth; null: 64. Only with search.depth adaptive."""
 
     tolerance: NonNegative | None = None
     """An adaptive depth is enough if the gap that it sees, summed over the occupancy, is more than this share of
-    what may be missing at the visited states; null: 0.05. Only with search.depth adaptive."""
+    what may be missing at the visited states; null: 0.7. Only with search.depth adaptive."""
 
     stop_at: NonNegative | None = None
     """Training ends once the certificate says that the policy is this close to the optimal return; null: never. It is a

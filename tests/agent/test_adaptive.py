@@ -23,10 +23,19 @@ def optimality_gap(model):
     return exact.optimal(model.mdp).J - exact.evaluate(model.mdp, model.policy.table()).J
 
 
-def test_an_adaptive_depth_is_the_smallest_at_which_always_left_is_not_stationary():
-    model = always_left(depth="adaptive")
+def test_a_small_tolerance_takes_the_smallest_depth_at_which_always_left_is_not_stationary():
+    model = always_left(depth="adaptive", tolerance=0.05)
     left_SA = model.policy.table()
     assert model.iterate().depth == stationary.escape_depth(model.mdp, left_SA) == 8
+
+
+def test_by_default_an_adaptive_depth_is_the_first_that_sees_most_of_what_is_missing():
+    model = always_left(depth="adaptive")
+    missing_S = exact.optimal(model.mdp).v_S - exact.evaluate(model.mdp, model.policy.table()).v_S
+    iteration = model.iterate()
+    seen = {m: float(stationary.gap(model.mdp, always_left(depth=m).policy.table(), m)[0]) for m in (18, 19)}
+    assert seen[18] <= 0.7 * float(missing_S[0]) < seen[19]
+    assert iteration.depth == 19
 
 
 def test_an_adaptive_depth_goes_no_deeper_than_its_maximum():
@@ -37,9 +46,7 @@ def test_an_adaptive_depth_goes_no_deeper_than_its_maximum():
 
 
 def test_an_adaptive_depth_stays_shallow_where_there_is_a_slope():
-    model = PGTS(
-        "pgts/Random-v0", depth="adaptive", critic=EXACT, num_envs=4, update={"type": "mirror", "step_size": 0.1}
-    )
+    model = PGTS("pgts/Random-v0", depth="adaptive", tolerance=0.05, critic=EXACT, num_envs=4, update="mirror")
     assert model.iterate().depth == 0
 
 
