@@ -33,7 +33,7 @@ from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.ownership import SUMMARY_FILE
 from pgts_torch.experiment.schema import Schema
-from pgts_torch.experiment.terminal import tell, telling
+from pgts_torch.experiment.terminal import plain_warnings, tell, telling
 from pgts_torch.trust import check_imports
 
 CHECK_FAILED = TRAINING_FAILED = 1
@@ -58,7 +58,7 @@ def main(arguments: Arguments | None = None) -> int:
         was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C, 143
         after SIGTERM, 129 after SIGHUP.
     """
-    with telling():
+    with telling(), plain_warnings():
         return _main(sys.argv[1:] if arguments is None else arguments)
 
 

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pgts_torch.experiment.terminal import Telling
 from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.tabular import TabularMDP
 from tests.experiment.test_surroundings import started
+from tests.forks import PATIENCE
 
 SHORT = ["--total_steps=15", "--rollout.num_envs=1", "--rollout.horizon.length=5", "--eval.episodes=1"]
 BARE = [*SHORT, "--search.depth=0", "--run.tensorboard=false", "--run.dir=run"]
@@ -122,3 +124,23 @@ def test_a_sweep_names_a_damaged_summary(content, tmp_path, monkeypatch, capsys)
     assert main(["sweep", "--out=out", "--depths=0", "--seeds=1", *SHORT]) == 2
     assert "error: out/depth-0/seed-0/summary.json is damaged (" in capsys.readouterr().err
     assert (folder / "summary.json").read_text() == content
+
+
+WARNS = """
+import warnings
+from pgts_torch.experiment.cli import COMMANDS, main
+
+def warns(arguments):
+    warnings.warn("the table is odd")
+    warnings.warn("of another kind", RuntimeWarning)
+
+COMMANDS["train"] = warns
+main(["train"])
+"""
+
+
+def test_a_warning_on_the_command_line_is_one_line_without_its_place_in_the_code():
+    done = subprocess.run([sys.executable, "-c", WARNS], capture_output=True, text=True, timeout=PATIENCE)
+    first, second, *_ = done.stderr.splitlines()
+    assert first == "warning: the table is odd"
+    assert second == "<string>:7: RuntimeWarning: of another kind"
