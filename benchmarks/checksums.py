@@ -4,7 +4,7 @@
     python benchmarks/checksums.py --against before.txt
 
 Each training makes a few short iterations. Its checksum is over the parameters of the policy and, for each iteration,
-the steps, the model calls, the losses and the certificate; names of anything are not in it. With --against the exit
+the advantages, steps, model calls, losses and the certificate; names of anything are not in it. With --against the exit
 code is 1 where a line differs.
 """
 
@@ -28,7 +28,7 @@ SHORT = ["--rollout.num_envs", "4", "--rollout.horizon", "{type: fixed, length: 
 ADAPTIVE = ["--search.depth", "adaptive", "--search.max_depth", "6"]
 
 VARIANTS: dict[str, list[str]] = {
-    "defaults, FrozenLake": ["--env.id", "FrozenLake-v1"],
+    "defaults, Taxi": ["--env.id", "Taxi-v4"],
     "defaults, adaptive": ["--env.id", "pgts/RiverSwim-v0", *ADAPTIVE],
     "defaults, CartPole": ["--env.id", "CartPole-v1", "--search.depth", "2"],
     "adaptive, CartPole": ["--env.id", "CartPole-v1", "--search.depth", "adaptive", "--search.max_depth", "2"],
@@ -45,9 +45,9 @@ VARIANTS: dict[str, list[str]] = {
         "--update.type",
         "gradient",
     ],
-    "sampled": ["--env.id", "FrozenLake-v1", "--search.kind", "sampled", "--search.samples", "2"],
-    "MCTS": ["--env.id", "FrozenLake-v1", "--search.kind", "mcts", "--search.simulations", "16"],
-    "pruned": ["--env.id", "FrozenLake-v1", "--search.kind", "expectimax", "--search.max_width", "8"],
+    "sampled": ["--env.id", "Taxi-v4", "--search.kind", "sampled", "--search.samples", "2"],
+    "MCTS": ["--env.id", "Taxi-v4", "--search.kind", "mcts", "--search.simulations", "16"],
+    "pruned": ["--env.id", "Taxi-v4", "--search.kind", "expectimax", "--search.max_width", "8"],
     "exact critic": ["--env.id", "pgts/Tightrope-v0", "--critic.type", "exact", "--search.stop_at", "0.01"],
     "simplex table": ["--env.id", "pgts/Ladder-v0", "--policy.type", "simplex"],
 }
@@ -86,9 +86,14 @@ def _digest(path: Path | None, arguments: list[str]) -> str:
         seen = model.iterate()
         for number in (seen.experience.num_steps, seen.model_calls, seen.certificate, *sorted(seen.losses.values())):
             digest.update(repr(number).encode())
+        digest.update(_bytes(seen.advantage_NA))
     for tensor in _tensors(model.policy.state_dict()):
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        digest.update(_bytes(tensor))
     return digest.hexdigest()[:16]
+
+
+def _bytes(tensor: Tensor) -> bytes:
+    return tensor.detach().cpu().contiguous().numpy().tobytes()
 
 
 def _tensors(state: Any) -> Iterator[Tensor]:
