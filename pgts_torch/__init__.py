@@ -5,7 +5,7 @@ A tensor's name ends in its axes:
 T time, D features`.
 
 Importing this package registers the `pgts/` environments with Gymnasium and does not import torch; the names below
-are loaded when they are first asked for.
+are loaded when they are first used.
 """
 
 import importlib
@@ -44,7 +44,7 @@ def __dir__() -> list[str]:
 
 
 def _register_environments() -> None:
-    """Every environment in two forms, one copy and many; DeepSea ends by itself and has no time limit."""
+    """Every environment in two forms, one and many; DeepSea ends by itself and has no time limit."""
     for name, entry_point, max_episode_steps in [
         ("Ladder", "ladder", 100),
         ("Tightrope", "tightrope", 100),

@@ -98,7 +98,7 @@ class Outcomes:
         return product.view(self.reward_NA.shape)
 
     def rows(self, row_N: Int[Tensor, "N"]) -> Self:
-        """The outcomes of some of the states, in the order asked for."""
+        """The outcomes of some of the states, in the given order."""
         return type(self)(
             self.reward_NA[row_N],
             self.prob_NAK[row_N],

@@ -19,11 +19,11 @@ class MemoryBudgetExceeded(NodeBudgetExceeded):
 
 
 class MissingModel(PgtsError):
-    """An environment offers no model that a lookahead could ask."""
+    """An environment offers no model that a lookahead could query."""
 
 
 class RandomOutcomes(PgtsError):
-    """A model that lists outcomes where it is certain of them was asked where chance decides."""
+    """A model that enumerates outcomes only where it is certain of them was queried where chance decides."""
 
 
 class RankLost(PgtsError):

@@ -1,4 +1,4 @@
-"""The zoo as Gymnasium environments, one copy or thousands."""
+"""The zoo as Gymnasium environments, one environment or thousands."""
 
 from pgts_torch.envs.tabular import TabularEnv
 from pgts_torch.envs.vector import TabularVectorEnv

@@ -1,4 +1,4 @@
-"""What `gymnasium.make` and `gymnasium.make_vec` call: one environment, or many copies, for each MDP of the zoo."""
+"""What `gymnasium.make` and `gymnasium.make_vec` call: one environment, or many, for each MDP of the zoo."""
 
 import inspect
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Drawing outcomes and start states of a tabular MDP, for one copy or many at once."""
+"""Sampling outcomes and start states of a tabular MDP, for one environment or many at once."""
 
 from typing import final
 
@@ -32,7 +32,7 @@ class OutcomeSampler:
         self.start_cumulative_S = _distribution_function(mdp.start_S.numpy())
 
     def outcomes(self, random: np.random.Generator, pair_B: Int[np.ndarray, "B"]) -> Int[np.ndarray, "B"]:
-        """The position of one drawn outcome for each pair, by bisection: log2(K) rounds for all copies together.
+        """The position of one sampled outcome for each pair, by bisection: log2(K) rounds for all together.
 
         Nothing is drawn from `random` where K is 1.
         """
@@ -47,7 +47,7 @@ class OutcomeSampler:
         return outcome_B
 
     def starts(self, random: np.random.Generator, count: int) -> Int[np.ndarray, "count"]:
-        """`count` states drawn from the start distribution."""
+        """`count` states sampled from the start distribution."""
         return np.searchsorted(self.start_cumulative_S, random.random(count), side="right")
 
 

@@ -1,4 +1,4 @@
-"""One copy of a tabular MDP as a Gymnasium environment."""
+"""A tabular MDP as a Gymnasium environment."""
 
 from functools import cached_property
 from typing import Any, final
@@ -20,7 +20,7 @@ RENDER_FPS = 4
 class TabularEnv(gymnasium.Env):
     """A tabular MDP to act in: the observation is the state's number.
 
-    A step pays the reward of the drawn outcome. `info["discount"]` is its discount (`metadata["discounts"]`), and
+    A step pays the reward of the sampled outcome. `info["discount"]` is its discount (`metadata["discounts"]`), and
     `terminated` says that it is 0. There is no time limit inside; registration adds one as a wrapper.
 
     Args:
@@ -29,7 +29,7 @@ class TabularEnv(gymnasium.Env):
 
     Raises:
         PgtsError: the render mode, an action, or a state to start in does not exist.
-        ResetNeeded: a step or a picture is asked for before the first reset, or a step after the end of the episode.
+        ResetNeeded: `step` or `render` before the first reset, or `step` after the end of the episode.
     """
 
     metadata = {  # noqa: RUF012 (Gymnasium's type)
@@ -61,7 +61,7 @@ class TabularEnv(gymnasium.Env):
         self._ended = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
-        """Start an episode in a state drawn from the start distribution, or in `options["state"]`."""
+        """Start an episode in a state sampled from the start distribution, or in `options["state"]`."""
         super().reset(seed=seed)
         check_options(options, ("state",))
         given = (options or {}).get("state")

@@ -1,4 +1,4 @@
-"""Thousands of copies of a tabular MDP, stepped together."""
+"""Thousands of environments of one tabular MDP, stepped together."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -20,15 +20,15 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.tabular.mdp import TabularMDP
 
 MAX_FRAMES = 64
-"""Most copies that can be rendered: a frame is up to 0.75 MB."""
+"""Most environments that can be rendered: a frame is up to 0.75 MB."""
 
 
 @final
 class TabularVectorEnv(gymnasium.vector.VectorEnv):
-    """`num_envs` copies of one MDP that share one random generator; a step is a few array operations for all of them.
+    """`num_envs` environments of one MDP that share one random generator; a step is a few array operations for all.
 
-    Rewards and `info["discount"]` are those of `TabularEnv`. A copy is truncated when it has made `max_episode_steps`
-    steps. What then happens to a copy that is over is Gymnasium's `AutoresetMode`:
+    Rewards and `info["discount"]` are those of `TabularEnv`. An environment is truncated when it has made
+    `max_episode_steps` steps. What then happens to it is Gymnasium's `AutoresetMode`:
 
         NEXT_STEP   the next step starts a new episode instead of stepping: reward 0, its action ignored
         SAME_STEP   a new episode starts at once; the last state is in `info["final_obs"]`
@@ -39,14 +39,14 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
 
     Args:
         mdp: the MDP; kept as `mdp`.
-        num_envs: how many copies.
+        num_envs: how many environments.
         max_episode_steps: None is no limit.
         autoreset_mode: a mode or its value, for instance "SameStep".
         render_mode: "rgb_array" or None.
 
     Raises:
         PgtsError: an argument, an option, an action, or a state to start in cannot be used.
-        ResetNeeded: a step or a picture is asked for before the first reset, or in DISABLED mode a step of a copy that
+        ResetNeeded: `step` or `render` before the first reset, or in DISABLED mode a step of an environment that
             is over.
     """
 
@@ -65,7 +65,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
             raise PgtsError(f"max_episode_steps is {max_episode_steps}; it must be at least 1, or None for no limit")
         check_render_mode(render_mode, ["rgb_array"])
         if render_mode is not None and num_envs > MAX_FRAMES:
-            raise PgtsError(f"num_envs is {num_envs}; at most {MAX_FRAMES} copies can be rendered")
+            raise PgtsError(f"num_envs is {num_envs}; at most {MAX_FRAMES} environments can be rendered")
         self.mdp = mdp
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
@@ -90,12 +90,12 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Int[np.ndarray, "B"], dict[str, Any]]:
-        """Start new episodes in all copies, or in some.
+        """Start new episodes in all environments, or in some.
 
         Args:
             seed: of the one generator; num_envs integers together seed it as well.
-            options: `reset_mask` [B]: which copies, default all. `state`: where they start, one state or one a copy
-                (of which those of the mask are used), default drawn from the start distribution.
+            options: `reset_mask` [B]: which environments, default all. `state`: where they start, one state or one
+                for each (of which those of the mask are used), default sampled from the start distribution.
         """
         check_options(options, ("reset_mask", "state"))
         options = options or {}
@@ -115,7 +115,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         Bool[np.ndarray, "B"],
         dict[str, Any],
     ]:
-        """Draw one outcome for every copy: states, rewards, terminated, truncated, info, each of shape [B]."""
+        """Sample one outcome for every environment: states, rewards, terminated, truncated, info, each of shape [B]."""
         action_B = self._check_actions(actions)
         self._check_ready()
         pair_B = self._state_B * self.mdp.num_actions + action_B
@@ -138,7 +138,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         return self._state_B.copy(), reward_B, terminated_B, truncated_B, info
 
     def render(self) -> tuple[RenderFrame, ...]:
-        """A picture [height, width, 3] of each copy."""
+        """A picture [height, width, 3] of each environment."""
         if self.render_mode is None:
             raise PgtsError("render_mode is None; give render_mode='rgb_array' to gymnasium.make_vec")
         if not self._was_reset:
@@ -180,7 +180,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
             raise ResetNeeded("Cannot call env.step() before calling env.reset()")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._over_B.any():
             raise ResetNeeded(
-                f"the episode of copy {int(self._over_B.argmax())} is over; "
+                f"the episode of environment {int(self._over_B.argmax())} is over; "
                 f"reset it with env.reset(options={{'reset_mask': mask}}) before the next env.step()"
             )
 
@@ -192,8 +192,8 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
             )
         last = self.mdp.num_actions - 1
         if action_B.min() < 0 or action_B.max() > last:
-            copy = int(((action_B < 0) | (action_B > last)).argmax())
-            raise PgtsError(f"action {action_B[copy]} of copy {copy} does not exist; actions are 0 to {last}")
+            index = int(((action_B < 0) | (action_B > last)).argmax())
+            raise PgtsError(f"action {action_B[index]} of environment {index} does not exist; actions are 0 to {last}")
         return action_B
 
     def _check_mask(self, mask: Any) -> Bool[np.ndarray, "B"]:
@@ -203,10 +203,10 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         if mask_B.shape != (self.num_envs,) or mask_B.dtype != np.bool_ or not mask_B.any():
             raise PgtsError(
                 f"reset_mask has shape {mask_B.shape} and dtype {mask_B.dtype} and names {np.count_nonzero(mask_B)} "
-                f"copies; it must be {self.num_envs} booleans that name at least one"
+                f"environments; it must be {self.num_envs} booleans that name at least one"
             )
         if not self._was_reset and not mask_B.all():
-            raise ResetNeeded("Cannot reset some copies before env.reset() has started all of them")
+            raise ResetNeeded("Cannot reset some environments before env.reset() has started all of them")
         return mask_B
 
     def _check_states(self, states: Any) -> Int[np.ndarray, "B"] | None:

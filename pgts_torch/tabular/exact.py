@@ -131,7 +131,7 @@ def optimal(mdp: TabularMDP) -> Optimum:
 def check_policy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S A"]:
     """pi in float64, its rows summing to 1 in that precision; PgtsError unless each row is a distribution."""
     if pi_SA.shape != (mdp.num_states, mdp.num_actions):
-        raise PgtsError(f"pi_SA has shape {tuple(pi_SA.shape)}; the MDP asks for {(mdp.num_states, mdp.num_actions)}")
+        raise PgtsError(f"pi_SA has shape {tuple(pi_SA.shape)}; the MDP needs {(mdp.num_states, mdp.num_actions)}")
     tolerance = 1e-9 if pi_SA.dtype == torch.float64 else 1e-5
     pi_SA = pi_SA.detach().to("cpu", torch.float64)
     bad_S = ~((pi_SA >= 0).all(-1) & ((pi_SA.sum(-1) - 1).abs() <= tolerance))

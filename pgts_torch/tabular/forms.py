@@ -183,7 +183,7 @@ def _rewards(R: Any, table: _Table, order: Order) -> tuple[Float[np.ndarray, "S 
         by_state = R if order == "SAS" else R.swapaxes(0, 1)
         return _expected(np.take_along_axis(by_state, table.child_SAK, axis=-1), table)
     raise PgtsError(
-        f"R_SA has shape {R.shape}; P_SAS asks for {(S, A)}, or {(S,)} where the action does not matter, or one reward "
+        f"R_SA has shape {R.shape}; P_SAS needs {(S, A)}, or {(S,)} where the action does not matter, or one reward "
         "for each entry of P"
     )
 

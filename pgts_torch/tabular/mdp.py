@@ -295,7 +295,7 @@ def _terminal_states(rows: list[list[_Row]], start_S: Tensor) -> set[int]:
 
 def _check_start(start_S: Tensor, num_states: int) -> None:
     if start_S.shape != (num_states,):
-        raise PgtsError(f"start_S has shape {tuple(start_S.shape)}; the MDP asks for ({num_states},)")
+        raise PgtsError(f"start_S has shape {tuple(start_S.shape)}; the MDP needs ({num_states},)")
     off = torch.nonzero(~torch.isfinite(start_S) | (start_S < 0)).flatten()
     if len(off):
         raise PgtsError(f"start_S[{off[0]}] is {start_S[off[0]]}; probabilities are finite and at least 0")
@@ -336,7 +336,7 @@ def _check_outcomes(outcomes: Outcomes) -> None:
         ("discount_NAK", outcomes.discount_NAK, (N, A, K)),
     ]:
         if tensor.shape != shape:
-            raise PgtsError(f"{name} has shape {tuple(tensor.shape)}; child_NAK asks for {shape}")
+            raise PgtsError(f"{name} has shape {tuple(tensor.shape)}; child_NAK needs {shape}")
         if tensor.dtype != torch.float64:
             raise PgtsError(f"{name} is {tensor.dtype}; the exact world is float64")
     _refuse(~torch.isfinite(reward), lambda s, a: f"R_SA[{s}, {a}] is {reward[s, a]}; rewards must be finite")

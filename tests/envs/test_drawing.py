@@ -148,7 +148,7 @@ def test_what_cannot_be_rendered_is_refused():
         TabularEnv(ladder(), render_mode="human")
     with pytest.raises(PgtsError, match=r"render_mode is 'ansi'; it must be None or one of \['rgb_array'\]"):
         TabularVectorEnv(ladder(), 2, render_mode="ansi")
-    with pytest.raises(PgtsError, match="num_envs is 65; at most 64 copies can be rendered"):
+    with pytest.raises(PgtsError, match="num_envs is 65; at most 64 environments can be rendered"):
         TabularVectorEnv(ladder(), 65, render_mode="rgb_array")
     for env, maker in [(TabularEnv(ladder()), "make"), (TabularVectorEnv(ladder()), "make_vec")]:
         with pytest.raises(PgtsError, match=f"render_mode is None; give render_mode=.* to gymnasium.{maker}$"):

@@ -175,7 +175,7 @@ def test_disabled_by_hand():
     state, _, terminated, _, info = envs.step([1, 0])
     assert (plain(state), plain(terminated)) == ([3, 2], [False, True])
     assert plain(info) == {"discount": [0.9, 0.0], "_discount": [True, True]}
-    with pytest.raises(ResetNeeded, match=r"the episode of copy 1 is over; reset it with env\.reset"):
+    with pytest.raises(ResetNeeded, match=r"the episode of environment 1 is over; reset it with env\.reset"):
         envs.step([1, 1])
     state, _ = envs.reset(options={"reset_mask": terminated})
     assert plain(state) == [3, 0]
@@ -258,7 +258,7 @@ def test_resetting_one_finished_copy_leaves_the_other_finished():
     envs.reset()
     envs.step([1, 1])
     envs.reset(options={"reset_mask": np.array([True, False])})
-    with pytest.raises(ResetNeeded, match="the episode of copy 1 is over"):
+    with pytest.raises(ResetNeeded, match="the episode of environment 1 is over"):
         envs.step([1, 1])
 
 
@@ -288,8 +288,8 @@ def test_a_wrong_argument_is_named(kwargs, message):
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        ([0, 2, 0], "action 2 of copy 1 does not exist; actions are 0 to 1"),
-        ([0, 1, -1], "action -1 of copy 2 does not exist; actions are 0 to 1"),
+        ([0, 2, 0], "action 2 of environment 1 does not exist; actions are 0 to 1"),
+        ([0, 1, -1], "action -1 of environment 2 does not exist; actions are 0 to 1"),
         ([0, 1], r"actions have shape \(2,\) and dtype int64; they must be 3 integers"),
         ([0.0, 1.0, 1.0], r"actions have shape \(3,\) and dtype float64; they must be 3 integers"),
     ],
@@ -310,9 +310,9 @@ def test_wrong_actions_are_named_and_move_nothing(actions, message):
         ({"state": [0, 1, -1]}, "state -1 does not exist; states are 0 to 4"),
         ({"state": [0, 1]}, r"option state has shape \(2,\) and dtype int64; it must be an integer or 3 integers"),
         ({"state": 1.0}, r"option state has shape \(\) and dtype float64; it must be an integer or 3 integers"),
-        ({"reset_mask": [True, False]}, r"reset_mask has shape \(2,\) and dtype bool and names 1 copies"),
-        ({"reset_mask": [1, 0, 0]}, r"reset_mask has shape \(3,\) and dtype int64 and names 1 copies"),
-        ({"reset_mask": [False] * 3}, "names 0 copies; it must be 3 booleans that name at least one"),
+        ({"reset_mask": [True, False]}, r"reset_mask has shape \(2,\) and dtype bool and names 1 environments"),
+        ({"reset_mask": [1, 0, 0]}, r"reset_mask has shape \(3,\) and dtype int64 and names 1 environments"),
+        ({"reset_mask": [False] * 3}, "names 0 environments; it must be 3 booleans that name at least one"),
     ],
 )
 def test_wrong_reset_options_are_named(options, message):
@@ -329,5 +329,7 @@ def test_a_wrong_list_of_seeds_is_named(seed):
 
 
 def test_some_copies_cannot_be_reset_before_all_were():
-    with pytest.raises(ResetNeeded, match=r"Cannot reset some copies before env.reset\(\) has started all of them"):
+    with pytest.raises(
+        ResetNeeded, match=r"Cannot reset some environments before env.reset\(\) has started all of them"
+    ):
         TabularVectorEnv(ladder(), 2).reset(options={"reset_mask": np.array([True, False])})

@@ -444,7 +444,7 @@ def test_a_policy_that_is_no_distribution_is_refused_with_its_first_bad_row(row)
 
 @pytest.mark.parametrize("shape", [(4, 2), (5, 3)])
 def test_a_policy_of_another_shape_is_refused(shape):
-    with pytest.raises(PgtsError, match=rf"pi_SA has shape \({shape[0]}, {shape[1]}\); the MDP asks for \(5, 2\)"):
+    with pytest.raises(PgtsError, match=rf"pi_SA has shape \({shape[0]}, {shape[1]}\); the MDP needs \(5, 2\)"):
         exact.evaluate(zoo("ladder"), torch.full(shape, 1 / shape[1], dtype=torch.float64))
 
 

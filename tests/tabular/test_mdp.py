@@ -298,7 +298,7 @@ def test_a_bad_table_is_refused_with_its_first_bad_state_and_action(field, value
 def test_a_table_of_another_shape_is_refused_by_name(field):
     table = a_valid_table()
     table[field] = table[field][:2]
-    with pytest.raises(PgtsError, match=rf"{field} has shape \(2, .*child_NAK asks for \(3, "):
+    with pytest.raises(PgtsError, match=rf"{field} has shape \(2, .*child_NAK needs \(3, "):
         mdp_of(table)
 
 
@@ -328,7 +328,7 @@ def test_outcomes_that_point_into_another_table_are_refused():
 @pytest.mark.parametrize(
     ("start", "message"),
     [
-        ([0.5, 0.5], r"start_S has shape \(2,\); the MDP asks for \(3,\)"),
+        ([0.5, 0.5], r"start_S has shape \(2,\); the MDP needs \(3,\)"),
         ([0.5, 0.6, 0.0], "start_S is not a distribution: it sums to 1.1"),
         ([0.5, -0.5, 1.0], r"start_S\[1\] is -0.5"),
         ([0.5, 0.5, float("nan")], r"start_S\[2\] is nan"),
@@ -375,7 +375,7 @@ def test_bad_dense_probabilities_are_refused_with_their_place_and_value(entry, v
         ((3, 3), (3, 2), r"P_SAS has shape \(3, 3\)"),
         ((0, 2, 0), (0, 2), "at least one state and one action"),
         ((3, 0, 3), (3, 0), "at least one state and one action"),
-        ((3, 2, 3), (2, 3), r"R_SA has shape \(2, 3\); P_SAS asks for \(3, 2\)"),
+        ((3, 2, 3), (2, 3), r"R_SA has shape \(2, 3\); P_SAS needs \(3, 2\)"),
     ],
 )
 def test_dense_arrays_of_wrong_shape_are_refused(P_shape, R_shape, message):
