@@ -115,6 +115,47 @@ def test_an_import_from_an_earlier_room_is_allowed(module, source):
     assert wrong_imports(ast.parse(source), module) == []
 
 
+def import_circles(trees: dict[str, ast.Module], packages: set[str]) -> list[set[str]]:
+    """The sets of modules that import each other, at the top or within functions. Names that a package offers count as
+    imports of the package; that Python also runs the `__init__.py` of every package above a module does not count."""
+
+    def modules_in(name: str, tree: ast.Module) -> Iterator[str]:
+        for found in imported_names(tree, name, name in packages):
+            parent = found.rpartition(".")[0]
+            yield found if found in trees else parent
+
+    graph = {name: {found for found in modules_in(name, tree) if found in trees} for name, tree in trees.items()}
+
+    def reached(start: str) -> set[str]:
+        seen: set[str] = set()
+        left = [start]
+        while left:
+            for found in graph[left.pop()] - seen:
+                seen.add(found)
+                left.append(found)
+        return seen
+
+    onwards = {name: reached(name) for name in trees}
+    circles = {frozenset(other for other in onwards[name] if name in onwards[other]) for name in trees}
+    return [set(circle) for circle in circles if circle]
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    packages = {module_name(path) for path in PACKAGE.rglob("__init__.py")}
+    assert import_circles(modules(), packages) == []
+
+
+def test_a_circle_of_imports_would_be_found_also_within_functions():
+    trees = {
+        "pgts_torch.a": "from pgts_torch.b import x",
+        "pgts_torch.b": "def f():\n    from pgts_torch import c",
+        "pgts_torch.c": "import pgts_torch.a",
+        "pgts_torch.d": "from pgts_torch.a import y",
+    }
+    parsed = {name: ast.parse(source) for name, source in trees.items()}
+    assert import_circles(parsed, set()) == [{"pgts_torch.a", "pgts_torch.b", "pgts_torch.c"}]
+
+
 def test_relative_imports_in_a_package_file_are_understood():
     assert wrong_imports(ast.parse("from .agent import pgts"), "pgts_torch.search", is_package=True) == []
     assert len(wrong_imports(ast.parse("from ..agent import pgts"), "pgts_torch.search", is_package=True)) == 1

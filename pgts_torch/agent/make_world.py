@@ -25,13 +25,13 @@ from pgts_torch.agent.copies import check_vector_env, env_name, make_vector_env,
 from pgts_torch.agent.world import DynamicsWorld, PlainWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models.adapters import adapter_for
 from pgts_torch.models.attributes import attributes, changing, different, own_to_each, told
 from pgts_torch.models.classic import CLASSIC
 from pgts_torch.models.environments import EnvSource, base_actions
 from pgts_torch.models.fidelity import why_not
 from pgts_torch.models.published import publishes_table, table_of
 from pgts_torch.models.simulator import SimulatorModel
-from pgts_torch.models.snapshots import adapter_for
 from pgts_torch.models.trial import dynamics_contradiction
 from pgts_torch.models.walks import Setup
 from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_of, wrappers_of

@@ -15,9 +15,10 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch.errors import PgtsError, text_of
+from pgts_torch.models.adapters import adapter_for, methods_for
 from pgts_torch.models.attributes import changing, own_to_each
 from pgts_torch.models.environments import EnvSource, all_actions, make_env, sampled_actions
-from pgts_torch.models.snapshots import adapter_for, env_name, generator_state, methods_for
+from pgts_torch.models.snapshots import env_name, generator_state
 from pgts_torch.models.trial import claims
 from pgts_torch.models.walks import Setup, Walk, again, live, replays, walks_of
 from pgts_torch.models.wrappers import transforms_of

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, failure
+from pgts_torch.models.adapters import adapter_for
 from pgts_torch.models.answers import Answers, Step, copied
 from pgts_torch.models.base import (
     DENIED,
@@ -29,7 +30,7 @@ from pgts_torch.models.base import (
     step_text,
 )
 from pgts_torch.models.environments import EnvSource, all_actions, check_step, draws_its_own, make_env
-from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, adapter_for, env_name, generator_state
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name, generator_state
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
 from pgts_torch.models.wrappers import transforms_of
 from pgts_torch.seeding import SharedGenerators
@@ -113,7 +114,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             self.env.reset(seed=0)  # to have a state at all, which the first snapshot replaces
         except BaseException as error:
             raise failure(f"{self.name} failed in reset with seed 0", error) from error
-        self._show = self.adapter.blindfold(self.env)
+        self._show = self.adapter.skip_observations(self.env)
         self._draws_its_own = draws_its_own(made)
         self._names_discounts = names_discounts(self.env)
         self._sure = Answers()

@@ -11,8 +11,9 @@ import pytest
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
 from pgts_torch.errors import MissingModel
+from pgts_torch.models.adapters import OwnState, ToyText, adapter_for
 from pgts_torch.models.environments import all_actions, make_env, sampled_actions
-from pgts_torch.models.snapshots import OwnState, SnapshotAdapter, ToyText, adapter_for, generator_state, reseed
+from pgts_torch.models.snapshots import SnapshotAdapter, generator_state, reseed
 from pgts_torch.seeding import numpy_stream
 from tests.models.corridors import Bare, Corridor, Forgetful, InBytes
 

@@ -1,4 +1,4 @@
-"""Snapshots of simulators that come as extras: MiniGrid (extra `envs`), ALE (`atari`) and MuJoCo (`mujoco`)."""
+"""Adapters of the simulators that come as extras: MiniGrid (extra `envs`), ALE (`atari`) and MuJoCo (`mujoco`)."""
 
 import copyreg
 import enum
@@ -51,7 +51,7 @@ class MiniGrid(SnapshotAdapter):
                 else:
                     wall = cell
 
-    def blindfold(self, env: Any) -> Callable[[], Any] | None:
+    def skip_observations(self, env: Any) -> Callable[[], Any] | None:
         if not all(
             cls.__module__.split(".")[0] in ("minigrid", "gymnasium", "typing") for cls in type(env).__mro__[:-1]
         ):

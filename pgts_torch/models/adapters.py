@@ -1,0 +1,200 @@
+"""Which adapter takes and restores the snapshots of an environment, and the adapters of Gymnasium's own families.
+
+An environment of your own comes first: see the head of `pgts_torch.models.snapshots`.
+"""
+
+import pickle
+import struct
+import sys
+from typing import Any, Protocol, final, runtime_checkable
+
+import gymnasium
+import numpy as np
+
+from pgts_torch.errors import MissingModel
+from pgts_torch.models.adapters_extra import Ale, MiniGrid, Mujoco
+from pgts_torch.models.provenance import overridden
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
+
+
+@runtime_checkable
+class Restorable(Protocol):
+    """An environment that answers for its own state; see the head of this file."""
+
+    def get_state(self) -> Any: ...
+
+    def set_state(self, state: Any) -> None: ...
+
+
+@final
+class OwnState(SnapshotAdapter):
+    """For environments with the two methods of `Restorable`."""
+
+    name = "get_state and set_state of its own"
+
+    def get_state(self, env: Any) -> Snapshot:
+        state = env.get_state()
+        data = state if type(state) is bytes else pickle.dumps((state,), protocol=5)
+        # A prefix tells a state that is bytes from one that is pickled.
+        return Snapshot((b"b" if data is state else b"p") + data, (data is state, data))
+
+    def set_state(self, env: Any, data: Any) -> None:
+        is_bytes, content = data
+        env.set_state(content if is_bytes else pickle.loads(content)[0])
+
+    def same_state(self, one: Snapshot, other: Snapshot) -> bool:
+        """Pickles of one state may differ, as where a number is of Python here and of numpy there, or an object is met
+        twice; so what they hold is compared."""
+        contents = [_content(snapshot.data[1]) for snapshot in (one, other)]
+        return one.key == other.key or (None not in contents and _same(*contents))
+
+
+def _content(pickled: bytes) -> tuple[Any] | None:
+    """What is in a pickle; None where bytes are none."""
+    try:
+        return (pickle.loads(pickled),) if pickled.startswith(b"\x80") else None
+    except Exception:  # bytes of somebody's own making, that begin like a pickle
+        return None
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values hold the same, however numbers are typed."""
+    if isinstance(one, np.ndarray | np.generic) or isinstance(other, np.ndarray | np.generic):
+        first, second = np.asarray(one), np.asarray(other)
+        if first.dtype.hasobject or second.dtype.hasobject:
+            return first.shape == second.shape and all(map(_same, first.ravel(), second.ravel()))
+        return first.shape == second.shape and bool(((first == second) | ((first != first) & (second != second))).all())
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_same(one[name], other[name]) for name in one)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if type(one) is type(other) and type(one).__eq__ is object.__eq__ and hasattr(one, "__dict__"):
+        return _same(vars(one), vars(other))
+    return bool(one == other) or (one != one and other != other)
+
+
+@final
+class ToyText(SnapshotAdapter):
+    """FrozenLake, CliffWalking and Taxi: the state, and whether Taxi's passenger may still change his mind."""
+
+    name = "toy text"
+    restored = frozenset({"s", "lastaction", "fickle_step", "taxi_orientation"})
+
+    def get_state(self, env: Any) -> Snapshot:
+        key = struct.pack("<q?", env.s, vars(env).get("fickle_step", False))
+        return Snapshot(key, key)
+
+    def set_state(self, env: Any, data: Any) -> None:
+        env.s, fickle = struct.unpack("<q?", data)
+        if "fickle_step" in vars(env):
+            env.fickle_step = fickle
+
+    def is_random(self, env: Any, action: Any) -> bool | None:
+        # These environments draw a number even where one outcome is sure.
+        fickle = vars(env).get("fickle_step", False)
+        return fickle or len({row[1:] for row in env.P[env.s][action] if row[0] > 0}) > 1
+
+    def obstacle(self, env: Any) -> str:
+        # Whether chance decides is read from P, which tells what these steps do and no others.
+        family = next(cls for cls in type(env).__mro__ if cls.__module__.startswith(_TOY_TEXT))
+        why = overridden(env, family)
+        return f"{why}, where snapshots are made for {family.__name__}: {methods_for(env)}" if why else ""
+
+    def same_world(self, env: Any, own: Any) -> bool:
+        return type(env) is type(own) and env.P == own.P
+
+
+@final
+class Blackjack(SnapshotAdapter):
+    """The two hands. The suit of the dealer's card is for rendering."""
+
+    name = "toy text"
+    restored = frozenset({"player", "dealer", "dealer_top_card_suit", "dealer_top_card_value_str"})
+
+    def get_state(self, env: Any) -> Snapshot:
+        key = bytes(env.player) + b"|" + bytes(env.dealer)
+        return Snapshot(key, key)
+
+    def set_state(self, env: Any, data: Any) -> None:
+        player, dealer = data.split(b"|")
+        env.player, env.dealer = list(player), list(dealer)
+
+    def same_world(self, env: Any, own: Any) -> bool:
+        return type(env) is type(own) and (env.natural, env.sab) == (own.natural, own.sab)
+
+
+@final
+class ClassicControl(SnapshotAdapter):
+    """CartPole, Acrobot, MountainCar and Pendulum: the vector `state`, in its dtype, and CartPole's mark of an end."""
+
+    name = "classic control"
+    restored = frozenset({"state", "steps_beyond_terminated", "last_u", "screen", "clock", "isopen", "surf"})
+
+    def get_state(self, env: Any) -> Snapshot:
+        state = np.asarray(env.state)
+        beyond = vars(env).get("steps_beyond_terminated")
+        key = struct.pack("<cq", state.dtype.char.encode(), -1 if beyond is None else beyond) + state.tobytes()
+        return Snapshot(key, key)
+
+    def set_state(self, env: Any, data: Any) -> None:
+        char, beyond = struct.unpack_from("<cq", data)
+        env.state = np.frombuffer(data, char.decode(), offset=9).copy()
+        if "steps_beyond_terminated" in vars(env):
+            env.steps_beyond_terminated = None if beyond < 0 else beyond
+
+    def same_world(self, env: Any, own: Any) -> bool:
+        return type(env) is type(own) and _constants(env) == _constants(own)
+
+
+def _constants(env: Any) -> dict[str, Any]:
+    """The plain attributes of an environment of classic control; those of rendering and of its state are left out."""
+    left_out = {"steps_beyond_terminated", "last_u", "render_mode", "isopen", "_np_random_seed"}
+    plain = (bool, int, float, str, np.floating)
+    return {name: value for name, value in vars(env).items() if isinstance(value, plain) and name not in left_out}
+
+
+_TOY_TEXT = "gymnasium.envs.toy_text"
+_CLASSIC = "gymnasium.envs.classic_control"
+
+
+ADAPTERS: dict[tuple[str, str], type[SnapshotAdapter]] = {
+    (f"{_TOY_TEXT}.frozen_lake", "FrozenLakeEnv"): ToyText,
+    (f"{_TOY_TEXT}.cliffwalking", "CliffWalkingEnv"): ToyText,
+    (f"{_TOY_TEXT}.taxi", "TaxiEnv"): ToyText,
+    (f"{_TOY_TEXT}.blackjack", "BlackjackEnv"): Blackjack,
+    (f"{_CLASSIC}.cartpole", "CartPoleEnv"): ClassicControl,
+    (f"{_CLASSIC}.acrobot", "AcrobotEnv"): ClassicControl,
+    (f"{_CLASSIC}.mountain_car", "MountainCarEnv"): ClassicControl,
+    (f"{_CLASSIC}.continuous_mountain_car", "Continuous_MountainCarEnv"): ClassicControl,
+    (f"{_CLASSIC}.pendulum", "PendulumEnv"): ClassicControl,
+    ("minigrid.minigrid_env", "MiniGridEnv"): MiniGrid,
+    ("ale_py.env", "AtariEnv"): Ale,
+    ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv"): Mujoco,
+}
+"""The families by (module, class); subclasses belong to them. A module that nothing has imported has no instances."""
+
+
+def adapter_for(env: gymnasium.Env) -> SnapshotAdapter:
+    """An adapter for this environment. Its own two methods come before what is known of its family.
+
+    Raises:
+        MissingModel: it has neither; the message says what to implement.
+    """
+    base = env.unwrapped
+    if isinstance(base, Restorable):
+        return OwnState()
+    for (module, name), make in ADAPTERS.items():
+        if module in sys.modules and isinstance(base, getattr(sys.modules[module], name)):
+            adapter = make()
+            if why := adapter.obstacle(base):
+                raise MissingModel(f"{env_name(env)} cannot be restored: {why}")
+            return adapter
+    raise MissingModel(f"{env_name(env)} cannot be restored: {methods_for(base)}")
+
+
+def methods_for(base: Any) -> str:
+    """What to write, in the words of a refusal."""
+    return (
+        f"give {type(base).__name__} the methods get_state(self), which returns all that step reads or changes except "
+        "self.np_random (bytes, or what pickles), and set_state(self, state), which puts it back"
+    )
