@@ -10,6 +10,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "pgts_torch"
+STUDY = ROOT / "study"
+BESIDE = {"study", "benchmarks", "tests"}
+"""What stands beside the package, and may import it."""
 
 ROOMS = [
     "errors",
@@ -34,7 +37,9 @@ def module_name(path: Path) -> str:
 
 
 def modules() -> dict[str, ast.Module]:
-    return {module_name(path): ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))}
+    """Those of the package and of the study."""
+    paths = [*sorted(PACKAGE.rglob("*.py")), *sorted(STUDY.glob("*.py"))]
+    return {module_name(path): ast.parse(path.read_text()) for path in paths}
 
 
 # Imports
@@ -47,7 +52,7 @@ def room_of(name: str) -> str:
 
 
 def imported_names(tree: ast.Module, module: str, is_package: bool) -> Iterator[str]:
-    """Everything of the package that a module imports anywhere, also in functions and behind TYPE_CHECKING."""
+    """Everything of this repository that a module imports anywhere, also in functions and behind TYPE_CHECKING."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found = [alias.name for alias in node.names]
@@ -57,7 +62,7 @@ def imported_names(tree: ast.Module, module: str, is_package: bool) -> Iterator[
             found = [f"{origin}.{alias.name}" for alias in node.names]
         else:
             continue
-        yield from (name for name in found if name.split(".")[0] == "pgts_torch")
+        yield from (name for name in found if name.split(".")[0] in {"pgts_torch", *BESIDE})
 
 
 def wrong_imports(tree: ast.Module, module: str, is_package: bool = False) -> list[str]:
@@ -65,7 +70,7 @@ def wrong_imports(tree: ast.Module, module: str, is_package: bool = False) -> li
     return [
         f"{module} imports {name}"
         for name in imported_names(tree, module, is_package)
-        if ROOMS.index(room_of(name)) > own
+        if name.split(".")[0] in BESIDE or ROOMS.index(room_of(name)) > own
     ]
 
 
@@ -96,6 +101,7 @@ def test_imports_point_one_way():
             "import torch\nif TYPE_CHECKING:\n    from pgts_torch.experiment.config import Config",
         ),
         ("pgts_torch", "from pgts_torch.experiment import cli"),
+        ("pgts_torch.experiment.cli", "def figures():\n    from study import command"),
     ],
 )
 def test_an_import_from_a_later_room_would_be_found(module, source):

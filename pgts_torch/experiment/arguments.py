@@ -21,8 +21,8 @@ class Parser(argparse.ArgumentParser):
     """An argparse parser that reports a mistake in one line and takes no abbreviations."""
 
     def __init__(self, name: str, function: Callable[..., Any], **settings: Any) -> None:
+        settings.setdefault("prog", f"pgts {name}".strip())
         super().__init__(
-            prog=f"pgts {name}".strip(),
             description=(function.__doc__ or "").partition("\n")[0],
             allow_abbrev=False,
             formatter_class=_Formatter,

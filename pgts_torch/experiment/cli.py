@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 from pgts_torch.errors import NotFinite, PgtsError, RankLost, Stopped
 from pgts_torch.experiment.arguments import (
@@ -29,7 +28,6 @@ from pgts_torch.experiment.arguments import (
     whole_list,
 )
 from pgts_torch.experiment.config import Config, dump
-from pgts_torch.experiment.figures import PARTS
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.ownership import SUMMARY_FILE
 from pgts_torch.experiment.schema import Schema
@@ -58,13 +56,18 @@ def main(arguments: Arguments | None = None) -> int:
         was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C, 143
         after SIGTERM, 129 after SIGHUP.
     """
+    return exit_code(_run_command, sys.argv[1:] if arguments is None else arguments)
+
+
+def exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> int:
+    """Run a command and return its exit code, as `main` says; mistakes and failures go to stderr, a line each."""
     with telling(), plain_warnings():
-        return _main(sys.argv[1:] if arguments is None else arguments)
+        return _exit_code(function, arguments)
 
 
-def _main(arguments: Arguments) -> int:
+def _exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> int:
     try:
-        code = _dispatch(arguments)
+        code = _dispatch(function, arguments)
         sys.stdout.flush()  # meets a broken pipe here, not while the interpreter shuts down
         return code
     except PgtsError as error:
@@ -195,26 +198,6 @@ def report(arguments: Arguments) -> None:
     print(json.dumps(answer) if given.json else answer["page"])
 
 
-@command
-def figures(arguments: Arguments) -> None:
-    """Reproduce the figures and tables of the paper, and check what it says."""
-    parser = Parser("figures", figures)
-    parser.add_argument("--only", choices=PARTS, help="compute this part; keep the others as they are in --out")
-    parser.add_argument(
-        "--quick", action="store_true", help="minutes instead of half an hour: fewer seeds and readings"
-    )
-    parser.add_argument(
-        "--out", metavar="DIR", type=output_folder, default=Path("docs"), help="where to write (default: %(default)s)"
-    )
-    parser.add_argument("--json", action="store_true", help="print the data as one JSON object")
-    given = parser.parse_args(arguments)
-    from pgts_torch.experiment.figures import command as reproduction
-
-    effort = reproduction.QUICK if given.quick else reproduction.FULL
-    parts = reproduction.run(only=given.only, effort=effort, out=given.out)
-    print(json.dumps(parts) if given.json else reproduction.describe(parts))
-
-
 STATIONARY_OPTIONS = {
     "ladder": ("n", "gamma", "start"),
     "tightrope": ("gamma", "start"),
@@ -304,10 +287,10 @@ def _add_trust(parser: Parser, when: str = "") -> None:
     )
 
 
-def _dispatch(arguments: Arguments) -> int:
-    """Run a subcommand and return its exit code; argparse leaves by SystemExit after --help."""
+def _dispatch(function: Callable[[Arguments], None], arguments: Arguments) -> int:
+    """Run a command and return its exit code; argparse leaves by SystemExit after --help."""
     try:
-        _run_command(arguments)
+        function(arguments)
     except SystemExit as leave:
         return leave.code if isinstance(leave.code, int) else int(leave.code is not None)
     return 0
@@ -327,6 +310,8 @@ def _run_command(arguments: Arguments) -> None:
         print(f"pgts {_version()}")
     elif given.command is None:
         parser.error(f"a command is missing; choose from {', '.join(COMMANDS)}")
+    elif given.command == "figures":
+        parser.error("'figures' is no longer a command of pgts; run python -m study in a checkout of the repository")
     elif given.command not in COMMANDS:
         close = difflib.get_close_matches(given.command, COMMANDS, n=1)
         hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(COMMANDS)}"

@@ -1,17 +1,14 @@
 """The data and the text behind `pgts stationary`: which policies tree search cannot improve, and how bad they are."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import scipy.sparse.csgraph
 import torch
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.seeding import numpy_stream
 from pgts_torch.tabular import TabularMDP, deep_sea, grid, ladder, random_mdp, stationary, tightrope
 from pgts_torch.tabular.mdp import start_distribution
 
@@ -128,86 +125,6 @@ def to_json(study: Study) -> dict[str, Any]:
 def describe(study: Study) -> str:
     """The study as tables within 80 columns."""
     return "\n".join(_lines(study))
-
-
-# Random families
-
-
-@dataclass(frozen=True)
-class FamilyRow:
-    """One random MDP: how it was drawn, how it is connected, and what its stationary policies are like.
-
-    diameter: the largest finite shortest path between two states, in steps.
-    sufficient_depth: the smallest M with Pi^M = Pi^inf.
-    worst_return: b^0.
-    """
-
-    branching: int
-    reward_share: float
-    gamma: float
-    num_states: int
-    seed: int
-    diameter: int
-    sufficient_depth: int
-    worst_return: float
-    J_optimal: float
-
-
-def family_study(
-    *,
-    branchings: Sequence[int] = (1, 2, 3),
-    reward_shares: Sequence[float] = (0.05, 0.2, 1.0),
-    gammas: Sequence[float] = (0.5, 0.9, 0.99),
-    sizes: Sequence[int] = (5, 7, 9),
-    seeds: Iterable[int] = range(20),
-) -> list[FamilyRow]:
-    """How deep is deep enough in random MDPs of two actions that start in state 0: one row for each MDP.
-
-    The same seed gives the same transitions for all gammas and reward shares, and the same rewards for all gammas.
-    """
-    rows = []
-    for seed in seeds:
-        for branching in branchings:
-            for size in sizes:
-                for share in reward_shares:
-                    for gamma in gammas:
-                        mdp = sparse_random_mdp(size, branching=branching, reward_share=share, gamma=gamma, seed=seed)
-                        sets = stationary.enumerate_sets(mdp)
-                        reached, worst = sets.sufficient_depth, sets.worst_return(0)
-                        drawn = (branching, share, gamma, size, seed)
-                        rows.append(FamilyRow(*drawn, diameter(mdp), reached, worst, sets.J_optimal))
-    return rows
-
-
-def sparse_random_mdp(
-    num_states: int,
-    num_actions: int = 2,
-    *,
-    branching: int,
-    reward_share: float,
-    gamma: float = 0.9,
-    seed: int = 0,
-    start: int | None = 0,
-) -> TabularMDP:
-    """`random_mdp` with most of its rewards set to 0.
-
-    Args:
-        reward_share: the share of (s, a) that keep their reward, drawn at random; at least one does.
-    """
-    if not 0 <= reward_share <= 1:
-        raise PgtsError(f"reward_share is {reward_share}; it must be in [0, 1]")
-    mdp = random_mdp(num_states, num_actions, branching=branching, seed=seed, gamma=gamma, start=start)
-    order = numpy_stream(seed, "sparse_random_mdp").permutation(num_states * num_actions)
-    kept = order < max(1, round(reward_share * len(order)))
-    reward_SA = mdp.outcomes.reward_NA * torch.from_numpy(kept).view(num_states, num_actions)
-    return replace(mdp, outcomes=replace(mdp.outcomes, reward_NA=reward_SA))
-
-
-def diameter(mdp: TabularMDP) -> int:
-    """The largest finite shortest path between two states, in steps with positive probability and discount."""
-    weight_SAS = mdp.outcomes.weight.to_dense().view(mdp.num_states, mdp.num_actions, -1)
-    steps = scipy.sparse.csgraph.shortest_path((weight_SAS > 0).any(1).numpy(), unweighted=True)
-    return int(steps[np.isfinite(steps)].max())
 
 
 def _from_file(path: Path, options: dict[str, Any]) -> TabularMDP:

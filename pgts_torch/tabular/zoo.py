@@ -54,6 +54,7 @@ def random_mdp(
     num_actions: int = 2,
     *,
     branching: int | None = None,
+    reward_share: float = 1.0,
     seed: int = 0,
     gamma: float = 0.9,
     start: Start = 0,
@@ -65,19 +66,26 @@ def random_mdp(
 
     Args:
         branching: successors of each (s, a); None: every state.
+        reward_share: the share of (s, a) that keep their reward, drawn at random, at least one; the others earn 0.
     """
     _check_size("num_states", num_states, 1)
     _check_size("num_actions", num_actions, 1)
     K = num_states if branching is None else branching
     if not 1 <= K <= num_states:
         raise PgtsError(f"branching is {branching}; it must be between 1 and num_states = {num_states}")
+    if not 0 <= reward_share <= 1:
+        raise PgtsError(f"reward_share is {reward_share}; it must be in [0, 1]")
     check_gamma(gamma)
     random = numpy_stream(seed, "random_mdp")
     prob = random.exponential(size=(num_states, num_actions, K))
     prob /= prob.sum(-1, keepdims=True)
     child = _distinct(random, num_states * num_actions, num_states, K).reshape(prob.shape)
+    reward = random.random((num_states, num_actions))
+    # A stream of its own: MDPs of one seed have the same transitions, and where kept the same rewards, for every share.
+    order = numpy_stream(seed, "sparse_random_mdp").permutation(reward.size).reshape(reward.shape)
+    reward[order >= max(1, round(reward_share * reward.size))] = 0
     outcomes = Outcomes(
-        torch.from_numpy(random.random((num_states, num_actions))),
+        torch.from_numpy(reward),
         torch.from_numpy(prob),
         torch.tensor(float(gamma), dtype=torch.float64).expand(prob.shape),
         torch.from_numpy(child),

@@ -81,6 +81,11 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ([], f"a command is missing; choose from {', '.join(COMMANDS)} (see pgts --help)"),
         (["trian"], "'trian' is not a command; did you mean train? (see pgts --help)"),
         (["xyz"], f"'xyz' is not a command; choose from {', '.join(COMMANDS)} (see pgts --help)"),
+        (
+            ["figures", "--quick"],
+            "'figures' is no longer a command of pgts; "
+            "run python -m study in a checkout of the repository (see pgts --help)",
+        ),
         (["--verbose"], "unrecognized arguments: --verbose (see pgts --help)"),
         (["train", "--config"], "argument --config: expected one argument (see pgts train --help)"),
         (["train", "--config", "none.yaml"], "none.yaml: the configuration cannot be read: No such file or directory"),

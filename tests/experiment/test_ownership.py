@@ -14,8 +14,6 @@ from pgts_torch.experiment import checkpoint, opening, run
 from pgts_torch.experiment.checkpoint import MODEL_FILE
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import Config, dump
-from pgts_torch.experiment.figures import command as figures
-from pgts_torch.experiment.figures.drawing import pictures
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.ownership import MANIFEST_FILE, MARK_FILE, digest, sealed
@@ -401,22 +399,3 @@ def test_a_sweep_replaces_its_own_table_and_picture_and_nothing_else(name, here,
     (here / "out" / name).unlink()
     for _ in range(2):
         assert main(sweep) == 0
-
-
-@pytest.mark.fault("file of the user under the name of an output")
-@pytest.mark.parametrize("name", ["reproduction.md", "figures/depth.png", "figures/mirage.png", "figures/depth.json"])
-def test_figures_replace_their_own_files_and_nothing_else(name, here, capsys):
-    (here / "figures").mkdir()
-    (here / name).write_text('{"mine": true}')
-    before = tree(here)
-    assert main(["figures", "--quick", "--only=depth", "--out=."]) == 2
-    assert name in capsys.readouterr().err
-    assert tree(here) == before
-
-
-def test_the_names_of_the_pictures_are_those_that_are_drawn():
-    parts = figures.stored(Path(__file__).parents[2] / "docs" / "figures")
-    assert set(figures._PICTURES) <= parts.keys()
-    for name, data in parts.items():
-        assert tuple(pictures(data)) == figures._PICTURES.get(name, (name,))
-    assert MODEL_FILE == "model.pt"

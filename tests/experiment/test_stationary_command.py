@@ -1,7 +1,6 @@
-"""The command `pgts stationary`, and the study of random families."""
+"""The command `pgts stationary`."""
 
 import json
-import math
 import subprocess
 import sys
 from pathlib import Path
@@ -9,10 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import stationary
 from pgts_torch.experiment.cli import STATIONARY_OPTIONS, main
 from pgts_torch.tabular import deep_sea, exact, grid, ladder, random_mdp, tightrope
 from pgts_torch.tabular import stationary as theory
@@ -211,48 +207,3 @@ def test_the_help_tells_the_names_and_the_arrays_of_a_file(capsys):
     assert max(map(len, out.splitlines())) < 80
     for word in [*STATIONARY_OPTIONS, 'numpy.savez("mdp.npz", P=P, R=R, gamma=0.9)', "[S, A, S]", "[S, A]", "start"]:
         assert word in out
-
-
-# The study of random families
-
-
-def test_a_family_has_a_row_for_each_mdp_and_the_rows_are_true():
-    rows = stationary.family_study(branchings=(1, 3), reward_shares=(0.1, 1.0), gammas=(0.9,), sizes=(4,), seeds=(0, 5))
-    drawn = [(row.seed, row.branching, row.num_states, row.reward_share, row.gamma) for row in rows]
-    assert drawn == [
-        (seed, branching, 4, share, 0.9) for seed in (0, 5) for branching in (1, 3) for share in (0.1, 1.0)
-    ]
-    for row in rows:
-        mdp = stationary.sparse_random_mdp(
-            4, branching=row.branching, reward_share=row.reward_share, gamma=0.9, seed=row.seed
-        )
-        sets = theory.enumerate_sets(mdp)
-        assert (row.sufficient_depth, row.worst_return) == (sets.sufficient_depth, sets.worst_return(0))
-        assert row.J_optimal == pytest.approx(exact.optimal(mdp).J)
-        assert row.worst_return <= row.J_optimal + 1e-12
-
-
-def test_the_same_seed_gives_the_same_family():
-    few = {"branchings": (2,), "reward_shares": (0.2,), "gammas": (0.5, 0.99), "sizes": (5,)}
-    assert stationary.family_study(seeds=(3,), **few) == stationary.family_study(seeds=(3, 4), **few)[:2]
-    assert stationary.family_study(seeds=(3,), **few) != stationary.family_study(seeds=(4,), **few)
-
-
-def test_a_sparse_random_mdp_keeps_the_share_of_the_rewards_and_the_transitions():
-    dense = random_mdp(9, 2, branching=2, seed=4)
-    for share, kept in [(0.0, 1), (0.05, 1), (0.2, 4), (0.5, 9), (1.0, 18)]:
-        mdp = stationary.sparse_random_mdp(9, branching=2, reward_share=share, seed=4)
-        rewards_SA = mdp.outcomes.reward_NA
-        assert int((rewards_SA != 0).sum()) == kept
-        assert torch.equal(rewards_SA[rewards_SA != 0], dense.outcomes.reward_NA[rewards_SA != 0])
-        assert torch.equal(mdp.outcomes.child_NAK, dense.outcomes.child_NAK)
-    with pytest.raises(PgtsError, match="reward_share is nan"):
-        stationary.sparse_random_mdp(5, branching=1, reward_share=math.nan)
-
-
-@pytest.mark.parametrize(
-    ("mdp", "steps"),
-    [(lambda: ladder(6), 5), (tightrope, 2), (lambda: grid(4, traps=(), slip=0.0), 6), (random_mdp, 1)],
-)
-def test_the_diameter_is_the_longest_of_the_shortest_finite_paths(mdp, steps):
-    assert stationary.diameter(mdp()) == steps

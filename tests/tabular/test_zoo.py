@@ -15,6 +15,7 @@ from pgts_torch.tabular import (
     exact,
     grid,
     ladder,
+    mirage,
     random_mdp,
     river_swim,
     tightrope,
@@ -105,6 +106,16 @@ def test_the_successors_of_a_garnet_are_uniform_over_all_sets():
     assert float(((counts - expected) ** 2 / expected).sum()) < 37
     assert child.min() == 0
     assert child.max() == 4999
+
+
+def test_a_random_mdp_keeps_a_share_of_its_rewards_and_all_of_its_transitions():
+    dense = random_mdp(9, 2, branching=2, seed=4).outcomes
+    for share, kept in [(0.0, 1), (0.05, 1), (0.2, 4), (0.5, 9), (1.0, 18)]:
+        sparse = random_mdp(9, 2, branching=2, reward_share=share, seed=4).outcomes
+        stays_SA = sparse.reward_NA != 0
+        assert int(stays_SA.sum()) == kept
+        assert torch.equal(sparse.reward_NA[stays_SA], dense.reward_NA[stays_SA])
+        assert torch.equal(sparse.child_NAK, dense.child_NAK)
 
 
 def test_rewards_and_probabilities_of_a_random_mdp_are_uniform():
@@ -232,6 +243,20 @@ def test_the_mapping_seed_of_deep_sea_draws_which_action_is_right():
     assert np.all(right_actions(deep_sea(10), 10) == 1)
 
 
+# Mirage
+
+
+@pytest.mark.parametrize(("width", "delta", "gamma"), [(10, 0.05, 0.9), (1, 0.3, 0.5), (4, 0.01, 0.99)])
+def test_the_advantage_of_right_on_the_mirage_is_that_of_the_formula(width, delta, gamma):
+    mdp = mirage(width, delta=delta, gamma=gamma)
+    q_SA = exact.evaluate(mdp, always(mdp, 0)).q_SA
+    for m in (0, 1, 2, 7, 30):
+        left, right = exact.lookahead(mdp, q_SA, m)[0].tolist()
+        assert right - left == pytest.approx(gamma / (1 - gamma) * (1 - (1 - delta) * (1 - gamma**m)))
+    assert exact.optimal(mdp).J == pytest.approx(gamma / (1 - gamma))
+    assert exact.evaluate(mdp, always(mdp, 1)).J == pytest.approx(gamma / (1 - gamma))
+
+
 # What is refused
 
 
@@ -246,6 +271,11 @@ def test_the_mapping_seed_of_deep_sea_draws_which_action_is_right():
         (lambda: random_mdp(3, branching=0), "branching is 0; it must be between 1 and num_states = 3"),
         (lambda: random_mdp(3, branching=4), "branching is 4"),
         (lambda: random_mdp(gamma=-0.1), "gamma is -0.1"),
+        (lambda: random_mdp(reward_share=math.nan), r"reward_share is nan; it must be in \[0, 1\]"),
+        (lambda: mirage(0), "width is 0; it must be at least 1"),
+        (lambda: mirage(delta=0.0), "delta is 0.0; it must be above 0 and below 1"),
+        (lambda: mirage(delta=1.0), "delta is 1.0; it must be above 0 and below 1"),
+        (lambda: mirage(gamma=2.0), "gamma is 2.0"),
         (lambda: grid(0), "size is 0"),
         (lambda: grid(5), "trap 32 is not on the grid; states are 0 to 24"),
         (lambda: grid(goal=100), "goal 100 is not on the grid"),

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from pgts_torch.experiment.figures.cubes import cover
+from study.cubes import cover
 
 Verdict = Literal["holds", "does not hold", "depends"]
 Reading = Mapping[str, str | float | int]

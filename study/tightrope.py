@@ -5,10 +5,12 @@ from typing import Any
 
 from torch import Tensor
 
-from pgts_torch.experiment.figures.batch import Iterate
-from pgts_torch.experiment.figures.claims import Claim, Finding, Reading, judge
-from pgts_torch.experiment.figures.curves import first, initial_policy
-from pgts_torch.experiment.figures.figure import (
+from pgts_torch.tabular import TabularMDP, exact, tightrope
+from pgts_torch.tabular.zoo import Start
+from study.batch import Iterate
+from study.claims import Claim, Finding, Reading, judge
+from study.curves import first, initial_policy
+from study.figure import (
     Figure,
     Move,
     Parameter,
@@ -21,9 +23,7 @@ from pgts_torch.experiment.figures.figure import (
     stuck,
     study,
 )
-from pgts_torch.experiment.figures.ladder import ALWAYS_LEFT, NEARLY_ALWAYS_LEFT
-from pgts_torch.tabular import TabularMDP, exact, tightrope
-from pgts_torch.tabular.zoo import Start
+from study.ladder import ALWAYS_LEFT, NEARLY_ALWAYS_LEFT
 
 DEPTHS = (0, 1, 2, 3, 4, 5)
 STEPS = (0.01, 0.1, 1.0)

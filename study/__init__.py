@@ -1,4 +1,6 @@
-"""Every figure and table of the paper, its statements checked, and the questions it leaves open, as one document.
+"""The paper reproduced: its figures and tables, its statements checked, its open questions tried, as one document.
+
+`python -m study` in a checkout of the repository; no part of the package.
 
 Each part computes plain data; pictures and the document are made from the data alone.
 """

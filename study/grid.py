@@ -6,10 +6,11 @@ from typing import Any
 
 from torch import Tensor
 
-from pgts_torch.experiment.figures.batch import Batch, Iterate
-from pgts_torch.experiment.figures.claims import Claim, Finding, Reading, judge
-from pgts_torch.experiment.figures.curves import Trace, arrivals, cells, first, initial_policy
-from pgts_torch.experiment.figures.figure import (
+from pgts_torch.tabular import exact, grid, stationary
+from study.batch import Batch, Iterate
+from study.claims import Claim, Finding, Reading, judge
+from study.curves import Trace, arrivals, cells, first, initial_policy
+from study.figure import (
     Figure,
     Move,
     Parameter,
@@ -18,8 +19,7 @@ from pgts_torch.experiment.figures.figure import (
     similar,
     study,
 )
-from pgts_torch.experiment.figures.random_mdp import UNIFORM
-from pgts_torch.tabular import exact, grid, stationary
+from study.random_mdp import UNIFORM
 
 DEPTHS = (0, 1, 2, 3, 4, 5, 8, 18)
 CHECKED = (0, 1, 4, 18)

@@ -3,8 +3,9 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from pgts_torch.experiment.figures.claims import Claim, Finding, Reading, judge
-from pgts_torch.experiment.figures.figure import (
+from pgts_torch.tabular import TabularMDP, grid, ladder, random_mdp, tightrope
+from study.claims import Claim, Finding, Reading, judge
+from study.figure import (
     Figure,
     Move,
     Parameter,
@@ -15,8 +16,7 @@ from pgts_torch.experiment.figures.figure import (
     similar,
     study,
 )
-from pgts_torch.experiment.figures.ladder import ALWAYS_LEFT
-from pgts_torch.tabular import TabularMDP, grid, ladder, random_mdp, tightrope
+from study.ladder import ALWAYS_LEFT
 
 UNIFORM = {"type": "uniform"}
 DEPTHS = (0, 1, 2, 3, 4, 5)

@@ -9,13 +9,12 @@ from typing import Any
 import torch
 
 from pgts_torch.agent.build import Description
-from pgts_torch.experiment.figures.claims import Claim, Finding, judge
-from pgts_torch.experiment.figures.curves import ARRIVED, arrivals, first, initial_policy, trace
-from pgts_torch.experiment.figures.figure import STARTS, Effort, Parameter, Report
-from pgts_torch.experiment.figures.ladder import ALWAYS_LEFT
-from pgts_torch.experiment.figures.random_mdp import UNIFORM
-from pgts_torch.experiment.stationary import sparse_random_mdp
 from pgts_torch.tabular import TabularMDP, exact, grid, ladder, mirage, random_mdp, tightrope
+from study.claims import Claim, Finding, judge
+from study.curves import ARRIVED, arrivals, first, initial_policy, trace
+from study.figure import STARTS, Effort, Parameter, Report
+from study.ladder import ALWAYS_LEFT
+from study.random_mdp import UNIFORM
 
 LEFT, RIGHT = 0, 1
 DEPTHS = (0, 1, 2, 3, 4, 5)
@@ -39,7 +38,7 @@ class Family:
 
 def _garnet(reward_share: float) -> Callable[..., TabularMDP]:
     def make(*, seed: int, start: int | None) -> TabularMDP:
-        return sparse_random_mdp(10, branching=2, reward_share=reward_share, seed=seed, start=start)
+        return random_mdp(10, branching=2, reward_share=reward_share, seed=seed, start=start)
 
     return make
 

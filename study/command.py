@@ -1,4 +1,4 @@
-"""What `pgts figures` does: compute parts, keep their data, draw the pictures, write the document."""
+"""What `python -m study` does: compute parts, keep their data, draw the pictures, write the document."""
 
 import io
 import json
@@ -13,11 +13,11 @@ import torch
 
 from pgts_torch import files
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.figures import PARTS, depth, figure, grid, ladder, random_mdp, sets, tightrope
-from pgts_torch.experiment.figures.document import claim_rows, document, is_document
-from pgts_torch.experiment.figures.drawing import pictures
-from pgts_torch.experiment.figures.figure import Effort, Report
-from pgts_torch.experiment.figures.sampled import WORKERS, executor
+from study import PARTS, depth, figure, grid, ladder, random_mdp, sets, tightrope
+from study.document import claim_rows, document, is_document
+from study.drawing import pictures
+from study.figure import Effort, Report
+from study.sampled import WORKERS, executor
 
 FULL = Effort(quick=False, seeds=10, workers=WORKERS)
 QUICK = Effort(quick=True, seeds=3, workers=WORKERS)
@@ -42,7 +42,7 @@ def run(*, only: str | None, effort: Effort, out: Path) -> dict[str, Any]:
     with files.named(f"--out {out}"):
         folder.mkdir(parents=True, exist_ok=True)
     before = stored(folder)  # what cannot be read is better known now than after all the work
-    page = files.target(out / "reproduction.md", is_document, "a document of pgts figures")
+    page = files.target(out / "reproduction.md", is_document, "a document of python -m study")
     for name in PARTS if only is None else (only,):
         for picture in _PICTURES.get(name, (name,)):
             files.target(folder / f"{picture}.png", lambda _: name in before, f"a picture of figures/{name}.json")  # noqa: B023
@@ -92,7 +92,7 @@ def stored(folder: Path) -> dict[str, Any]:
                     raise PgtsError("it is not the data of this part")
             except (ValueError, RecursionError) as error:
                 raise PgtsError(
-                    f"{path} cannot be read: {error}; remove it or run pgts figures --only {name}"
+                    f"{path} cannot be read: {error}; remove it or run python -m study --only {name}"
                 ) from error
     return parts
 

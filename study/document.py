@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pgts_torch.experiment.figures import PARTS
-from pgts_torch.experiment.figures.curves import ARRIVED
+from study import PARTS
+from study.curves import ARRIVED
 
 Data = Mapping[str, Any]
 
@@ -33,14 +33,14 @@ def claim_rows(parts: Mapping[str, Data]) -> list[tuple[str, Data]]:
 
 def is_document(raw: bytes) -> bool:
     """Whether the content of a file is a document that was made here."""
-    return raw.startswith(b"# The paper, reproduced and checked\n\nWritten by `pgts figures`;")
+    return raw.startswith(b"# The paper, reproduced and checked\n\nWritten by `python -m study`;")
 
 
 def _lines(parts: Mapping[str, Data]) -> Iterator[str]:
     yield "# The paper, reproduced and checked"
     yield ""
-    yield "Written by `pgts figures`; do not edit. Each number and picture comes from `figures/*.json`, which the same"
-    yield "command writes. References are to the paper (PGTS)."
+    yield "Written by `python -m study`; do not edit. Each number and picture comes from `figures/*.json`, which the"
+    yield "same command writes. References are to the paper (PGTS)."
     yield ""
     quick = [name for name in PARTS if name in parts and parts[name]["quick"]]
     missing = [name for name in PARTS if name not in parts]
@@ -48,7 +48,7 @@ def _lines(parts: Mapping[str, Data]) -> Iterator[str]:
         yield f"**Made with `--quick`** (fewer seeds, depths and readings): {', '.join(quick)}."
         yield ""
     if missing:
-        commands = ", ".join(f"`pgts figures --only {name}`" for name in missing)
+        commands = ", ".join(f"`python -m study --only {name}`" for name in missing)
         yield f"**Not computed yet:** {', '.join(missing)}. Run {commands}."
         yield ""
     yield from _summary(parts)
@@ -88,7 +88,7 @@ def _verdict(claim: Data) -> str:
 def _part(name: str, data: Data) -> Iterator[str]:
     yield f"## {data['title']}"
     yield ""
-    yield f"Made by `pgts figures --only {name}{' --quick' if data['quick'] else ''}`."
+    yield f"Made by `python -m study --only {name}{' --quick' if data['quick'] else ''}`."
     yield ""
     if name == "stationary":
         yield from _stationary(data)

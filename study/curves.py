@@ -9,10 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgts_torch.agent.build import Description, make_tabular_policy
-from pgts_torch.experiment.figures.batch import Batch, Cells, Iterate, Step
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.ascent import projected_step
 from pgts_torch.tabular.mdp import TabularMDP
+from study.batch import Batch, Cells, Iterate, Step
 
 ARRIVED = 0.99
 """A return has arrived when it has made this share of the way from J^{pi_0} to J*."""

@@ -4,9 +4,11 @@ import itertools
 
 import torch
 
-from pgts_torch.experiment.figures.claims import Claim, Finding, judge
-from pgts_torch.experiment.figures.curves import first, initial_policy
-from pgts_torch.experiment.figures.figure import (
+from pgts_torch.tabular import exact, ladder
+from study.claims import Claim, Finding, judge
+from study.curves import first, initial_policy
+from study.families import diameter
+from study.figure import (
     Figure,
     Move,
     Parameter,
@@ -16,8 +18,6 @@ from pgts_torch.experiment.figures.figure import (
     stuck,
     study,
 )
-from pgts_torch.experiment.stationary import diameter
-from pgts_torch.tabular import exact, ladder
 
 ALWAYS_LEFT = {"type": "biased", "action": 0, "probability": 1.0}
 NEARLY_ALWAYS_LEFT = {"type": "biased", "action": 0, "probability": 0.99}

@@ -8,13 +8,14 @@ from typing import Any
 
 import scipy.stats
 
-from pgts_torch.experiment import stationary as study
-from pgts_torch.experiment.figures import table1
-from pgts_torch.experiment.figures.claims import Claim, Finding, judge
-from pgts_torch.experiment.figures.curves import initial_policy
-from pgts_torch.experiment.figures.figure import Effort, Parameter, Report
-from pgts_torch.experiment.figures.ladder import ALWAYS_LEFT
+from pgts_torch.experiment import stationary as counting
 from pgts_torch.tabular import ascent, grid, ladder, random_mdp, stationary, tightrope
+from study import table1
+from study.claims import Claim, Finding, judge
+from study.curves import initial_policy
+from study.families import FamilyRow, family_study
+from study.figure import Effort, Parameter, Report
+from study.ladder import ALWAYS_LEFT
 
 COUNTED = {
     "Ladder": ladder,
@@ -35,17 +36,17 @@ def compute(effort: Effort, report: Report) -> dict[str, Any]:
     found = {name: table1.members(column) for name, column in table1.PAPER.items()}
     tables = {name: table1.table(column, found[name]) for name, column in table1.PAPER.items()}
     report("stationary: enumerating policies")
-    counted = {name: study.study(make()) for name, make in COUNTED.items()}
+    counted = {name: counting.study(make()) for name, make in COUNTED.items()}
     seeds = range(2 if effort.quick else 20)
     report(f"stationary: random families, {len(seeds)} seeds")
-    rows = study.family_study(seeds=seeds)
+    rows = family_study(seeds=seeds)
     return {
         "part": "stationary",
         "title": "Stationary sets",
         "quick": effort.quick,
         "parameters": [asdict(parameter) for parameter in _parameters(rows, len(seeds))],
         "table1": tables,
-        "counted": {name: study.to_json(one) for name, one in counted.items()},
+        "counted": {name: counting.to_json(one) for name, one in counted.items()},
         "family": [asdict(row) for row in rows],
         "claims": [claim.plain() for claim in _claims(found, tables, counted, rows)],
     }
@@ -54,8 +55,8 @@ def compute(effort: Effort, report: Report) -> dict[str, Any]:
 def _claims(
     found: Mapping[str, table1.Found],
     tables: Mapping[str, dict[str, Any]],
-    counted: Mapping[str, study.Study],
-    rows: Sequence[study.FamilyRow],
+    counted: Mapping[str, counting.Study],
+    rows: Sequence[FamilyRow],
 ) -> list[Claim]:
     return [
         judge("Pi^m_eta is the same for every eta >= 0", "Lemma 1", _step_sizes()),
@@ -94,7 +95,7 @@ def _nested(name: str, found: table1.Found) -> Finding:
     return Finding({"MDP": name}, text, grown == 0)
 
 
-def _worst_return(name: str, one: study.Study) -> Finding:
+def _worst_return(name: str, one: counting.Study) -> Finding:
     worst = [row.worst_return for row in one.depths]
     text = f"{name}: b^m = " + ", ".join(f"{value:.4g}" for value in worst)
     return Finding({"MDP": name}, text, all(b >= a - 1e-9 for a, b in itertools.pairwise(worst)))
@@ -107,7 +108,7 @@ def _table(table: dict[str, Any]) -> Finding:
     return Finding({}, text, not kinds)
 
 
-def _finite(counted: Mapping[str, study.Study], rows: Sequence[study.FamilyRow]) -> list[Finding]:
+def _finite(counted: Mapping[str, counting.Study], rows: Sequence[FamilyRow]) -> list[Finding]:
     named = ", ".join(f"{one.sufficient_depth} ({name})" for name, one in counted.items())
     largest = max(row.sufficient_depth for row in rows)
     text = f"M = {named}; at most {largest} in {len(rows)} random MDPs"
@@ -115,7 +116,7 @@ def _finite(counted: Mapping[str, study.Study], rows: Sequence[study.FamilyRow])
     return [Finding({}, text, all(one.depths[-1].lack == 0 for one in counted.values()))]
 
 
-def _correlation(rows: Sequence[study.FamilyRow], name: str) -> Finding:
+def _correlation(rows: Sequence[FamilyRow], name: str) -> Finding:
     values = [getattr(row, name) for row in rows]
     answer = scipy.stats.spearmanr(values, [row.sufficient_depth for row in rows])
     means = {
@@ -129,7 +130,7 @@ def _correlation(rows: Sequence[study.FamilyRow], name: str) -> Finding:
     return Finding({}, text, bool(answer.pvalue < SIGNIFICANT))
 
 
-def _parameters(rows: Sequence[study.FamilyRow], seeds: int) -> list[Parameter]:
+def _parameters(rows: Sequence[FamilyRow], seeds: int) -> list[Parameter]:
     def values(name: str) -> str:
         return ", ".join(f"{value:g}" for value in sorted({getattr(row, name) for row in rows}))
 

@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pgts_torch.experiment.figures.cubes import Cube, cover
 from pgts_torch.tabular import TabularMDP, ladder, tightrope
-from pgts_torch.tabular.patterns import ALWAYS, NEVER, SOMETIMES, Membership, memberships, patterns
+from study.cubes import Cube, cover
+from study.patterns import ALWAYS, NEVER, SOMETIMES, Membership, memberships, patterns
 
 SIGNS: dict[frozenset[str], str] = {
     frozenset(NEVER): "0",

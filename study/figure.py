@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from pgts_torch.agent.build import Description
-from pgts_torch.experiment.figures.claims import Claim, Finding, Reading
-from pgts_torch.experiment.figures.curves import Trace, Watch, initial_policy, trace
-from pgts_torch.experiment.figures.sampled import Job, arguments, band, returns
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.ascent import projected_step, softmax_step
 from pgts_torch.tabular.mdp import TabularMDP
+from study.claims import Claim, Finding, Reading
+from study.curves import Trace, Watch, initial_policy, trace
+from study.sampled import Job, arguments, band, returns
 
 STARTS: dict[str, int | None] = {"s0": 0, "uniform": None}
 STEPS = {"projected": projected_step, "softmax": softmax_step}

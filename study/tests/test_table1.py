@@ -1,5 +1,6 @@
-"""Stationary sets of all policies, pattern by pattern."""
+"""Table 1: stationary sets of all policies, pattern by pattern."""
 
+import dataclasses
 from fractions import Fraction
 
 import pytest
@@ -7,18 +8,12 @@ import torch
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.tabular import TabularMDP, ladder, random_mdp, stationary, tightrope
-from pgts_torch.tabular.patterns import Membership, memberships, patterns, policy
+from study import table1
+from study.patterns import Membership, memberships, patterns, policy
+from study.tests.rules import ladder_rule
 from tests.support import right_with
 
 DEPTHS = 5
-
-
-def ladder_rule(pattern: str, depth: int) -> bool:
-    """docs/theory.md, Sec. 4: always right, or a first zero at j < n - 1 - m and another one at j + m + 1 or above."""
-    if "0" not in pattern:
-        return set(pattern) == {"1"}
-    j = pattern.index("0")
-    return j + depth < len(pattern) - 1 and "0" in pattern[j + depth + 1 :]
 
 
 def test_there_are_three_patterns_for_each_state():
@@ -87,3 +82,40 @@ def test_a_pattern_that_does_not_fit_is_refused(pattern):
 def test_an_mdp_of_three_actions_is_refused():
     with pytest.raises(PgtsError, match="the MDP has 3 actions; patterns are those of two"):
         memberships(random_mdp(3, 3), "000", 1)
+
+
+def test_the_table_is_the_closed_rule_for_all_243_patterns_and_its_classes_say_the_same(ladder_members):
+    found = table1.table(table1.PAPER["ladder"], ladder_members)
+    for m, row in enumerate(found["correct"]):
+        classes = [name for later in found["correct"][m:] for name in later["leaving"]] + found["staying"]
+        members = {pattern for pattern in ladder_members if any(table1.in_class(pattern, name) for name in classes)}
+        assert members == {pattern for pattern in ladder_members if ladder_rule(pattern, m)}
+        assert row["patterns"] == len(members)
+    deterministic = [sum(ladder_rule(p, m) for p in ladder_members if "x" not in p) for m in range(5)]
+    assert deterministic == [27, 23, 17, 9, 1]
+
+
+@pytest.mark.parametrize("name", ["ladder", "tightrope"])
+def test_every_witness_is_stationary_where_the_table_says_and_escapes_one_deeper(name, ladder_members):
+    column = table1.PAPER[name]
+    mdp = column.make()
+    differences = table1.table(column, ladder_members if name == "ladder" else table1.members(column))["differences"]
+    assert differences
+    for row in differences:
+        pi_SA = right_with(*row["witness"])
+        assert stationary.is_stationary(mdp, pi_SA, row["stationary_at"]), row
+        assert not stationary.is_stationary(mdp, pi_SA, row["escapes_at"]), row
+        assert row["escapes_at"] == row["stationary_at"] + 1
+
+
+def test_a_table_without_errors_has_no_differences_and_a_class_too_many_is_named(ladder_members):
+    column = table1.PAPER["ladder"]
+    found = table1.table(column, ladder_members)
+    rows = [
+        dataclasses.replace(row, leaving=tuple(true["leaving"]))
+        for row, true in zip(column.rows, found["correct"], strict=True)
+    ]
+    assert table1.table(dataclasses.replace(column, rows=tuple(rows)), ladder_members)["differences"] == []
+    rows[3] = dataclasses.replace(rows[3], leaving=("0***0", "11110"))
+    wrong = table1.table(dataclasses.replace(column, rows=tuple(rows)), ladder_members)["differences"]
+    assert [(row["kind"], row["class"], row["belongs_in"]) for row in wrong] == [("too many", "11110", "none")]
