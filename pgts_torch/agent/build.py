@@ -81,8 +81,8 @@ def make_estimator(description: Description) -> Estimator:
 
 
 def make_search(description: Description, world: World) -> Search:
-    """A search: auto, expectimax(max_width), sampled(samples, share) or mcts(simulations, merge, samples); each also
-    takes max_nodes and max_bytes."""
+    """A search: auto, expectimax(max_width), sampled(samples, share) or mcts(simulations, root,
+    rule, exploration, wave, prior, backup, merge, samples); each also takes max_nodes and max_bytes."""
     if world.model is None:
         raise MissingModel("the environment has no model that a lookahead could ask")
     return _make("search", _SEARCHES, description, world.model)

@@ -91,7 +91,8 @@ class PGTS:
         tolerance: which share of what may be missing to J* a lookahead must see to be deep enough (default 0.7).
         stop_at: `learn` ends, with the policy in question, once the certificate says J* - J^pi <= stop_at. That is a
             proof only where `certificates.trust` says so. Default: never.
-        search: how the lookahead is made (`search.engine`): "auto", {"type": "sampled", "samples": 8}, ...
+        search: how the lookahead is made (`search.engine`): "auto", {"type": "sampled", "samples": 8},
+            {"type": "mcts", "rule": "puct", "prior": "policy"}, ...
         estimator: "lookahead", or {"type": "sampled", "lambda": 0.95}: advantages of the actions taken, as in PPO and
             A2C, which need depth 0, a network and no model.
         policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax", "mlp",
@@ -216,7 +217,7 @@ class PGTS:
         numbers_anew = self.world.forget()
         experience = whole_rollout(self.ranks, self.world, lambda: self._visit(draws.own))
         if numbers_anew and self.search is not None:
-            self.search.forget()
+            self.search.reset()
         taken = self._taken(experience)
         fitting = draws.own if self.critic.draws_when_asked else draws.common
         losses = self.critic.fit(self.policy, experience, generator=fitting)
@@ -359,7 +360,13 @@ class PGTS:
         observe, critic = self.world.observe, self.critic
         leaf: Leaf = lambda s: critic.v(observe(s)) if critic.target == "v" else critic.q(observe(s))  # noqa: E731
         depth = self.depths[-1] if depth is None else depth
-        return self.search(state_N, depth=depth, generator=self._search_stream(), **{f"{critic.target}_leaf": leaf})
+        return self.search(
+            state_N,
+            depth=depth,
+            prior=lambda s: self.policy.probs(observe(s)),
+            generator=self._search_stream(),
+            **{f"{critic.target}_leaf": leaf},
+        )
 
     def _look_together(self, state_N: Tensor, depth: int) -> Lookahead:
         """`lookahead`, in which each process has its part."""

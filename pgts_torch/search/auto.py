@@ -5,13 +5,15 @@ from dataclasses import replace
 from typing import Any, final
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from pgts_torch.errors import MemoryBudgetExceeded, NodeBudgetExceeded, PgtsError, RandomOutcomes
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.engine import SampledSearch, Search
-from pgts_torch.search.expectimax import expectimax
-from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaf, Leaves, Lookahead
+from pgts_torch.search.expectimax import full_width
+from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaves, Lookahead
+from pgts_torch.search.pruned import pruned
 from pgts_torch.search.topology import Topology, tree_nodes
 
 MOST_SAMPLES = 32
@@ -21,16 +23,18 @@ MOST_SAMPLES = 32
 class AutoSearch(Search):
     """Picks the search by what the model can do, by how often paths meet, and by the budget; `str` says what it picked.
 
-    - Outcomes can be listed and the nodes that hold all paths fit into the budget: expectimax of full width, exact.
-    - They can be listed and do not fit: expectimax that unfolds as many states of each level as fit. The width is
+    - The model enumerates outcomes and the nodes that hold all paths fit into the budget: expectimax of full width,
+      exact.
+    - It enumerates them and they do not fit: expectimax that expands as many states of each level as fit. The width is
       halved until they do; where they left room, the next search is twice as wide. Full width is not tried again for
       as many roots and levels as were too many the last time.
-    - They can only be drawn, or turn out to be random where they should be listed: sampled, with as many samples of
-      each action as fit if no two paths meet. Where paths met and left room, the next search draws twice as many, up
-      to 32; one of more roots or levels begins anew, and one that turns out too large is done again with half.
+    - It only samples outcomes, or turns out to be random where it should enumerate them: sampled, with as many samples
+      of each action as fit if no two paths meet. Where paths met and left room, the next search takes twice as many, up
+      to 32; for more roots or levels the number is chosen again, and a search that turns out too large is done again
+      with half.
 
     Args:
-        model: what is asked.
+        model: enumerates or samples outcomes.
         max_nodes: the most nodes of one search.
         max_bytes: the most memory that a search may take.
 
@@ -50,66 +54,52 @@ class AutoSearch(Search):
         self._most_asked = 0, 0
         self._picked = "nothing yet"
 
-    def _look(
-        self, root_B: Tensor, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, generator: torch.Generator
-    ) -> Lookahead:
-        expansions = Leaves(self.model, depth, q_leaf, v_leaf).expansions
+    def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
         if self.topology is not None:
+            calls_before, roots, expansions = self.topology.model_calls, len(root_B), leaves.expansions
             try:
-                return self._listed(root_B, depth, expansions, q_leaf, v_leaf)
+                if self._too_much is None or roots < self._too_much[0] or expansions < self._too_much[1]:
+                    try:
+                        full = full_width(leaves, self.topology, root_B, max_nodes=self.max_nodes)
+                        self._picked = _all_paths(full)
+                        return full
+                    except NodeBudgetExceeded:
+                        self._too_much = roots, expansions
+                return self._narrowed(leaves, root_B, calls_before)
             except RandomOutcomes:
                 if not isinstance(self.model, SamplingModel):
                     raise
                 self.topology = None
-        return self._sampled(root_B, depth, expansions, q_leaf, v_leaf, generator)
+        return self._sampled(leaves, root_B, generator)
 
-    def _listed(
-        self, root_B: Tensor, depth: int, expansions: int, q_leaf: Leaf | None, v_leaf: Leaf | None
-    ) -> Lookahead:
+    def _narrowed(self, leaves: Leaves, root_B: Tensor, calls_before: int) -> Lookahead:
+        """Expectimax of the largest width that fits.
+
+        Args:
+            calls_before: `topology.model_calls` before the search; what it tried in vain counts too.
+        """
         assert self.topology is not None
         topology: Topology = self.topology
-        calls_before, calls_left_behind = topology.model_calls, 0
-
-        def look(max_width: int | None) -> Lookahead:
-            return expectimax(
-                topology.model,
-                root_B,
-                depth=depth,
-                q_leaf=q_leaf,
-                v_leaf=v_leaf,
-                topology=topology,
-                max_nodes=self.max_nodes,
-                max_width=max_width,
-            )
-
-        too_much = self._too_much
-        if too_much is None or len(root_B) < too_much[0] or expansions < too_much[1]:
-            try:
-                full = look(None)
-                self._picked = f"expectimax: the model lists its outcomes, and {full.nodes} nodes hold all paths"
-                return full
-            except NodeBudgetExceeded:
-                self._too_much = len(root_B), expansions
-        begun_anew = False
+        calls_left_behind, is_emptied = 0, False
         while True:
             try:
-                narrow = look(self._width)
+                narrow = pruned(leaves, topology, root_B, max_width=self._width, max_nodes=self.max_nodes)
                 break
             except NodeBudgetExceeded as error:
                 if isinstance(error, MemoryBudgetExceeded):
-                    # What was found before, or by this attempt, takes memory too; the next one begins without it.
+                    # What earlier searches, or this attempt, left in the topology takes memory too: try without it.
                     calls_left_behind += topology.model_calls - calls_before
                     is_full = topology.num_expanded > 0
-                    topology = self.topology = topology.anew()
+                    topology = self.topology = topology.fresh()
                     calls_before = 0
-                    if is_full and not begun_anew:
-                        begun_anew = True
+                    if is_full and not is_emptied:
+                        is_emptied = True
                         continue
                 if self._width == 1:
                     raise
                 self._width //= 2
         if float(narrow.pruned_BA.max()) == 0:
-            self._picked = f"expectimax: the model lists its outcomes, and {narrow.nodes} nodes hold all paths"
+            self._picked = _all_paths(narrow)
         else:
             self._picked = (
                 f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes, "
@@ -119,16 +109,9 @@ class AutoSearch(Search):
             self._width *= 2
         return replace(narrow, model_calls=calls_left_behind + topology.model_calls - calls_before)
 
-    def _sampled(
-        self,
-        root_B: Tensor,
-        depth: int,
-        expansions: int,
-        q_leaf: Leaf | None,
-        v_leaf: Leaf | None,
-        generator: torch.Generator,
-    ) -> Lookahead:
-        roots, A = len(root_B), self.model.num_actions
+    def _sampled(self, leaves: Leaves, root_B: Tensor, generator: torch.Generator) -> Lookahead:
+        """Sparse sampling with as many samples as fit."""
+        roots, A, expansions = len(root_B), self.model.num_actions, leaves.expansions
         if roots > self._most_asked[0] or expansions > self._most_asked[1]:
             self._samples, self._most_asked = 0, (roots, expansions)
         while (
@@ -142,7 +125,7 @@ class AutoSearch(Search):
                 search = SampledSearch(
                     self.model, samples=self._samples, max_nodes=self.max_nodes, max_bytes=self.max_bytes
                 )
-                look = search(root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, generator=generator)
+                look = search.look_ahead(leaves, root_B, generator)
                 break
             except NodeBudgetExceeded:
                 if self._samples == 1:
@@ -150,7 +133,7 @@ class AutoSearch(Search):
                 self._samples //= 2
         tree = tree_nodes(roots, A * self._samples, expansions)
         self._picked = (
-            f"sampled, {self._samples} outcomes of each action: the model only draws, and {look.nodes} nodes hold "
+            f"sampled, {self._samples} outcomes of each action: the model only samples, and {look.nodes} nodes hold "
             f"{tree:.3g} paths"
         )
         if self._samples < MOST_SAMPLES and look.nodes * 2**expansions <= self.max_nodes:
@@ -165,9 +148,13 @@ class AutoSearch(Search):
         if not isinstance(choices["_picked"], str) or len(choices["_most_asked"]) != 2:
             raise PgtsError("its choices are of another form")
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         if self.topology is not None:
-            self.topology = self.topology.anew()
+            self.topology = self.topology.fresh()
 
     def __str__(self) -> str:
         return self._picked
+
+
+def _all_paths(look: Lookahead) -> str:
+    return f"expectimax: the model enumerates its outcomes, and {look.nodes} nodes hold all paths"

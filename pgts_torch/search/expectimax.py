@@ -5,14 +5,12 @@ from jaxtyping import Int
 from torch import Tensor
 
 from pgts_torch.bellman import backup, sweep
-from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead
 from pgts_torch.search.pruned import pruned
-from pgts_torch.search.topology import Topology
+from pgts_torch.search.topology import Topology, topology_of
 
 
-@torch.no_grad()
 def expectimax(
     model: EnumeratingModel,
     root_B: Int[Tensor, "B"],
@@ -26,35 +24,38 @@ def expectimax(
 ) -> Lookahead:
     """(T^m Q)(s, .) at the roots for m = depth.        [PGTS Sec. 3]
 
-    With `q_leaf` = Q the model is unfolded m levels and max_a Q(s, a) stands at the bottom. With `v_leaf` = v it is
-    unfolded m + 1 levels with v at the bottom, which is T^m Q for Q = r + gamma P v: the lowest backup takes no maximum
+    With `q_leaf` = Q the roots are expanded m levels and max_a Q(s, a) stands at the bottom. With `v_leaf` = v they are
+    expanded m + 1 levels with v at the bottom, which is T^m Q for Q = r + gamma P v: the lowest backup takes no maximum
     before it, the others do.
 
     Paths of one level that meet in a state are one node, also across roots, and once a level brings no new state the
-    closed set is swept without asking the model again. In deterministic and in stochastic models the result is exact.
+    closed set is swept without further queries. In deterministic and in stochastic models the result is exact.
 
     Args:
-        model: lists the outcomes of a state.
+        model: enumerates the outcomes of a state.
         root_B: states of the model, int64; repeated ones cost nothing.
         depth: m, a finite whole number of at least 0.
         q_leaf: an estimate of Q^pi: states [N] to [N, A].
         v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.
         topology: what earlier searches of the same model found; this search adds to it. Default: a fresh one.
         max_nodes: the most nodes, summed over levels.
-        max_width: W, the most states of each level below the roots that are unfolded further; the critic values the
-            others at once (`pgts_torch.search.pruned`). None: all of them.
+        max_width: W, the most states of each level below the roots that are expanded; the critic values the others
+            at once (`pgts_torch.search.pruned`). None: all of them.
 
     Raises:
         PgtsError: a bad depth or width, roots that are no states, leaf values of a wrong shape or not finite (naming
             the state).
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
-    leaves = Leaves(model, depth, q_leaf, v_leaf)
-    topology = topology or Topology(model)
-    if topology.model is not model:
-        raise PgtsError("the topology belongs to another model")
+    leaves, topology = Leaves(model, depth, q_leaf, v_leaf), topology_of(model, topology)
     if max_width is not None:
         return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
+    return full_width(leaves, topology, root_B, max_nodes=max_nodes)
+
+
+@torch.no_grad()
+def full_width(leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_nodes: int) -> Lookahead:
+    """`expectimax` of all states of all levels, with leaves and topology at hand."""
     calls_before = topology.model_calls
     levels = topology.levels(root_B, leaves.expansions, max_nodes=max_nodes)
     bottom = levels.leaves(leaves.expansions)

@@ -3,16 +3,12 @@
 from typing import final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError
-from pgts_torch.search.lookahead import Leaf, Leaves
+from pgts_torch.search.lookahead import Leaves
 from pgts_torch.search.memory import GROWTH, check_memory
 from pgts_torch.search.topology import Topology, counting
-
-_FAIR = 1e-3
-"""By how much the probabilities of a prior may miss 1."""
 
 
 @final
@@ -32,8 +28,8 @@ class KnownStates:
     max_bytes: the topology's: the most memory that the tables and the nodes of the search may take.
     """
 
-    def __init__(self, topology: Topology, leaves: Leaves, prior: Leaf | None) -> None:
-        self._topology, self._leaves, self._prior, self.max_bytes = topology, leaves, prior, topology.max_bytes
+    def __init__(self, topology: Topology, leaves: Leaves) -> None:
+        self._topology, self._leaves, self.max_bytes = topology, leaves, topology.max_bytes
         model = topology.model
         self.num_actions, self.num_outcomes = model.num_actions, 1
         self.device, self.dtype = model.device, model.dtype
@@ -88,7 +84,7 @@ class KnownStates:
             state_N = state_N.clone()
             outcomes, children = self._topology.step(state_N)
             v_C = self._leaves.v(children) if len(children) else None
-            prior = self._priors(state_N)
+            prior = self._leaves.prior(state_N)
         N, _, K = outcomes.child_NAK.shape
         has_weight = counting(outcomes)
         zero = torch.zeros((), dtype=self.dtype, device=self.device)
@@ -136,19 +132,6 @@ class KnownStates:
                 fill = -torch.inf if name.startswith("shut") else 0
                 setattr(self, name, widened(getattr(self, name), self.num_outcomes, K, fill))
             self.num_outcomes = K
-
-    def _priors(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
-        N, A = len(state_N), self.num_actions
-        if self._prior is None:
-            return torch.full((N, A), 1 / A, dtype=self.dtype, device=self.device)
-        prior_NA = self._prior(state_N).to(self.dtype)
-        if prior_NA.shape != (N, A):
-            raise PgtsError(f"the prior answered with shape {tuple(prior_NA.shape)}; {N} states ask for {(N, A)}")
-        off_N = ~((prior_NA >= 0).all(-1) & ((prior_NA.sum(-1) - 1).abs() <= _FAIR))
-        if off_N.any():
-            n = int(off_N.nonzero()[0, 0])
-            raise PgtsError(f"the prior of state {int(state_N[n])} is {prior_NA[n].tolist()}; it is no distribution")
-        return prior_NA
 
 
 def longer(x_N: Tensor, rows: int) -> Tensor:

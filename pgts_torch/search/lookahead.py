@@ -1,4 +1,4 @@
-"""What every search takes and gives: leaf values in, values of all actions of the roots out."""
+"""What every search takes and returns: leaf values in, values of all actions of the roots out."""
 
 import math
 from collections.abc import Callable
@@ -16,12 +16,15 @@ from pgts_torch.models.base import Model
 from pgts_torch.tabular.exact import check_depth
 
 Leaf = Callable[[Tensor], Tensor]
-"""A critic as a search asks it: states [N] to values [N, A] (of Q^pi) or [N] (of v^pi)."""
+"""A critic or a policy as a search calls it: states [N] to values of Q^pi [N, A] or of v^pi [N], or to pi [N, A]."""
 
 MAX_NODES = 10_000_000
 
 MAX_BYTES = 4 * 2**30
 """How much memory a search may take at its peak, with what is remembered for the next ones."""
+
+_FAIR = 1e-3
+"""By how much the probabilities of a prior may miss 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,19 +33,19 @@ class Lookahead:
 
     q_BA: lookahead values of all actions, in reward units and in the dtype of the model; they carry no gradient.
         -inf where the action is not allowed.
-    stderr_BA: standard error of q that comes from sampled outcomes, in reward units: 0 where all outcomes were listed,
-        NaN where it was not estimated.
+    stderr_BA: standard error of q that comes from sampled outcomes, in reward units: 0 where all outcomes were
+        enumerated, NaN where it was not estimated.
     pruned_BA: in [0, 1]: the most discounted probability that any plan after (s, a) puts on nodes above the last level
         that the critic values in place of a deeper look. If the critic is off by at most e there,
         |q - T^m Q| <= pruned * e beside the sampling error; 0 for a search of full width.
-    model_calls: how many (state, action) the model was asked for in this search.
-    critic_calls: how often the critic was asked, each time for many states together.
+    model_calls: for how many (state, action) the model was queried in this search.
+    critic_calls: how often the critic was called, each time for many states together.
     nodes_per_level: how many nodes are backed up at each level, from the roots to the leaves.
     bias_BA: how much q is too high because maxima were taken over sampled values, in reward units, as far as the sample
         itself can tell; None where nothing was sampled.
-    samples: the fewest outcomes that were drawn of a (state, action); None where none were.
+    samples: the fewest outcomes that were sampled of a (state, action); None where none were.
     value_range: between which numbers the model's values lie; both the same (0) where its actions have one outcome
-        each, so that samples which agree say all.
+        each, so that equal samples leave no doubt.
     """
 
     q_BA: Float[Tensor, "B A"]
@@ -59,7 +62,7 @@ class Lookahead:
         """Lower and upper bounds of T^m Q, as far as sampled outcomes put it in doubt: q - bias -+ t stderr.
 
         t is the quantile of Student's distribution with C - 1 degrees of freedom, C = `samples`. Where samples agree so
-        far that stderr is 0 the range of the values has the word instead: with values in [l, u]
+        far that stderr is 0 the interval comes from the range of the values instead: with values in [l, u]
 
             q - f (q - l)  to  q + f (u - q),        f = 1 - (1 - confidence)^{1 / (C - 1)}
 
@@ -108,53 +111,75 @@ class Lookahead:
 
 @final
 class Leaves:
-    """The critic of one search: checks what it says and counts how often it is asked.
+    """What the critic says of the states of one search, and the policy it may start from, both checked.
+
+    calls: how often the critic was called.
+    expansions: how many levels are expanded: with Q at the bottom m, with v one more, for Q = r + gamma P v.
 
     Args:
-        model: whose states are asked about.
+        model: of the states.
         depth: m, a finite whole number of at least 0.
         q_leaf: an estimate of Q^pi: states [N] to [N, A]; -inf where an action is not allowed.
         v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.
+        prior: the policy, states [N] to probabilities [N, A]. Default: uniform.
 
     Raises:
         PgtsError: a bad depth, or not exactly one critic.
     """
 
-    def __init__(self, model: Model, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None) -> None:
+    def __init__(
+        self, model: Model, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, prior: Leaf | None = None
+    ) -> None:
         if (q_leaf is None) == (v_leaf is None):
             raise PgtsError("give exactly one of q_leaf and v_leaf")
         self.calls = 0
         self.expansions = check_depth(depth) + (v_leaf is not None)
-        """How many levels are unfolded: with Q at the bottom m of them, with v one more, for Q = r + gamma P v."""
-        self._model, self._q_leaf, self._v_leaf = model, q_leaf, v_leaf
+        self._model, self._q_leaf, self._v_leaf, self._prior = model, q_leaf, v_leaf, prior
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         """v, or max_a Q(s, a).
 
         Raises:
-            PgtsError: the critic's answer has a wrong shape, or is not finite (naming the state).
+            PgtsError: the critic returns a wrong shape, or values that are not finite (naming the state).
         """
         if self._v_leaf is None:
             return self.q(state_N).amax(-1)
-        return self._asked(self._v_leaf, state_N, (len(state_N),))
+        return self._called(self._v_leaf, state_N, (len(state_N),))
 
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
         """Q(s, .), -inf where an action is not allowed; as `v` otherwise. Only for critics of Q^pi."""
         assert self._q_leaf is not None
-        return self._asked(self._q_leaf, state_N, (len(state_N), self._model.num_actions))
+        return self._called(self._q_leaf, state_N, (len(state_N), self._model.num_actions))
 
-    def _asked(self, leaf: Leaf, state_N: Tensor, shape: tuple[int, ...]) -> Tensor:
+    def prior(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
+        """pi(.|s), or uniform probabilities.
+
+        Raises:
+            PgtsError: the policy returns a wrong shape, or what is no distribution (naming the state).
+        """
+        N, A = len(state_N), self._model.num_actions
+        if self._prior is None:
+            return torch.full((N, A), 1 / A, dtype=self._model.dtype, device=self._model.device)
+        prior_NA = self._prior(state_N).to(self._model.dtype)
+        if prior_NA.shape != (N, A):
+            raise PgtsError(f"the prior has shape {tuple(prior_NA.shape)}; for {N} states it must be {(N, A)}")
+        off_N = ~((prior_NA >= 0).all(-1) & ((prior_NA.sum(-1) - 1).abs() <= _FAIR))
+        if off_N.any():
+            n = int(off_N.nonzero()[0, 0])
+            raise PgtsError(f"the prior of state {int(state_N[n])} is {prior_NA[n].tolist()}; it is no distribution")
+        return prior_NA
+
+    def _called(self, leaf: Leaf, state_N: Tensor, shape: tuple[int, ...]) -> Tensor:
         self.calls += 1
         values = leaf(state_N).to(self._model.dtype)
         if values.shape != shape:
-            given, asked = tuple(values.shape), len(state_N)
-            raise PgtsError(f"the critic answered with shape {given}; {asked} leaves ask for {shape}")
+            raise PgtsError(f"the critic's values have shape {tuple(values.shape)}; of {len(state_N)} leaves: {shape}")
         check_finite("value", "the critic's value", values, state_N)
         return values
 
 
 def unexpanded(leaves: Leaves, root_B: Int[Tensor, "B"]) -> Lookahead:
-    """The lookahead of no levels: what the critic of Q^pi says of the roots, asked once about each."""
+    """The lookahead of no levels: the critic's Q at the roots, called once for the distinct ones."""
     state_N, row_B = torch.unique(root_B, return_inverse=True)
     q_BA = leaves.q(state_N)[row_B]
     zero_BA = torch.zeros_like(q_BA)

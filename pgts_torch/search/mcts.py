@@ -13,7 +13,7 @@ from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.search.known import KnownStates
 from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead, check_states, check_vector, unexpanded
 from pgts_torch.search.split import Rule, Selection, sigma
-from pgts_torch.search.topology import Topology
+from pgts_torch.search.topology import Topology, topology_of
 from pgts_torch.search.tree import Backup, Tree
 from pgts_torch.seeding import draw_keys, mix, uniform
 
@@ -23,7 +23,6 @@ _WHOLE = 1e-6
 """In a graph shares of simulations add up to whole ones up to rounding."""
 
 
-@torch.no_grad()
 def mcts(
     model: EnumeratingModel,
     root_B: Int[Tensor, "B"],
@@ -92,20 +91,60 @@ def mcts(
         NodeBudgetExceeded: more than `max_nodes` would be needed; or what is to be expanded next would not fit into
             `max_bytes`, and the model has not been asked about it.
     """
-    _check(simulations, root, rule, exploration, wave, prior, backup, merge, generator)
-    leaves = Leaves(model, depth, q_leaf, v_leaf)
-    topology = topology or Topology(model)
-    if topology.model is not model:
-        raise PgtsError("the topology belongs to another model")
+    check_options(
+        simulations=simulations,
+        root=root,
+        rule=rule,
+        exploration=exploration,
+        wave=wave,
+        has_prior=prior is not None,
+        backup=backup,
+        merge=merge,
+    )
+    if root == "rule" and generator is not None:
+        raise PgtsError("only root='gumbel' draws from a generator")
+    return grow(
+        Leaves(model, depth, q_leaf, v_leaf, prior),
+        topology_of(model, topology),
+        root_B,
+        simulations=simulations,
+        root=root,
+        rule=rule,
+        exploration=exploration,
+        wave=wave,
+        backup=backup,
+        merge=merge,
+        generator=generator,
+        max_nodes=max_nodes,
+    )
+
+
+@torch.no_grad()
+def grow(
+    leaves: Leaves,
+    topology: Topology,
+    root_B: Int[Tensor, "B"],
+    *,
+    simulations: int,
+    root: Root,
+    rule: Rule,
+    exploration: float | None,
+    wave: int | None,
+    backup: Backup,
+    merge: bool,
+    generator: torch.Generator | None,
+    max_nodes: int,
+) -> Lookahead:
+    """`mcts`, with leaves and topology at hand and its options checked."""
     check_vector(root_B)
-    check_states(root_B, model.num_states)
+    check_states(root_B, topology.model.num_states)
     if leaves.expansions == 0:
         return unexpanded(leaves, root_B)
     state_B, row_B = root_B.unique(return_inverse=True)
     calls_before = topology.model_calls
     # Tens of small operations a level: without the bookkeeping of autograd each is a fifth cheaper.
     with torch.inference_mode():
-        known = KnownStates(topology, leaves, prior)
+        known = KnownStates(topology, leaves)
         known.rows(state_B)  # before there is a tree: its tables are as wide as K is by then
         selection = Selection(rule, 1.25 if exploration is None else exploration)
         room = len(state_B) * simulations
@@ -207,17 +246,18 @@ def _preference(known: KnownStates, state_B: Tensor, generator: torch.Generator 
     return log_prior_BA - (-u_BA.log()).log().to(known.dtype)
 
 
-def _check(
+def check_options(
+    *,
     simulations: int,
     root: str,
     rule: str,
     exploration: float | None,
     wave: int | None,
-    prior: Leaf | None,
+    has_prior: bool,
     backup: str,
     merge: bool,
-    generator: torch.Generator | None,
 ) -> None:
+    """PgtsError where an option of `mcts` is out of range, or has no effect beside the others."""
     check_count("simulations", simulations)
     for name, value, words in (("root", root, Root), ("rule", rule, Rule), ("backup", backup, Backup)):
         if value not in get_args(words):
@@ -230,7 +270,5 @@ def _check(
         raise PgtsError(f"exploration is {exploration}; it must be finite and at least 0")
     if merge and backup == "mean":
         raise PgtsError("merge needs backup='max': a node that several paths share has no return of its own")
-    if root == "rule" and generator is not None:
-        raise PgtsError("only root='gumbel' draws from a generator")
-    if root == "rule" and rule == "uct" and prior is not None:
-        raise PgtsError("rule='uct' without root='gumbel' asks for no prior")
+    if root == "rule" and rule == "uct" and has_prior:
+        raise PgtsError("rule='uct' without root='gumbel' uses no prior")

@@ -11,7 +11,7 @@ from pgts_torch.bellman import Outcomes, backup
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.empirical import Empirical, Share
-from pgts_torch.search.expectimax import expectimax
+from pgts_torch.search.expectimax import full_width
 from pgts_torch.search.lookahead import (
     MAX_BYTES,
     MAX_NODES,
@@ -33,7 +33,6 @@ _CHUNK = 2**22
 """The most resampled outcomes of one level that are held at a time, or those of one replicate."""
 
 
-@torch.no_grad()
 def sampled(
     model: SamplingModel,
     root_B: Int[Tensor, "B"],
@@ -87,7 +86,33 @@ def sampled(
         PgtsError: as `expectimax`; C below 1; several C with share="search"; a model that cannot do what is asked.
         NodeBudgetExceeded: more than `max_nodes` or `max_bytes` would be needed.
     """
-    leaves = Leaves(model, depth, q_leaf, v_leaf)
+    return sparse(
+        Leaves(model, depth, q_leaf, v_leaf),
+        model,
+        root_B,
+        samples=samples,
+        share=share,
+        generator=generator,
+        replicates=replicates,
+        max_nodes=max_nodes,
+        max_bytes=max_bytes,
+    )
+
+
+@torch.no_grad()
+def sparse(
+    leaves: Leaves,
+    model: SamplingModel,
+    root_B: Int[Tensor, "B"],
+    *,
+    samples: int | Sequence[int | None],
+    share: Share,
+    generator: torch.Generator,
+    replicates: int,
+    max_nodes: int,
+    max_bytes: int,
+) -> Lookahead:
+    """`sampled`, with its leaves at hand."""
     check_vector(root_B)
     check_states(root_B, model.num_states)
     plan = plan_levels(samples, leaves.expansions, share, model)
@@ -99,9 +124,7 @@ def sampled(
     if all(C is None for C in plan):
         assert isinstance(model, EnumeratingModel)
         topology = Topology(model, max_bytes=max_bytes)
-        return expectimax(
-            model, root_B, depth=depth, q_leaf=q_leaf, v_leaf=v_leaf, topology=topology, max_nodes=max_nodes
-        )
+        return full_width(leaves, topology, root_B, max_nodes=max_nodes)
     empirical = Empirical(model, root_B, samples=plan, share=share, key=key)
     topology = Topology(empirical, max_bytes=max_bytes)
     steps, bottom_N, nodes_per_level = _unfolded(empirical, topology, leaves.expansions, share, max_nodes)

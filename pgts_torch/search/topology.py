@@ -198,8 +198,8 @@ class Topology:
         children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
         return self._renumbered(outcomes, counts_NAK, children), children
 
-    def anew(self) -> "Topology":
-        """One of the same model and limits that has asked nothing yet."""
+    def fresh(self) -> "Topology":
+        """An empty one of the same model and limits."""
         return Topology(self.model, max_bytes=self.max_bytes)
 
     @property
@@ -208,7 +208,7 @@ class Topology:
         return max(self.model.num_outcomes or 1, self._known.num_outcomes)
 
     @property
-    def asked(self) -> Int[Tensor, "N"]:
+    def queried(self) -> Int[Tensor, "N"]:
         """The states that the model has been asked about, ascending."""
         return torch.nonzero(self._row_S >= 0).flatten()
 
@@ -220,14 +220,14 @@ class Topology:
     def expanded(self) -> tuple[Int[Tensor, "X"], Outcomes]:
         """The states that the model has been asked about, in the order of asking, and what follows them, in terms of
         states and in the memory where it lies."""
-        asked = self.asked
-        state_X = torch.empty_like(asked)
-        state_X[self._row_S[asked]] = asked
+        queried = self.queried
+        state_X = torch.empty_like(queried)
+        state_X[self._row_S[queried]] = queried
         return state_X, replace(self._known.all(), num_children=self.model.num_states)
 
     @torch.inference_mode(False)
     @torch.no_grad()
-    def recall(self, state_N: Int[Tensor, "N"]) -> None:
+    def preload(self, state_N: Int[Tensor, "N"]) -> None:
         """Have the outcomes of these states ready, as if they had been asked about before; `model_calls` does not
         count them."""
         self._grow_tables()
@@ -366,6 +366,14 @@ class Topology:
             unknown = torch.full((missing,), -1, dtype=torch.int64, device=self.model.device)
             self._row_S = torch.cat([self._row_S, unknown])
             self._scratch_S = torch.cat([self._scratch_S, unknown])
+
+
+def topology_of(model: EnumeratingModel, topology: Topology | None) -> Topology:
+    """The topology that a caller gave, or a fresh one; PgtsError if it belongs to another model."""
+    topology = topology or Topology(model)
+    if topology.model is not model:
+        raise PgtsError("the topology belongs to another model")
+    return topology
 
 
 def counting(outcomes: Outcomes) -> Bool[Tensor, "N A K"]:

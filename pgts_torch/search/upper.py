@@ -92,8 +92,8 @@ class UpperBound:
         return u_S1[state_N, 0]
 
     def state_dict(self) -> dict[str, Any]:
-        """What later bounds depend on, in the order of `topology.asked`, on the CPU."""
-        asked = self.topology.asked
+        """What later bounds depend on, in the order of `topology.queried`, on the CPU."""
+        asked = self.topology.queried
         return {
             "bound": self._grown(self._bound_S)[asked].cpu(),
             "below": self._grown(self._below_S)[asked].cpu(),
@@ -105,7 +105,7 @@ class UpperBound:
         """Take over what `state_dict` gave; the topology has recalled what was asked."""
         if self.w < math.inf:
             self._take_in()
-            asked = self.topology.asked
+            asked = self.topology.queried
             self._bound_S[asked] = state["bound"].to(asked.device)
             self._below_S[asked] = state["below"].to(asked.device)
             self._settled = state["settled"]

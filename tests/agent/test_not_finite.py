@@ -114,14 +114,14 @@ def in_targets(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
 def in_lookaheads(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
     search = model.search
     assert search is not None
-    look = search._look
+    look = search.look_ahead
 
     def wrapped(*args):
         answer = look(*args)
         answer.q_BA[-1] = value
         return answer
 
-    patch.setattr(search, "_look", wrapped)
+    patch.setattr(search, "look_ahead", wrapped)
 
 
 def in_logits(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:

@@ -7,9 +7,19 @@ import torch
 
 from pgts_torch import PGTS
 from pgts_torch.errors import PgtsError
+from pgts_torch.models import TabularModel
+from pgts_torch.search import mcts
 from pgts_torch.tabular import exact
 
 LEFT = {"type": "softmax", "init": {"type": "biased", "action": 0, "probability": 0.99}}
+ALPHA_ZERO = {
+    "type": "mcts",
+    "simulations": 12,
+    "root": "rule",
+    "rule": "puct",
+    "prior": "policy",
+    "backup": "mean",
+}
 SEARCHES = [
     "auto",
     {"type": "expectimax", "max_width": 3},
@@ -48,7 +58,7 @@ def test_a_lookahead_does_not_depend_on_what_was_looked_at_before(search):
     torch.testing.assert_close(model.lookahead(torch.tensor([0, 3])).q_BA, first, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("search", SEARCHES, ids=str)
+@pytest.mark.parametrize("search", [*SEARCHES, ALPHA_ZERO], ids=str)
 def test_a_model_is_saved_with_its_search_and_trains_on_alike(search, tmp_path):
     made = PGTS("pgts/Random-v0", depth=2, search=search, num_envs=4, seed=3)
     made.iterate()
@@ -63,6 +73,26 @@ def test_every_search_has_a_limit_of_memory(search):
     with pytest.raises(PgtsError, match=r"the limit is 9\.31e-08 GiB"):
         PGTS("pgts/Ladder-v0", depth=2, search={**description, "max_bytes": 100}, num_envs=2).iterate()
     PGTS("pgts/Ladder-v0", depth=2, search={**description, "max_bytes": 100_000}, num_envs=2).iterate()
+
+
+def test_the_prior_of_the_policy_is_that_of_the_policy_as_it_is_now():
+    model = PGTS("pgts/Random-v0", depth=3, search=ALPHA_ZERO, num_envs=4, seed=3)
+    roots, table = torch.arange(model.mdp.num_states), TabularModel(model.mdp)
+
+    def direct() -> torch.Tensor:
+        options = {name: value for name, value in ALPHA_ZERO.items() if name not in ("type", "prior")}
+        pi_SA, critic = model.policy.table(), model.critic
+        leaf = {f"{critic.target}_leaf": critic.v if critic.target == "v" else critic.q}
+        return mcts(table, roots, depth=3, **leaf, **options, prior=lambda s: pi_SA[s]).q_BA
+
+    before = model.lookahead(roots).q_BA
+    assert torch.equal(before, direct())
+    model.iterate()
+    assert torch.equal(model.lookahead(roots).q_BA, direct())
+    model.policy.logits_SA[:, 0] += 5.0
+    changed = model.lookahead(roots).q_BA
+    assert torch.equal(changed, direct())
+    assert not torch.equal(changed, before)
 
 
 def test_samples_prove_nothing_but_a_narrow_search_does():
@@ -83,6 +113,7 @@ def test_samples_prove_nothing_but_a_narrow_search_does():
         ({"type": "auto", "max_width": 3}, "search 'auto' does not take these options: \\['max_width'\\]"),
         ({"type": "mcts", "share": "level"}, "search 'mcts' does not take"),
         ({"type": "mcts", "samples": 0}, "samples is 0"),
+        ({"type": "expectimax", "prior": "policy"}, "search 'expectimax' does not take"),
     ],
 )
 def test_a_search_that_does_not_exist_or_an_option_that_it_does_not_heed_is_refused(search, message):

@@ -24,7 +24,7 @@ def found(nodes: int, root_B: Tensor) -> Lookahead:
 
 
 def asked(search: AutoSearch, roots: int = 1, depth: int = 1) -> None:
-    """One search whose leaves are valued by v: it unfolds depth + 1 levels."""
+    """One search whose leaves are valued by v: depth + 1 levels are expanded."""
     search(torch.zeros(roots, dtype=torch.int64), depth=depth, v_leaf=torch.zeros_like, generator=stream(0, "search"))
 
 
@@ -35,14 +35,15 @@ def widths(monkeypatch) -> Callable[[Callable[[int], int]], list[int | None]]:
     def replace(nodes_of: Callable[[int], int]) -> list[int | None]:
         tried: list[int | None] = []
 
-        def expectimax(_: Any, root_B: Tensor, *, max_width: int | None, max_nodes: int, **__: Any) -> Lookahead:
+        def search(_: Any, __: Any, root_B: Tensor, *, max_nodes: int, max_width: int | None = None) -> Lookahead:
             tried.append(max_width)
             nodes = TOO_LARGE if max_width is None else nodes_of(max_width)
             if nodes > max_nodes:
                 raise NodeBudgetExceeded(f"it has {nodes} nodes")
             return found(nodes, root_B)
 
-        monkeypatch.setattr(auto, "expectimax", expectimax)
+        monkeypatch.setattr(auto, "full_width", search)
+        monkeypatch.setattr(auto, "pruned", search)
         return tried
 
     return replace
@@ -100,7 +101,7 @@ def samples(monkeypatch) -> Callable[[Callable[[int], int]], list[int]]:
                 tried.append(samples)
                 self.nodes, self.max_nodes = nodes_of(samples), max_nodes
 
-            def __call__(self, root_B: Tensor, **_: Any) -> Lookahead:
+            def look_ahead(self, _: Any, root_B: Tensor, __: Any) -> Lookahead:
                 if self.nodes > self.max_nodes:
                     raise NodeBudgetExceeded(f"it has {self.nodes} nodes")
                 return found(self.nodes, root_B)
@@ -137,15 +138,15 @@ def test_samples_are_never_more_than_32(samples):
     assert tried == [2, 4, 8, 16, 32, 32, 32]
 
 
-@pytest.mark.parametrize(("roots", "depth", "anew"), [(2, 2, False), (1, 1, False), (3, 2, True), (2, 3, True)])
-def test_a_search_of_more_roots_or_of_more_levels_begins_anew(roots, depth, anew, samples):
+@pytest.mark.parametrize(("roots", "depth", "again"), [(2, 2, False), (1, 1, False), (3, 2, True), (2, 3, True)])
+def test_a_search_of_more_roots_or_of_more_levels_chooses_its_samples_again(roots, depth, again, samples):
     tried = samples(lambda C: 1)
     search = AutoSearch(DrawingModel(zoo("ladder")), max_nodes=200)
     for _ in range(3):
         asked(search, roots=2, depth=2)
     assert tried == [2, 4, 8]
     asked(search, roots=roots, depth=depth)
-    assert (tried[-1] < 8) == anew
+    assert (tried[-1] < 8) == again
 
 
 def test_a_sampled_search_that_turns_out_too_large_is_done_again_with_half(samples):

@@ -150,7 +150,7 @@ def test_a_critic_that_does_not_answer_with_numbers_is_named_by_the_state(engine
         ({"root_B": torch.tensor([], dtype=torch.int64)}, "at least one state"),
         ({"q_leaf": lambda s: torch.zeros(len(s), 2)}, "exactly one of q_leaf and v_leaf"),
         ({"v_leaf": None}, "exactly one of q_leaf and v_leaf"),
-        ({"v_leaf": lambda s: torch.zeros(len(s), 3)}, "answered with shape"),
+        ({"v_leaf": lambda s: torch.zeros(len(s), 3)}, "values have shape"),
     ],
 )
 def test_bad_questions_are_refused(engine, changed, message):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pgts_torch.errors import MissingModel, NodeBudgetExceeded, PgtsError
 from pgts_torch.models import EnumeratingModel, SamplingModel, SimulatorModel, TabularModel, Transitions
-from pgts_torch.search import Lookahead, sampled
+from pgts_torch.search import Lookahead, mcts, sampled
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
 from pgts_torch.seeding import stream
@@ -79,7 +79,7 @@ def test_where_all_paths_fit_the_automatic_search_looks_at_all_of_them_and_says_
     search = AutoSearch(TabularModel(GARNET))
     assert str(search) == "nothing yet"
     nodes = look(search).nodes
-    assert str(search) == f"expectimax: the model lists its outcomes, and {nodes} nodes hold all paths"
+    assert str(search) == f"expectimax: the model enumerates its outcomes, and {nodes} nodes hold all paths"
 
 
 def test_where_they_do_not_fit_it_keeps_to_the_budget_and_asks_nothing_twice():
@@ -104,7 +104,7 @@ def test_a_model_that_only_draws_is_sampled_and_more_often_where_paths_met():
     for seed in range(6):
         search(torch.tensor([0]), depth=3, v_leaf=torch.zeros_like, generator=stream(seed, "search"))
         samples.append(int(str(search).split()[1]))
-        assert "the model only draws" in str(search)
+        assert "the model only samples" in str(search)
     # 2 actions and 2 samples on 4 levels: 341 nodes if no two paths met; the Ladder has 5 states.
     assert samples[0] == 2
     assert samples == sorted(samples)
@@ -183,10 +183,77 @@ def test_a_tree_search_of_a_model_that_only_draws_is_one_of_what_was_drawn():
     torch.testing.assert_close(seen.q_BA, expected.q_BA)
     assert seen.model_calls <= expected.model_calls
     assert not torch.equal(look(search, seed=1).q_BA, seen.q_BA)
-    assert str(search) == "mcts, 100000 simulations, merged, 2 drawn outcomes of each action"
+    assert str(search) == "mcts, 100000 simulations, merged, 2 sampled outcomes of each action"
     assert torch.equal(look(MCTSSearch(TabularModel(GARNET), simulations=100_000, samples=2)).q_BA, seen.q_BA)
     with pytest.raises(PgtsError, match="samples is 0"):
         MCTSSearch(DrawingModel(GARNET), samples=0)
+
+
+MCTS_OPTIONS = [
+    {"root": "rule"},
+    {"rule": "puct"},
+    {"rule": "uct", "exploration": 0.3},
+    {"wave": 1},
+    {"prior": "policy"},
+    {"backup": "mean"},
+    {"merge": False},
+    {"root": "rule", "rule": "puct", "exploration": 2.0, "prior": "policy", "wave": 1, "backup": "mean"},
+]
+
+
+@pytest.mark.parametrize("options", MCTS_OPTIONS, ids=str)
+def test_each_option_of_a_tree_search_is_that_of_the_function_and_changes_the_answer(options):
+    v_S, root_B = some_v(GARNET), torch.arange(40)
+    pi_SA = torch.full((GARNET.num_states, 3), 0.1, dtype=torch.float64)
+    pi_SA[:, 2] = 0.8
+    given = {"depth": 4, "v_leaf": lambda s: v_S[s]}
+
+    def searched(**options) -> Lookahead:
+        search = MCTSSearch(TabularModel(GARNET), simulations=12, **options)
+        return search(root_B, **given, prior=lambda s: pi_SA[s], generator=stream(0, "search"))
+
+    of_function = dict(options)
+    of_function.setdefault("merge", options.get("backup") != "mean")
+    if of_function.pop("prior", None):
+        of_function["prior"] = lambda s: pi_SA[s]
+    if options.get("root") != "rule":
+        of_function["generator"] = stream(0, "search")
+    direct = mcts(TabularModel(GARNET), root_B, **given, simulations=12, **of_function)
+    assert torch.equal(searched(**options).q_BA, direct.q_BA)
+    assert not torch.equal(searched(**options).q_BA, searched().q_BA)
+
+
+def test_a_tree_search_says_which_options_it_has():
+    model = TabularModel(GARNET)
+    alpha_zero = {"root": "rule", "rule": "puct", "prior": "policy", "backup": "mean"}
+    assert str(MCTSSearch(model, **alpha_zero)) == (
+        "mcts, 64 simulations, puct at the root too, the policy as prior, mean backups"
+    )
+    assert str(MCTSSearch(model, rule="uct", wave=1)) == "mcts, 64 simulations, uct, merged"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"root": "puct"}, "root is 'puct'; it must be one of 'gumbel', 'rule'"),
+        ({"rule": "ucb"}, "rule is 'ucb'; it must be one of 'gumbel', 'puct', 'uct'"),
+        ({"backup": "min"}, "backup is 'min'; it must be one of 'max', 'mean'"),
+        ({"prior": "best"}, "prior is 'best'; it must be one of 'uniform', 'policy'"),
+        ({"wave": 0}, "wave is 0"),
+        ({"exploration": 1.0}, "rule='gumbel' has no exploration"),
+        ({"rule": "puct", "exploration": -1.0}, "exploration is -1.0; it must be finite and at least 0"),
+        ({"backup": "mean", "merge": True}, "merge needs backup='max'"),
+        ({"root": "rule", "rule": "uct", "prior": "policy"}, "rule='uct' without root='gumbel' uses no prior"),
+    ],
+)
+def test_an_option_of_a_tree_search_that_is_out_of_range_or_has_no_effect_is_refused(options, message):
+    with pytest.raises(PgtsError, match=message):
+        MCTSSearch(TabularModel(GARNET), **options)
+
+
+def test_a_search_from_the_prior_of_the_policy_needs_the_policy():
+    with pytest.raises(PgtsError, match="the prior of the search is that of the policy: give prior"):
+        look(MCTSSearch(TabularModel(GARNET), prior="policy"))
 
 
 class ListingModel(EnumeratingModel):
@@ -204,8 +271,12 @@ class ListingModel(EnumeratingModel):
 @pytest.mark.parametrize(
     ("make", "model", "message"),
     [
-        (ExpectimaxSearch, DrawingModel, "'expectimax' needs a model that lists its outcomes; DrawingModel does not"),
-        (SampledSearch, ListingModel, "'sampled' needs a model that draws outcomes; ListingModel does not"),
+        (
+            ExpectimaxSearch,
+            DrawingModel,
+            "'expectimax' needs a model that enumerates its outcomes; DrawingModel does not",
+        ),
+        (SampledSearch, ListingModel, "'sampled' needs a model that samples outcomes; ListingModel does not"),
     ],
 )
 def test_a_search_asks_for_what_its_model_can_do(make, model, message):

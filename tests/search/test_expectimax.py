@@ -383,9 +383,9 @@ def test_roots_that_are_no_states_are_refused_and_named(roots, message):
 
 @pytest.mark.parametrize("shape", [(), (4,), (5, 1), (5, 2, 1)])
 def test_leaf_values_of_a_wrong_shape_are_refused(shape):
-    with pytest.raises(PgtsError, match=r"critic answered with shape .*; 5 leaves ask for \(5,\)"):
+    with pytest.raises(PgtsError, match=r"values have shape .*; of 5 leaves: \(5,\)"):
         expectimax(TabularModel(ladder(5)), torch.arange(5), depth=3, v_leaf=lambda _: torch.zeros(shape))
-    with pytest.raises(PgtsError, match=r"critic answered with shape .*; 5 leaves ask for \(5, 2\)"):
+    with pytest.raises(PgtsError, match=r"values have shape .*; of 5 leaves: \(5, 2\)"):
         expectimax(TabularModel(ladder(5)), torch.arange(5), depth=3, q_leaf=lambda _: torch.zeros(shape))
 
 

@@ -126,7 +126,7 @@ def test_rows_of_tables_are_what_they_take():
     columns = (outcomes.reward_NA, outcomes.prob_NAK, outcomes.discount_NAK, outcomes.child_NAK)
     sizes = Sizes(A, K, torch.float64)
     assert 7 * sizes.outcomes == sum(column.numel() * column.element_size() for column in columns)
-    known = KnownStates(Topology(model), Leaves(model, 2, None, zeros), None)
+    known = KnownStates(Topology(model), Leaves(model, 2, None, zeros))
     known.rows(ROOT)
     tree = Tree(known, 3, Selection("gumbel", 1.25), backup="max", merge=False, max_nodes=100, room=1)
     assert sizes.node == bytes_of(tree, "_N", "_NA", "_NE")
@@ -181,7 +181,7 @@ def test_samples_that_would_not_fit_are_refused_before_one_is_drawn(monkeypatch)
 
 
 @pytest.mark.parametrize("kind", [AutoSearch, ExpectimaxSearch, SampledSearch, MCTSSearch])
-def test_every_kind_of_search_has_the_limit_also_after_it_has_forgotten(kind):
+def test_every_kind_of_search_has_the_limit_also_after_a_reset(kind):
     def refuses(search: Search, root_B: Tensor) -> bool:
         try:
             search(root_B, depth=1, v_leaf=zeros, generator=stream(0, "search"))
@@ -193,7 +193,7 @@ def test_every_kind_of_search_has_the_limit_also_after_it_has_forgotten(kind):
     search = kind(model, max_bytes=150_000)
     for _ in range(2):
         assert refuses(search, torch.arange(40))
-        search.forget()
+        search.reset()
     assert not refuses(kind(model), torch.arange(40))
     assert SearchConfig().max_bytes == MAX_BYTES
 

@@ -71,7 +71,7 @@ def test_it_is_above_the_optimal_values_at_any_time_and_never_rises(scale, monke
         before_S = made.at(every)
         for step in range(60):
             if step % 6 == 0:  # another state is expanded now and then
-                topology.recall(torch.tensor([step // 3]))
+                topology.preload(torch.tensor([step // 3]))
             made.tighten(1)
             now_S = made.at(every)
             assert bool((now_S >= v_S).all())
@@ -142,7 +142,7 @@ def test_a_state_that_may_stay_for_nothing_undiscounted_bounds_nothing_and_leave
         2,
     )
     topology = Topology(Listed(stays))
-    topology.recall(torch.tensor([0, 1]))
+    topology.preload(torch.tensor([0, 1]))
     made = UpperBound(topology, 10.0, gamma=0.9)
     for _ in range(SETTLES):
         made.tighten(1)
@@ -154,12 +154,12 @@ def test_one_that_was_saved_goes_on_with_the_same_bits():
     mdp, every = random_mdp(40, 3, branching=2, seed=3, gamma=0.98, start=0), torch.arange(40)
     first = bound(expanded(mdp, 2), mdp, calls=2)
     topology = Topology(TabularModel(mdp))
-    topology.recall(first.topology.asked)
+    topology.preload(first.topology.queried)
     second = bound(topology, mdp, calls=0)
     second.load_state_dict(first.state_dict())
     for one in (first, second):
         one.tighten(1)
-        one.topology.recall(torch.tensor([5, 6, 7]))
+        one.topology.preload(torch.tensor([5, 6, 7]))
     assert torch.equal(first.at(every), second.at(every))
     third = bound(topology, mdp, calls=0)
     third.load_state_dict(first.state_dict())  # after the topology has grown, which `first` has not taken in yet
