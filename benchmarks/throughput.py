@@ -193,7 +193,7 @@ def lookahead(config: str, changes: list[str], depth: int, device: str) -> dict[
         found["seconds"].append(time.process_time() - begin)
         found["looking"].append(sum(looks))
         found["calls"].append(iteration.model_calls)
-        found["states"].append(len(iteration.state_N))
+        found["states"].append(len(iteration.observation_N))
     return found
 
 

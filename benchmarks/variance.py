@@ -147,7 +147,7 @@ def measured(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], estimates: int) -> di
         env = TabularVectorEnv(mdp, copies, autoreset_mode=AutoresetMode.DISABLED)
         world = TabularWorld(env, mdp)
         generator = stream(0, "variance", name)
-        return rollout(world, env, policy, horizon, seed=0, names=("variance", name), generator=generator)
+        return rollout(world, policy, horizon, seed=0, names=("variance", name), generator=generator)
 
     # Line r of v_RS: the critic of estimate r, which has seen episodes of its own.
     critics = [TabularCritic(S, A, method=TDLambda(0.9), step_size=STEP_SIZE) for _ in range(R)]

@@ -12,7 +12,7 @@ from pgts_torch.agent.critics import Critic, ExactCritic
 from pgts_torch.agent.policies import fitting
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.world import World
+from pgts_torch.agent.world import ModelWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.search.engine import Search
 from pgts_torch.search.upper import UpperBound
@@ -77,7 +77,7 @@ class Certificates:
         ranks: all of them get the same bounds.
     """
 
-    def __init__(self, world: World, search: Search, critic: Critic, *, num_depths: int, ranks: Ranks) -> None:
+    def __init__(self, world: ModelWorld, search: Search, critic: Critic, *, num_depths: int, ranks: Ranks) -> None:
         self._world, self._search, self._critic = world, search, critic
         self._num_depths, self._ranks = num_depths, ranks
         self._upper: UpperBound | None = None

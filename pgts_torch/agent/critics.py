@@ -89,9 +89,8 @@ class ExactCritic(Critic):
         self._evaluation: exact.Evaluation | None = None
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
-        """Solve the Bellman equation of the policy; the rollout only says what the policy sees of the states."""
-        states = torch.arange(self.mdp.num_states, device=rollout.state_TB.device)
-        self.solve(listed(policy, rollout.observe(states)))
+        """Solve the Bellman equation of the policy, which sees the states themselves; the rollout is not looked at."""
+        self.solve(listed(policy, torch.arange(self.mdp.num_states, device=rollout.alive_TB.device)))
         return {}
 
     def solve(self, pi_SA: Float[Tensor, "S A"]) -> None:
@@ -185,7 +184,7 @@ class TabularCritic(Critic):
             value_C = torch.where(self._count_C > 0, value_C, self._mean_target(rollout))
         target_TB = self._targets(rollout, partial(self._read, value_C))[rollout.alive_TB]
         check_targets(target_TB)
-        cell_TB = rollout.state_TB
+        cell_TB = rollout.observation_UB[:-1]
         if self.target == "q":
             cell_TB = cell_TB * self.num_actions + rollout.action_TB
         cell_V = cell_TB[rollout.alive_TB]
@@ -224,7 +223,7 @@ class TabularCritic(Critic):
         self._value_C, self._count_C = value_C, count_C
 
     def _targets(self, rollout: Rollout, v: Callable[[Tensor], Tensor]) -> Float[Tensor, "T B"]:
-        next_TB = rollout.next_state_TB
+        next_TB = rollout.observation_UB[1:]
         bootstrap_TB = v(next_TB.reshape(-1)).view(next_TB.shape)
         if isinstance(self.method, TDLambda):
             return lambda_returns(rollout, bootstrap_TB, rollout.discount_TB, self.method.lambda_)

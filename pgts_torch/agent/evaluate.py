@@ -6,15 +6,13 @@ from typing import Any, Self, final
 
 import scipy.special
 import torch
-from gymnasium.vector import VectorEnv
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from pgts_torch.agent.copies import close_copies
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import FixedHorizon, rollout
-from pgts_torch.agent.world import World
 from pgts_torch.errors import check_count
 from pgts_torch.seeding import SharedGenerators, stream
 
@@ -69,8 +67,7 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
     with SharedGenerators(seed, *names, "construction"):
         env = algorithm.make_copies(episodes)
     made = rollout(
-        _Watched(algorithm.world, env),
-        env,
+        algorithm.world.of(env),
         Greedy(algorithm.policy) if deterministic else algorithm.policy,
         FixedHorizon(algorithm.time_limit or UNLIMITED_LENGTH),
         seed=seed,
@@ -84,50 +81,6 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
         Score.of(made.returns()),
         Score.of(made.alive_TB.double().sum(0)),
     )
-
-
-@final
-class _Watched(World):
-    """Copies in which a policy is only watched: no state is asked for again, so none is told from another, and what
-    training says of the environment is not said once more.
-
-    Args:
-        world: says what the policy sees.
-        env: copies of its environment.
-    """
-
-    def __init__(self, world: World, env: VectorEnv) -> None:
-        self.env, self._world = env, world
-        self.num_actions, self.observation_space = world.num_actions, world.observation_space
-        self.gamma, self.device, self.noticed = world.gamma, world.device, True
-
-    def encode(self, observation: Any) -> Tensor:
-        """As in the world."""
-        return self._world.encode(observation)
-
-    def see(self, env: VectorEnv, observation: Any) -> tuple[Tensor, Int[Tensor, "B"]]:
-        """The observation, and 0 for all."""
-        return self.encode(observation), torch.zeros(env.num_envs, dtype=torch.int64, device=self.device)
-
-    def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
-        """0 for all."""
-        return read_N
-
-    def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """Nothing can be said."""
-        raise AssertionError("what was watched is over")
-
-    def export(self, state_N: Int[Tensor, "N"]) -> Any:
-        """Nothing can be said."""
-        raise AssertionError("what was watched is over")
-
-    def adopt(self, exported: Any) -> Int[Tensor, "N"]:
-        """Nothing can be said."""
-        raise AssertionError("what was watched is over")
-
-    def forget(self) -> bool:
-        """Nothing."""
-        return False
 
 
 @final

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from pgts_torch.agent.rollout import Rollout
@@ -10,11 +10,12 @@ from pgts_torch.search.lookahead import Lookahead
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class PolicyBatch:
     """What the policy pi_k is moved by.
 
-    state_N, weight_N: the states that it visited, and what each counts for in the update; with sampled advantages every
-        visit has a row of its own.
+    observation_N, weight_N: what it saw in the states that it visited, and what each of them counts for in the update;
+        with sampled advantages every visit has a row of its own.
+    state_N: these states; None with sampled advantages, which need none.
     pi_NA: pi_k at these states.
     advantage_NA: how much better each action is than the policy, with sum_a pi(a|s) A(s, a) = 0. Of a lookahead
         (T^m Q)(s, a) - <pi, T^m Q>; of what was sampled in expectation only.
@@ -29,7 +30,8 @@ class Seen:
         or nothing is known of it.
     """
 
-    state_N: Int[Tensor, "N"]
+    observation_N: Shaped[Tensor, "N ..."]
+    state_N: Int[Tensor, "N"] | None
     weight_N: Float[Tensor, "N"]
     pi_NA: Float[Tensor, "N A"]
     advantage_NA: Float[Tensor, "N A"]
@@ -41,7 +43,7 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Iteration(Seen):
+class Iteration(PolicyBatch):
     """What one pass through the loop of Algorithm 1 saw and did.
 
     experience: the episodes of pi_k.

@@ -22,7 +22,7 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
 from pgts_torch.agent.copies import check_vector_env, env_name, make_vector_env, normalizing_wrapper
-from pgts_torch.agent.world import DynamicsWorld, PlainWorld, SimulatedWorld, TabularWorld, World
+from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.adapters import adapter_for
@@ -59,7 +59,7 @@ def make_world(
     """The world of an environment: what can be asked about it decides.
 
     A transition table makes it tabular; else its dynamics are asked if they are known in torch; else snapshots make it
-    simulated. It is plain where no model is needed and there is no table.
+    simulated. It has no model where none is needed and there is no table.
 
     Args:
         env: what `num_envs` copies are made from (`make_vector_env`, with `kwargs`), or copies.
@@ -94,7 +94,7 @@ def make_world(
             "keeps: leave it out, and set normalize of the network or normalize_returns of the critic"
         )
     _check_single(action_repeat, "without a model")
-    return PlainWorld(copies, gamma=discount, observation_key=observation_key, device=device)
+    return World(copies, gamma=discount, observation_key=observation_key, device=device)
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,8 @@ class _Sought:
 
 
 def _first_model(
-    sought: _Sought, candidates: tuple[Callable[[_Sought], World | None], ...]
-) -> tuple[World | None, list[str]]:
+    sought: _Sought, candidates: tuple[Callable[[_Sought], ModelWorld | None], ...]
+) -> tuple[ModelWorld | None, list[str]]:
     """The world of the first model that is not refused, and why those before it were."""
     copies, reasons = sought.copies, list[str]()
     if type(copies) is TabularVectorEnv:

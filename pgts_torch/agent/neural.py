@@ -148,7 +148,7 @@ class NetworkCritic(Critic):
             self._asked = None  # they were sums over the actions of another policy
         self._policy = policy
         alive_TB = rollout.alive_TB
-        observation_V, action_V = rollout.observe(rollout.state_TB[alive_TB]), rollout.action_TB[alive_TB]
+        observation_V, action_V = rollout.observation_V, rollout.action_TB[alive_TB]
         v_TB, target_TB = self._targets(rollout)
         target_V = target_TB[alive_TB]
         check_targets(target_V)

@@ -33,7 +33,7 @@ from pgts_torch.agent.build import (
 from pgts_torch.agent.certificate import Certificates
 from pgts_torch.agent.copies import make_vector_env, more_copies, own_actions, registered_limit
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.iteration import Iteration, Seen
+from pgts_torch.agent.iteration import Iteration, PolicyBatch
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.model_check import Mode, ModelCheck
 from pgts_torch.agent.policies import Policy, listed
@@ -42,6 +42,7 @@ from pgts_torch.agent.rollout import Horizon, Rollout, rollout
 from pgts_torch.agent.sharing import whole_lookahead, whole_rollout
 from pgts_torch.agent.states import NO_STATE, check_keys, take_over
 from pgts_torch.agent.updates import Update
+from pgts_torch.agent.world import ModelWorld
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.rewards import RewardRange
@@ -190,6 +191,7 @@ class PGTS:
             self.search = make_search(search, self.world)
         self.certificates: Certificates | None = None
         if self.search is not None:
+            assert isinstance(self.world, ModelWorld)
             self.certificates = Certificates(
                 self.world, self.search, self.critic, num_depths=len(self.depths), ranks=self.ranks
             )
@@ -214,7 +216,7 @@ class PGTS:
         calls_before = self._model_calls()
 
         # Visit states with pi_k and estimate Q^{pi_k} (line 2).
-        numbers_anew = self.world.forget()
+        numbers_anew = isinstance(self.world, ModelWorld) and self.world.forget()
         experience = whole_rollout(self.ranks, self.world, lambda: self._visit(draws.own))
         if numbers_anew and self.search is not None:
             self.search.reset()
@@ -230,10 +232,9 @@ class PGTS:
 
         # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is good enough.
         if not self._is_enough(seen.certificate):
-            observation_N = self.world.observe(seen.state_N)
             losses |= self.update(
                 self.policy,
-                observation_N,
+                seen.observation_N,
                 seen.advantage_NA,
                 seen.weight_N,
                 generator=draws.common,
@@ -249,8 +250,7 @@ class PGTS:
     def _visit(self, generator: torch.Generator) -> Rollout:
         """The episodes of this process."""
         names = ("iteration", self.num_iterations, *self.ranks.names)
-        world, horizon = self.world, self.horizon
-        return rollout(world, world.env, self.policy, horizon, seed=self.seed, names=names, generator=generator)
+        return rollout(self.world, self.policy, self.horizon, seed=self.seed, names=names, generator=generator)
 
     def _draws(self) -> _Draws:
         """One stream where this process is alone."""
@@ -269,10 +269,11 @@ class PGTS:
     def _model_calls(self) -> int:
         return (0 if self.search is None else self.search.model_calls) + self.critic.model_calls
 
-    def _look(self, experience: Rollout) -> Seen:
+    def _look(self, experience: Rollout) -> PolicyBatch:
         """The lookahead from the visited states, at the given depth or at the first that sees enough."""
         states, weight_N = experience.visits(self.update.state_weight)
-        pi_NA = self.policy.probs(self.world.observe(states))
+        observation_N = experience.first_observation_N
+        pi_NA = self.policy.probs(observation_N)
         shallow = self._look_together(states, 0)
         v_N = (pi_NA * shallow.q_BA).sum(-1)
         check_finite("value", "the policy's value", v_N, states)
@@ -293,27 +294,26 @@ class PGTS:
             if float(gap_N @ occupancy_N) > self.tolerance * missing or self._is_enough(bound):
                 break
         advantage_NA = centred(look.q_BA, pi_NA, rounding=self._rounding(look))
-        return Seen(states, weight_N, pi_NA, advantage_NA, depth, look, gap_N, bound, look.noise)
+        return PolicyBatch(observation_N, states, weight_N, pi_NA, advantage_NA, depth, look, gap_N, bound, look.noise)
 
     def _rounding(self, look: Lookahead) -> float:
         """Differences of lookahead values that rounding explains, in reward units."""
         eps = max(torch.finfo(dtype).eps for dtype in (look.q_BA.dtype, self.critic.dtype))
         return _ROUNDINGS * eps * float(look.q_BA[look.q_BA.isfinite()].abs().amax())
 
-    def _taken(self, experience: Rollout) -> Seen | None:
+    def _taken(self, experience: Rollout) -> PolicyBatch | None:
         """The advantages of the actions taken, by the critic as it was when they were; None where a lookahead is
         asked for all actions instead."""
         if not isinstance(self.estimator, SampledAdvantages):
             return None
         alive_TB = experience.alive_TB
-        states = experience.state_TB[alive_TB]
-        observation_N = self.world.observe(states)
+        observation_N = experience.observation_V
         pi_NA = self.policy.probs(observation_N)
         advantage_TB = self.estimator(experience, self.critic)
         advantage_NA = score_function(experience.action_TB[alive_TB], advantage_TB[alive_TB], pi_NA)
         weight_N = experience.visit_weight(self.update.state_weight)
         unknown_N = torch.full_like(weight_N, torch.nan)
-        return Seen(states, weight_N, pi_NA, advantage_NA, 0, None, unknown_N, math.inf, 0.0)
+        return PolicyBatch(observation_N, None, weight_N, pi_NA, advantage_NA, 0, None, unknown_N, math.inf, 0.0)
 
     @property
     def gamma(self) -> float:
@@ -330,7 +330,7 @@ class PGTS:
     def policy_table(self) -> Float[Tensor, "S A"]:
         """pi(.|s) for all states, on the CPU in float64; PgtsError where they cannot be listed."""
         states = torch.arange(self.mdp.num_states, device=self.device)
-        return listed(self.policy, self.world.observe(states))
+        return listed(self.policy, states)
 
     @property
     def time_limit(self) -> int | None:
@@ -357,6 +357,7 @@ class PGTS:
         """
         if self.search is None:
             raise PgtsError("with sampled advantages there is no lookahead")
+        assert isinstance(self.world, ModelWorld)
         observe, critic = self.world.observe, self.critic
         leaf: Leaf = lambda s: critic.v(observe(s)) if critic.target == "v" else critic.q(observe(s))  # noqa: E731
         depth = self.depths[-1] if depth is None else depth

@@ -2,19 +2,20 @@
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, final
 
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from pgts_torch.agent.copies import env_name
 from pgts_torch.agent.episodes import Episodes
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.world import World
+from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.seeding import SharedGenerators, draw_keys, seed_sequence
@@ -84,25 +85,42 @@ Horizon = FixedHorizon | GeometricHorizon
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """B episodes, step by step; where an episode is over, its row is padded and `alive_TB` is False. Each row begins
-    in the states where the row before it ended.
+    """B episodes, step by step; where an episode is over, its row is padded and `alive_TB` is False.
 
+    observation_UB: what the policy saw before each of the T steps, and what it would have seen after the last: U = T +
+        1.
     reward_TB: in reward units.   discount_TB: of the transition itself, 0 where it terminated.
     weight_TB: what a visit counts for in the occupancy: the product of the discounts before it (fixed horizon) or 1
         (geometric horizon); 0 where the episode is over.
     survival_TB: what one later unit of weight is worth now: weight_{t+1} = weight_t * survival_t.
-    observe: what policies and critics see of the states.
+    state_UB: the states in which this was seen, which a lookahead may start from; None where no model knows them.
     """
 
-    state_TB: Int[Tensor, "T B"]
+    observation_UB: Shaped[Tensor, "U B ..."]
     action_TB: Int[Tensor, "T B"]
     reward_TB: Float[Tensor, "T B"]
     discount_TB: Float[Tensor, "T B"]
-    next_state_TB: Int[Tensor, "T B"]
     alive_TB: Bool[Tensor, "T B"]
     weight_TB: Float[Tensor, "T B"]
     survival_TB: Float[Tensor, "T B"]
-    observe: Callable[[Tensor], Tensor] = field(kw_only=True)
+    state_UB: Int[Tensor, "U B"] | None = None
+
+    @property
+    def observation_V(self) -> Shaped[Tensor, "V ..."]:
+        """What the policy saw in each of the V = `num_steps` visits, in the order of `alive_TB`."""
+        return self.observation_UB[:-1][self.alive_TB]
+
+    @property
+    def state_TB(self) -> Int[Tensor, "T B"]:
+        """The states before each step. Only where a model knows them."""
+        assert self.state_UB is not None
+        return self.state_UB[:-1]
+
+    @property
+    def next_state_TB(self) -> Int[Tensor, "T B"]:
+        """The states after each step. Only where a model knows them."""
+        assert self.state_UB is not None
+        return self.state_UB[1:]
 
     @property
     def num_steps(self) -> int:
@@ -111,7 +129,7 @@ class Rollout:
 
     @property
     def num_episodes(self) -> int:
-        return self.state_TB.shape[1]
+        return self.alive_TB.shape[1]
 
     @property
     def follows_TB(self) -> Bool[Tensor, "T B"]:
@@ -124,10 +142,9 @@ class Rollout:
         Args:
             v: the values of observations.
         """
-        state_UB = torch.cat([self.state_TB, self.next_state_TB[-1:]])
         needed_UB = torch.cat([self.alive_TB[:1], self.alive_TB])
-        v_UB = torch.zeros_like(state_UB, dtype=self.reward_TB.dtype)
-        v_UB[needed_UB] = v(self.observe(state_UB[needed_UB])).to(v_UB)
+        v_UB = torch.zeros_like(needed_UB, dtype=self.reward_TB.dtype)
+        v_UB[needed_UB] = v(self.observation_UB[needed_UB]).to(v_UB)
         return v_UB[:-1], v_UB[1:]
 
     def returns(self) -> Float[Tensor, "B"]:
@@ -141,15 +158,28 @@ class Rollout:
         visits:     share of s among all visits
         uniform:    1
         """
-        states, row_V = self.state_TB[self.alive_TB].unique(return_inverse=True)
+        states, row_V = self._distinct
         if state_weight == "uniform":
             return states, torch.ones(len(states), dtype=self.weight_TB.dtype, device=states.device)
         weight_V = self.visit_weight(state_weight)
         weight_N = torch.zeros(len(states), dtype=weight_V.dtype, device=states.device)
         return states, weight_N.index_add_(0, row_V, weight_V)
 
+    @property
+    def first_observation_N(self) -> Shaped[Tensor, "N ..."]:
+        """What the policy saw at the first visit of each distinct state, in the order of `visits`."""
+        states, row_V = self._distinct
+        visit_V = torch.arange(len(row_V), device=row_V.device)
+        first_N = torch.full_like(states, len(row_V)).scatter_reduce_(0, row_V, visit_V, "amin")
+        return self.observation_V[first_N]
+
+    @cached_property
+    def _distinct(self) -> tuple[Int[Tensor, "N"], Int[Tensor, "V"]]:
+        """The distinct visited states, ascending, and which of them each visit was to."""
+        return self.state_TB[self.alive_TB].unique(return_inverse=True)
+
     def visit_weight(self, state_weight: StateWeight) -> Float[Tensor, "V"]:
-        """What each single visit adds to w(s), in the order of `state_TB[alive_TB]`; with "uniform" each counts 1."""
+        """What each single visit adds to w(s), in the order of `alive_TB`; with "uniform" each counts 1."""
         weight_V = self.weight_TB[self.alive_TB]
         if state_weight == "occupancy":
             return weight_V / self.num_episodes
@@ -158,7 +188,6 @@ class Rollout:
 
 def rollout(
     world: World,
-    env: VectorEnv,
     policy: Policy,
     horizon: Horizon,
     *,
@@ -166,14 +195,13 @@ def rollout(
     names: tuple[str | int, ...],
     generator: torch.Generator,
 ) -> Rollout:
-    """One episode of each copy of a vector environment, from a fresh reset.
+    """One episode in each environment of a world, from a fresh reset.
 
     What happens is a function of (seed, names), the policy and nothing else: the environment is seeded anew, and so are
     for the time being the generators that it may share with the whole process (`SharedGenerators`), which is said.
 
     Args:
-        world: says which states the copies are in.
-        env: copies of its environment, in `AutoresetMode.DISABLED`: `world.env` or others.
+        world: its environments; with a model also the states are kept, from which a lookahead may start.
         seed, names: the environment's own stream.
         generator: draws actions and the geometric horizon.
 
@@ -182,14 +210,14 @@ def rollout(
             answered with something that is not a number, naming environment, step and seed.
     """
     if world.draws_its_own:
-        return _episodes(world, env, policy, horizon, seed=seed, names=names, generator=generator)
+        return _episodes(world, policy, horizon, seed=seed, names=names, generator=generator)
     with SharedGenerators(seed, *names) as shared:
-        made = _episodes(world, env, policy, horizon, seed=seed, names=names, generator=generator)
+        made = _episodes(world, policy, horizon, seed=seed, names=names, generator=generator)
     if shared.drawn and not world.noticed:
         world.noticed = True
         warnings.warn(
-            f"{env_name(env)} draws from the generator of {shared.drawn[0]}, which the whole process shares: it is "
-            "seeded for each iteration and put back afterwards; better draw from self.np_random",
+            f"{env_name(world.env)} draws from the generator of {shared.drawn[0]}, which the whole process shares: it "
+            "is seeded for each iteration and put back afterwards; better draw from self.np_random",
             stacklevel=3,
         )
     return made
@@ -197,7 +225,6 @@ def rollout(
 
 def _episodes(
     world: World,
-    env: VectorEnv,
     policy: Policy,
     horizon: Horizon,
     *,
@@ -205,48 +232,49 @@ def _episodes(
     names: tuple[str | int, ...],
     generator: torch.Generator,
 ) -> Rollout:
+    env, model_world = world.env, world if isinstance(world, ModelWorld) else None
     words = seed_sequence(seed, *names, "env").generate_state(env.num_envs)
     try:
         episodes = Episodes(env, gamma=world.gamma, seeds=words.tolist())
     except BaseException as error:
         raise _failure(env, "at the start", words.tolist(), error) from error
     try:
-        observation_B, read_B = world.see(env, episodes.observation)
+        observations = [world.encode(episodes.observation)]
+        reads = [model_world.read(episodes.observation)] if model_world else []
     except BaseException as error:
         raise _failure(env, "at the start", *episodes.blame(error)) from error
     # What is small stays in numpy until the end: on tensors of a few numbers, each operation costs several times more.
     alive_B, weight_B = np.ones(env.num_envs, dtype=bool), np.ones(env.num_envs)
-    reads = [read_B]
     rows: list[tuple[np.ndarray, ...]] = []
     while len(rows) < horizon.limit and alive_B.any():
-        action_B = policy.sample(observation_B, generator=generator).cpu().numpy()
+        action_B = policy.sample(observations[-1], generator=generator).cpu().numpy()
         try:
             reward_B, discount_B, truncated_B = episodes.step(action_B, alive_B)
             if world.reward_range is not None:
                 world.reward_range.check(reward_B[alive_B])
-            observation_B, read_B = world.see(env, episodes.observation)
+            observations.append(world.encode(episodes.observation))
+            if model_world:
+                reads.append(model_world.read(episodes.observation))
         except BaseException as error:
             raise _failure(env, f"in step {len(rows)}", *episodes.blame(error)) from error
         survival_B = horizon.survival(torch.from_numpy(discount_B), generator).numpy()
         rows.append((action_B, reward_B, discount_B, alive_B, weight_B * alive_B, survival_B))
-        reads.append(read_B)
         weight_B = weight_B * survival_B
         alive_B = alive_B & (survival_B > 0) & ~truncated_B
     horizon.check_end(int(alive_B.sum()))
-    number_TB = world.numbers(torch.cat(reads)).view(len(reads), -1)
+    state_UB = model_world.numbers(torch.cat(reads)).view(len(reads), -1) if model_world else None
     action_TB, reward_TB, discount_TB, alive_TB, weight_TB, survival_TB = (
         torch.from_numpy(np.array(column)).to(world.device) for column in zip(*rows, strict=True)
     )
     return Rollout(
-        number_TB[:-1],
+        torch.stack(observations),
         action_TB,
         reward_TB,
         discount_TB,
-        number_TB[1:],
         alive_TB,
         weight_TB,
         survival_TB,
-        observe=world.observe,
+        state_UB,
     )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.world import World
+from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.search.lookahead import Lookahead
 
 _COLUMNS = ("action_TB", "reward_TB", "discount_TB", "alive_TB", "weight_TB", "survival_TB")
@@ -21,7 +21,7 @@ def whole_rollout(ranks: Ranks, world: World, make: Callable[[], Rollout]) -> Ro
     """The episodes of all ranks, side by side; their states have the same numbers in all ranks.
 
     Args:
-        world: whose states they visit; where it numbers states anew in each iteration, it does so now.
+        world: where they are made; where it numbers states anew in each iteration, it does so now.
         make: makes the episodes of this rank.
 
     Raises:
@@ -30,27 +30,35 @@ def whole_rollout(ranks: Ranks, world: World, make: Callable[[], Rollout]) -> Ro
     if ranks.size == 1:
         return make()
     parts = ranks.gather("episodes", lambda: _sent(world, make()))
-    world.forget()
+    if isinstance(world, ModelWorld):
+        world.forget()
     length = max(len(part["alive_TB"]) for part in parts)
     columns = {
         name: torch.cat([_padded(part[name], length) for part in parts], 1).to(world.device) for name in _COLUMNS
     }
-    state_UB = torch.cat([_states(world, part, length) for part in parts], 1)
-    return Rollout(state_TB=state_UB[:-1], next_state_TB=state_UB[1:], observe=world.observe, **columns)
+    observation_UB = torch.cat([_extended(part["observations"], length) for part in parts], 1).to(world.device)
+    state_UB = None
+    if isinstance(world, ModelWorld):
+        state_UB = torch.cat([_extended(_adopted(world, part), length) for part in parts], 1)
+    return Rollout(observation_UB, **columns, state_UB=state_UB)
 
 
 def _sent(world: World, made: Rollout) -> dict[str, Any]:
     """Episodes as another process can take them."""
-    state_UB = torch.cat([made.state_TB, made.next_state_TB[-1:]])
     columns = {name: getattr(made, name).cpu() for name in _COLUMNS}
-    return {"states": world.export(state_UB.flatten()), **columns}
+    if isinstance(world, ModelWorld) and made.state_UB is not None:
+        columns["states"] = world.export(made.state_UB.flatten())
+    return {"observations": made.observation_UB.cpu(), **columns}
 
 
-def _states(world: World, part: dict[str, Any], length: int) -> Int[Tensor, "U B"]:
-    """The states of some episodes, and the one after; the last ones stand for those that there are not."""
-    num_steps, num_episodes = part["alive_TB"].shape
-    state_UB = world.adopt(part["states"]).view(num_steps + 1, num_episodes)
-    return torch.cat([state_UB, state_UB[-1:].expand(length - num_steps, -1)])
+def _adopted(world: ModelWorld, part: dict[str, Any]) -> Int[Tensor, "U B"]:
+    """The states of some episodes, by the numbers of this process."""
+    return world.adopt(part["states"]).view(len(part["alive_TB"]) + 1, -1)
+
+
+def _extended(x_UB: Tensor, length: int) -> Tensor:
+    """With its last row repeated, to the end of episodes of so many steps."""
+    return torch.cat([x_UB, x_UB[-1:].expand(length + 1 - len(x_UB), *x_UB.shape[1:])])
 
 
 def _padded(column_TB: Tensor, length: int) -> Tensor:

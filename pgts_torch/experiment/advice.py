@@ -59,7 +59,7 @@ class Movement:
         moved = mean of 1/2 sum_a |pi - pi_first|, in [0, 1];   gap_share = mean g_m / mean (max_a q - min_a q)
         """
         share_N = _shares(iteration)
-        first_NA = self.first.probs(algorithm.world.observe(iteration.state_N))
+        first_NA = self.first.probs(iteration.observation_N)
         self.moved = self._apart(algorithm, iteration, first_NA)
         self.gap_share = None
         if iteration.look is not None:
@@ -70,7 +70,7 @@ class Movement:
     @staticmethod
     def _apart(algorithm: PGTS, iteration: Iteration, other_NA: Tensor) -> float:
         """Which share of probability the policy has elsewhere than another one has it."""
-        probs_NA = algorithm.policy.probs(algorithm.world.observe(iteration.state_N))
+        probs_NA = algorithm.policy.probs(iteration.observation_N)
         share_N = _shares(iteration)
         return float((probs_NA - other_NA).abs().sum(-1).to(share_N.dtype) @ share_N) / 2
 

@@ -57,7 +57,7 @@ class Truth:
         """
         evaluation = exact.evaluate(self.mdp, pi_SA)
         tags = {"exact/J": evaluation.J, "exact/optimality_gap": max(self.optimum.J - evaluation.J, 0.0)}
-        if iteration.look is None:
+        if iteration.look is None or iteration.state_N is None:
             return tags
         look_SA = exact.lookahead(self.mdp, evaluation.q_SA, iteration.depth)
         states = iteration.state_N.cpu()

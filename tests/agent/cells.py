@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from pgts_torch.agent.make_world import make_world
-from pgts_torch.agent.world import World
+from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError
 
 KEYWORDS: dict[str, Any] = {"num_envs": 2, "gamma": 0.9, "observation_key": None, "plain": False, "device": "cpu"}
@@ -32,14 +32,13 @@ def vector_of(*makers: Callable[[], gymnasium.Env]) -> SyncVectorEnv:
     return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
 
 
-def reached(world: World) -> tuple[torch.Tensor, torch.Tensor]:
+def reached(world: ModelWorld) -> tuple[torch.Tensor, torch.Tensor]:
     """The number of the state in which the first copy begins, and what it shows, after a reset with seed 0."""
     observation, _ = world.env.reset(seed=0)
-    encoded, read = world.see(world.env, observation)
-    return world.numbers(read)[:1], encoded[:1]
+    return world.numbers(world.read(observation))[:1], world.encode(observation)[:1]
 
 
-def agrees(world: World, actions: Sequence[int]) -> bool:
+def agrees(world: ModelWorld, actions: Sequence[int]) -> bool:
     """Whether the model says of each of these steps what then happens in the first copy: reward, and what it shows."""
     state, _ = reached(world)
     for action in actions:

@@ -46,7 +46,7 @@ def made_in(
     world = TabularWorld(env, tabular_truth(env, gamma=0.9))
     world.gamma = gamma
     generator = generator or stream(seed, *names)
-    return rollout(world, env, policy, horizon, seed=seed, names=names, generator=generator)
+    return rollout(world, policy, horizon, seed=seed, names=names, generator=generator)
 
 
 def transitions(made: Rollout) -> list[tuple[int, int, float, float, int]]:

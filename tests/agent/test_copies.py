@@ -11,7 +11,7 @@ from pgts_torch import PGTS
 from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.copies import make_vector_env
 from pgts_torch.agent.evaluate import evaluate
-from pgts_torch.agent.world import DynamicsWorld, PlainWorld, SimulatedWorld, TabularWorld
+from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import check_model
 from pgts_torch.models.environments import make_env
@@ -84,6 +84,7 @@ def test_what_the_model_answers_is_what_the_divided_environment_does():
     model = PGTS(Field, **SHORT, actions_per_dimension=3)
     seen = model.iterate().experience
     place_TBD = model.world.observe(seen.next_state_TB.reshape(-1)).view(*seen.state_TB.shape, 2)
+    assert torch.equal(place_TBD, seen.observation_UB[1:])
     grid_AD = torch.tensor([[x, y] for x in (-1.0, 0.0, 1.0) for y in (-2.0, 0.0, 2.0)], dtype=torch.float64)
     torch.testing.assert_close(place_TBD, grid_AD[seen.action_TB].cumsum(0))
 
@@ -127,7 +128,7 @@ def test_an_id_that_names_its_module_is_imported_from_there(tmp_path, monkeypatc
 
 def test_continuous_actions_need_no_model_where_advantages_are_sampled():
     model = pendulum(depth=0, estimator="sampled")
-    assert isinstance(model.world, PlainWorld)
+    assert not isinstance(model.world, ModelWorld)
     assert model.iterate().model_calls == 0
 
 

@@ -63,9 +63,8 @@ def by_hand() -> Rollout:
     discount_TB[2, 1] = 0.0
     alive_TB = torch.tensor([[1, 1, 1], [1, 1, 1], [1, 1, 0]], dtype=torch.bool)
     survival_TB = torch.tensor([[1, 1, 1], [1, 1, 0], [0, 0, 0]], dtype=torch.float64)
-    states_TB = torch.arange(3)[:, None].expand(3, 3)
-    columns = (states_TB, states_TB * 0, column, discount_TB, states_TB + 1, alive_TB, column, survival_TB)
-    return Rollout(*columns, observe=lambda state_N: state_N)
+    state_UB = torch.arange(4)[:, None].expand(4, 3)
+    return Rollout(state_UB, state_UB[:-1] * 0, column, discount_TB, alive_TB, column, survival_TB)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from gymnasium import wrappers
 from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
-from pgts_torch.agent.world import PlainWorld, SimulatedWorld
+from pgts_torch.agent.world import ModelWorld, SimulatedWorld
 from tests.agent.cells import Walk, agrees, refusal_of, vector_of, world_of
 
 # Dynamics and adapters
@@ -251,7 +251,7 @@ DIFFERENTLY = "a restored state goes on differently at step"
 )
 def test_a_simulator_that_cannot_be_restored_is_refused_in_the_words_of_check_model(make, why):
     assert f"{make.__name__} cannot serve as a model: {why}" in refusal_of(make)
-    assert isinstance(world_of(make, plain=True), PlainWorld)
+    assert not isinstance(world_of(make, plain=True), ModelWorld)
 
 
 def test_an_environment_that_is_slow_is_tried_in_few_steps():

@@ -28,18 +28,18 @@ MDP = random_mdp(6, 2, gamma=0.5, start=None)
 POINTS_SD = torch.randn(7, 3, generator=stream(0, "points"))
 
 
-def by_hand(reward: float = 1.0, observe=lambda state_N: state_N) -> Rollout:
+def by_hand(reward: float = 1.0, shows: Tensor | None = None) -> Rollout:
     """Three episodes of rewards 1, 2, 4 (times `reward`) with discounts 0.5: the first is cut after three steps, the
-    second terminates in its third, the third is cut after two. States 0, 1, 2, 3 follow each other."""
+    second terminates in its third, the third is cut after two. States 0, 1, 2, 3 follow each other, and show rows of
+    `shows`, or their number."""
     column = reward * torch.tensor([[1.0], [2.0], [4.0]], dtype=torch.float64).expand(3, 3)
     discount_TB = torch.full((3, 3), 0.5, dtype=torch.float64)
     discount_TB[2, 1] = 0.0
     alive_TB = torch.tensor([[1, 1, 1], [1, 1, 1], [1, 1, 0]], dtype=torch.bool)
     survival_TB = torch.tensor([[1, 1, 1], [1, 1, 0], [1, 0, 0]], dtype=torch.float64)
-    state_TB = torch.arange(3)[:, None].expand(3, 3)
-    return Rollout(
-        state_TB, state_TB % 2, column, discount_TB, state_TB + 1, alive_TB, column, survival_TB, observe=observe
-    )
+    state_UB = torch.arange(4)[:, None].expand(4, 3)
+    observation_UB = state_UB if shows is None else shows[state_UB]
+    return Rollout(observation_UB, state_UB[:-1] % 2, column, discount_TB, alive_TB, column, survival_TB)
 
 
 def tabular_critic(value_S: list[float] | Tensor, **options) -> NetworkCritic:
@@ -79,7 +79,7 @@ def test_a_policy_starts_from_its_seed_alone_and_torch_s_own_generator_is_left_a
     before = torch.get_rng_state()
     first, same, other = (NetworkPolicy(VECTORS, 5, seed=seed) for seed in (1, 1, 2))
     critic = NetworkCritic(VECTORS, 5, seed=1)
-    critic.fit(first, by_hand(observe=POINTS_SD.__getitem__), generator=stream(0, "critic"))
+    critic.fit(first, by_hand(shows=POINTS_SD), generator=stream(0, "critic"))
     first.sample(POINTS_SD, generator=stream(0, "sample"))
     assert torch.equal(torch.get_rng_state(), before)
     assert torch.equal(first.probs(POINTS_SD), same.probs(POINTS_SD))
@@ -144,7 +144,7 @@ def test_what_was_cut_is_bootstrapped_and_what_terminated_is_not(method, expecte
 def test_generalised_advantages_follow_their_own_recursion(lambda_):
     made = by_hand()
     v_S = torch.tensor([3.0, -1.0, 5.0, 10.0], dtype=torch.float64)
-    v_TB, next_v_TB = v_S[made.state_TB], v_S[made.next_state_TB]
+    v_TB, next_v_TB = v_S[made.observation_UB[:-1]], v_S[made.observation_UB[1:]]
     advantage_TB = gae(made, v_TB, next_v_TB, lambda_)
     for b, (length, ended) in enumerate([(3, False), (3, True), (2, False)]):
         following_advantage = 0.0
@@ -194,7 +194,7 @@ def test_values_are_in_reward_units_whatever_the_unit_is(unit):
 
 def test_a_new_scale_of_the_targets_leaves_learned_values_where_they_were():
     critic = NetworkCritic(VECTORS, 2, seed=1, polyak=0.5)
-    critic.fit(following(torch.ones(4, 2) / 2), by_hand(observe=POINTS_SD.__getitem__), generator=stream(0, "c"))
+    critic.fit(following(torch.ones(4, 2) / 2), by_hand(shows=POINTS_SD), generator=stream(0, "c"))
     before_N, lagging_N = critic.v(POINTS_SD), critic._v(critic._target_network, POINTS_SD)
     before = critic._mean, critic._scale
     critic._rescale(torch.tensor([1000.0, 3000.0]))
@@ -242,7 +242,7 @@ def test_values_are_not_taken_for_what_they_are_not(asked):
     first, second = following(torch.tensor([[0.9, 0.1]] * 4)), following(torch.tensor([[0.1, 0.9]] * 4))
     for critic in (asking, silent):
         critic.fit(first, made, generator=stream(0, "critic"))
-    backward = dataclasses.replace(made, state_TB=made.next_state_TB, next_state_TB=made.state_TB)
+    backward = dataclasses.replace(made, observation_UB=made.observation_UB.flip(0))
     asking.values(backward if asked == "of another rollout" else made)
     policy = second if asked == "of another policy" else first
     for k in range(3 if asked == "before a fit already" else 1):
@@ -257,7 +257,7 @@ def test_a_policy_and_a_critic_can_share_a_trunk():
     critic = NetworkCritic(space, 2, network=policy.network.trunk)
     alone = NetworkCritic(space, 2, network=CNN(normalize=True, hidden=(16,)))
     images_S = torch.randint(0, 256, (4, 7, 7, 3), generator=stream(0, "images")).float()
-    made, states = by_hand(observe=images_S.__getitem__), torch.arange(3)
+    made, states = by_hand(shows=images_S), torch.arange(3)
     generator, encoder = stream(0, "test"), policy.network.trunk.encoder
     update = GradientUpdate()
     for k in range(2):
@@ -278,7 +278,7 @@ def test_a_policy_and_a_critic_can_share_a_trunk():
 def test_a_saved_critic_goes_on_bit_for_bit(target, polyak, tmp_path):
     options = {"network": MLP((8,), normalize=True), "target": target, "polyak": polyak}
     critics = [NetworkCritic(VECTORS, 2, seed=seed, **options) for seed in (1, 2)]
-    made, policy = by_hand(observe=POINTS_SD.__getitem__), NetworkPolicy(VECTORS, 2)
+    made, policy = by_hand(shows=POINTS_SD), NetworkPolicy(VECTORS, 2)
     critics[0].fit(policy, made, generator=stream(0, "critic"))
     saving.write(tmp_path / "critic", critics[0].state_dict())
     critics[1].load_state_dict(saving.read(tmp_path / "critic"))

@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -59,9 +59,9 @@ def tensors(state: Any) -> list[torch.Tensor]:
 
 def plain(experience: Rollout, model: PGTS) -> dict[str, Any]:
     """Episodes without their numbers of states: what stands for a state is what another process is told of it."""
-    columns = {name: value for name, value in vars(experience).items() if name != "observe" and "state" not in name}
-    state_UB = torch.cat([experience.state_TB, experience.next_state_TB[-1:]])
-    return {"columns": columns, "states": model.world.export(state_UB.flatten())}
+    columns = {each.name: getattr(experience, each.name) for each in fields(experience) if each.name != "state_UB"}
+    states = None if experience.state_UB is None else model.world.export(experience.state_UB.flatten())
+    return {"columns": columns, "states": states}
 
 
 def trained(make: Callable[..., PGTS], *, num_envs: int, iterations: int = 3) -> dict[str, Any]:
@@ -94,9 +94,9 @@ def replayed(
     for each in seen:
 
         def given(world: Any, *rest: Any, each=each, **options: Any) -> Rollout:
-            columns = each["experience"]["columns"]
-            state_UB = world.adopt(each["experience"]["states"]).view(-1, columns["reward_TB"].shape[1])
-            return Rollout(state_TB=state_UB[:-1], next_state_TB=state_UB[1:], observe=world.observe, **columns)
+            columns, states = each["experience"]["columns"], each["experience"]["states"]
+            state_UB = None if states is None else world.adopt(states).view(columns["observation_UB"].shape[:2])
+            return Rollout(**columns, state_UB=state_UB)
 
         monkeypatch.setattr(pgts, "rollout", given)
         if len(chooser.depths) > 1:

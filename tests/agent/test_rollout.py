@@ -71,30 +71,37 @@ def truncated_occupancy(mdp: TabularMDP, pi_SA: torch.Tensor, length: int) -> to
 
 
 def by_hand() -> Rollout:
-    """Two episodes, states 3 1 3 and 1 2; the second is over after two steps."""
+    """Two episodes, states 3 1 3 and 1 2; the second is over after two steps. In state s 10 t + s is seen at time t."""
     alive_TB = torch.tensor([[1, 1], [1, 1], [1, 0]], dtype=torch.bool)
     ones_TB = torch.ones(3, 2, dtype=torch.float64)
+    state_UB = torch.tensor([[3, 1], [1, 2], [3, 0], [1, 0]])
     return Rollout(
-        state_TB=torch.tensor([[3, 1], [1, 2], [3, 0]]),
+        observation_UB=state_UB + 10 * torch.arange(4)[:, None],
         action_TB=torch.zeros(3, 2, dtype=torch.int64),
         reward_TB=torch.tensor([[1.0, 10.0], [2.0, 20.0], [3.0, 77.0]], dtype=torch.float64),
         discount_TB=0.5 * ones_TB,
-        next_state_TB=torch.tensor([[1, 2], [3, 0], [1, 0]]),
         alive_TB=alive_TB,
         weight_TB=torch.tensor([[1.0, 1.0], [0.5, 0.5], [0.25, 0.0]], dtype=torch.float64),
         survival_TB=0.5 * ones_TB,
-        observe=lambda state_N: state_N,
+        state_UB=state_UB,
     )
 
 
 def test_the_values_before_and_after_each_step_are_asked_once_for_each_visit_and_each_end():
-    made, v_S, asked = by_hand(), torch.tensor([5.0, 10.0, 20.0, 30.0]), []
-    v_TB, next_v_TB = made.values(lambda state_N: asked.append(state_N) or v_S[state_N])
+    made, asked = by_hand(), []
+    v_TB, next_v_TB = made.values(lambda seen_N: asked.append(seen_N) or 2.0 * seen_N)
     alive_TB = made.alive_TB
-    assert v_TB[alive_TB].tolist() == v_S[made.state_TB][alive_TB].tolist() == [30.0, 10.0, 10.0, 20.0, 30.0]
-    assert next_v_TB[alive_TB].tolist() == v_S[made.next_state_TB][alive_TB].tolist() == [10.0, 20.0, 30.0, 5.0, 10.0]
+    assert v_TB[alive_TB].tolist() == [6.0, 2.0, 22.0, 24.0, 46.0]
+    assert next_v_TB[alive_TB].tolist() == [22.0, 24.0, 46.0, 40.0, 62.0]
     assert v_TB.dtype == next_v_TB.dtype == made.reward_TB.dtype
-    assert [len(state_N) for state_N in asked] == [made.num_steps + made.num_episodes] == [7]
+    assert [len(seen_N) for seen_N in asked] == [made.num_steps + made.num_episodes] == [7]
+
+
+def test_of_each_distinct_state_the_first_visit_says_what_was_seen():
+    made = by_hand()
+    assert made.observation_V.tolist() == [3, 1, 11, 12, 23]
+    assert made.visits("visits")[0].tolist() == [1, 2, 3]
+    assert made.first_observation_N.tolist() == [1, 12, 3]
 
 
 @pytest.mark.parametrize("name", DISCOUNTED)
