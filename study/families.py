@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse.csgraph
 
-from pgts_torch.tabular import TabularMDP, random_mdp, stationary
+from pgts_torch.tabular import TabularMDP, random_mdp, stationary_sets
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def family_study(
     rows = []
     for seed, branching, size, share, gamma in itertools.product(seeds, branchings, sizes, reward_shares, gammas):
         mdp = random_mdp(size, branching=branching, reward_share=share, gamma=gamma, seed=seed)
-        sets = stationary.enumerate_sets(mdp)
+        sets = stationary_sets.enumerate_sets(mdp)
         found = diameter(mdp), sets.sufficient_depth, sets.worst_return(0), sets.J_optimal
         rows.append(FamilyRow(branching, share, gamma, size, seed, *found))
     return rows

@@ -9,8 +9,9 @@ from typing import Any
 import torch
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.tabular import TabularMDP, deep_sea, grid, ladder, random_mdp, stationary, tightrope
+from pgts_torch.tabular import TabularMDP, deep_sea, grid, ladder, random_mdp, stationary, stationary_sets, tightrope
 from pgts_torch.tabular.mdp import start_distribution
+from pgts_torch.tabular.stationary_sets import NEVER
 
 ALL_ROWS = 30
 """A table of more depths shows only those at which Pi^m changes."""
@@ -41,7 +42,7 @@ class DepthRow:
 class Study:
     """The stationary sets of one MDP.
 
-    escape_depths: how many policies leave Pi^m first at each depth; `stationary.NEVER` stands for the optimal ones.
+    escape_depths: how many policies leave Pi^m first at each depth; `NEVER` stands for the optimal ones.
     sufficient_depth: the smallest M with Pi^M = Pi^inf.
     depths: a row for each depth 0 .. M.
     """
@@ -79,7 +80,7 @@ def make(what: str, **options: Any) -> TabularMDP:
         return tightrope(**options)
     if what == "random":
         size = options.pop("states", 10), options.pop("actions", 2)
-        stationary.check_enumerable(*size)
+        stationary_sets.check_enumerable(*size)
         return random_mdp(*size, seed=options.pop("mdp_seed", 0), **options)
     if what == "grid":
         return grid(_size(options, 3, 4, lambda n: n * n), traps=options.pop("traps", ()), **options)
@@ -94,7 +95,7 @@ def study(mdp: TabularMDP) -> Study:
     Raises:
         PgtsError: there are too many policies, or one has no value.
     """
-    sets = stationary.enumerate_sets(mdp)
+    sets = stationary_sets.enumerate_sets(mdp)
     M, worst_SA = sets.sufficient_depth, stationary.worst_policy(mdp)
 
     def row(depth: int) -> DepthRow:
@@ -138,9 +139,9 @@ def _size(options: dict[str, Any], default: int, num_actions: int, num_states: C
     """The option n; PgtsError, with the largest size that is none, if it gives more policies than are enumerated."""
     n = options.pop("n", default)
     try:
-        stationary.check_enumerable(num_states(n), num_actions)
+        stationary_sets.check_enumerable(num_states(n), num_actions)
     except PgtsError as error:
-        fit = max(k for k in range(1, 21) if num_actions ** num_states(k) <= stationary.MAX_POLICIES)
+        fit = max(k for k in range(1, 21) if num_actions ** num_states(k) <= stationary_sets.MAX_POLICIES)
         raise PgtsError(f"--n {n} gives {error}, as --n {fit} does") from None
     return n
 
@@ -171,7 +172,7 @@ def _lines(study: Study) -> Iterator[str]:
     )
     yield f"{'escapes at':>10}  {'policies':>9}"
     most = max(study.escape_depths.values())
-    for depth, count in sorted(study.escape_depths.items(), key=lambda item: (item[0] == stationary.NEVER, item[0])):
+    for depth, count in sorted(study.escape_depths.items(), key=lambda item: (item[0] == NEVER, item[0])):
         yield f"{_depth_name(depth):>10}  {count:>9}  {'#' * math.ceil(BAR * count / most)}"
 
 
@@ -180,4 +181,4 @@ def _changes(study: Study, depth: int) -> bool:
 
 
 def _depth_name(depth: int) -> str:
-    return "never" if depth == stationary.NEVER else str(depth)
+    return "never" if depth == NEVER else str(depth)

@@ -1,6 +1,6 @@
 """The exact world: tabular MDPs in float64 and everything that theory says of them."""
 
-from pgts_torch.tabular import ascent, exact, stationary
+from pgts_torch.tabular import ascent, exact, stationary, stationary_sets
 from pgts_torch.tabular.mdp import TabularMDP
 from pgts_torch.tabular.zoo import (
     combination_lock,
@@ -27,5 +27,6 @@ __all__ = [
     "random_mdp",
     "river_swim",
     "stationary",
+    "stationary_sets",
     "tightrope",
 ]

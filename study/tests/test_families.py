@@ -2,7 +2,7 @@
 
 import pytest
 
-from pgts_torch.tabular import exact, grid, ladder, random_mdp, stationary, tightrope
+from pgts_torch.tabular import exact, grid, ladder, random_mdp, stationary_sets, tightrope
 from study.families import diameter, family_study
 
 
@@ -14,7 +14,7 @@ def test_a_family_has_a_row_for_each_mdp_and_the_rows_are_true():
     ]
     for row in rows:
         mdp = random_mdp(4, branching=row.branching, reward_share=row.reward_share, seed=row.seed)
-        sets = stationary.enumerate_sets(mdp)
+        sets = stationary_sets.enumerate_sets(mdp)
         assert (row.sufficient_depth, row.worst_return) == (sets.sufficient_depth, sets.worst_return(0))
         assert row.J_optimal == pytest.approx(exact.optimal(mdp).J)
         assert row.worst_return <= row.J_optimal + 1e-12

@@ -9,7 +9,17 @@ import torch
 from hypothesis import given
 
 from pgts_torch.seeding import numpy_stream
-from pgts_torch.tabular import TabularMDP, ascent, exact, grid, ladder, random_mdp, stationary, tightrope
+from pgts_torch.tabular import (
+    TabularMDP,
+    ascent,
+    exact,
+    grid,
+    ladder,
+    random_mdp,
+    stationary,
+    stationary_sets,
+    tightrope,
+)
 from study.families import diameter
 from study.tests.rules import ladder_rule
 from tests.support import mdps_with_policy, random_policy, right_with
@@ -72,7 +82,7 @@ def test_the_policies_that_never_escape_are_the_optimal_ones():
     for case in family():
         optimal_P = case.lack_P <= EXACT
         assert optimal_P.any()
-        assert np.array_equal(case.sets.escape_P.numpy() == stationary.NEVER, optimal_P)
+        assert np.array_equal(case.sets.escape_P.numpy() == stationary_sets.NEVER, optimal_P)
         assert np.all(case.member_MP[:, optimal_P])
 
 
@@ -121,8 +131,8 @@ def test_depth_0_suffices_where_every_policy_visits_every_state():
     assert len(connected) > 42, "a uniform start is not the only way"
     assert all(case.sets.sufficient_depth == 0 for case in connected)
     for mdp in (grid(2, traps=(1,)), grid(3, traps=(1,), gamma=0.99), random_mdp(), ladder(5, start=None)):
-        assert stationary.enumerate_sets(mdp).sufficient_depth == 0
-    assert stationary.enumerate_sets(grid(2, traps=(), slip=0.0)).sufficient_depth > 0
+        assert stationary_sets.enumerate_sets(mdp).sufficient_depth == 0
+    assert stationary_sets.enumerate_sets(grid(2, traps=(), slip=0.0)).sufficient_depth > 0
 
 
 def test_a_depth_that_reaches_a_reward_earns_something():
@@ -150,7 +160,7 @@ def test_a_toll_makes_any_depth_necessary_at_diameter_1(gamma, price, depth):
     mdp = toll(gamma, price)
     expected = math.floor(math.log(1 - price * (1 - gamma) / gamma) / math.log(gamma)) + 1
     assert diameter(mdp) == 1
-    assert stationary.enumerate_sets(mdp).sufficient_depth == expected == depth
+    assert stationary_sets.enumerate_sets(mdp).sufficient_depth == expected == depth
 
 
 @pytest.mark.parametrize(("n", "values"), [(2, (0, 0.4, 1)), (4, (0, 0.4, 1)), (5, (0, 0.7))])
@@ -159,18 +169,18 @@ def test_a_policy_of_the_ladder_is_stationary_by_its_zeros(n, values):
     mdp = ladder(n)
     for right in itertools.product(values, repeat=n):
         pattern = "".join(str(a) if a in (0, 1) else "x" for a in right)
-        escape = stationary.escape_depth(mdp, right_with(*right))
-        verdicts = [escape == stationary.NEVER or depth < escape for depth in range(n + 1)]
+        escape = stationary_sets.escape_depth(mdp, right_with(*right))
+        verdicts = [escape == stationary_sets.NEVER or depth < escape for depth in range(n + 1)]
         assert verdicts == [ladder_rule(pattern, depth) for depth in range(n + 1)], right
 
 
 def test_the_ladder_has_as_many_stationary_policies_as_the_formula_says():
     for n in range(1, 11):
-        sets = stationary.enumerate_sets(ladder(n))
+        sets = stationary_sets.enumerate_sets(ladder(n))
         for m in range(n + 1):
             formula = 1 + sum(2**m * (2 ** (n - 1 - j - m) - 1) for j in range(n - 1 - m))
             assert sets.count(m) == formula
-    assert [stationary.enumerate_sets(ladder(5)).count(m) for m in range(5)] == [27, 23, 17, 9, 1]
+    assert [stationary_sets.enumerate_sets(ladder(5)).count(m) for m in range(5)] == [27, 23, 17, 9, 1]
 
 
 @pytest.mark.parametrize("gamma", [0.3, 0.9, 0.99])

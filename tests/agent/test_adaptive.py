@@ -8,7 +8,7 @@ import torch
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import TabularModel
-from pgts_torch.tabular import exact, ladder, random_mdp, stationary
+from pgts_torch.tabular import exact, ladder, random_mdp, stationary, stationary_sets
 
 LEFT = {"type": "simplex", "init": {"type": "biased", "action": 0, "probability": 1.0}}
 EXACT = {"type": "exact"}
@@ -26,7 +26,7 @@ def optimality_gap(model):
 def test_a_small_tolerance_takes_the_smallest_depth_at_which_always_left_is_not_stationary():
     model = always_left(depth="adaptive", tolerance=0.05)
     left_SA = model.policy.table()
-    assert model.iterate().depth == stationary.escape_depth(model.mdp, left_SA) == 8
+    assert model.iterate().depth == stationary_sets.escape_depth(model.mdp, left_SA) == 8
 
 
 def test_by_default_an_adaptive_depth_is_the_first_that_sees_most_of_what_is_missing():

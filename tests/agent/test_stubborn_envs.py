@@ -18,7 +18,7 @@ from pgts_torch.models import check_model
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.search import expectimax, mcts, sampled
 from pgts_torch.seeding import stream
-from pgts_torch.tabular import TabularMDP, exact, stationary
+from pgts_torch.tabular import TabularMDP, exact, stationary, stationary_sets
 from tests.agent.test_step_forms import LOOKAHEAD, Clock, make
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -262,7 +262,7 @@ def test_rewards_of_a_table_are_refused_where_values_would_be_no_numbers(gamma, 
         of(1.01 * 1.124 * most)
     with pytest.raises(PgtsError, match=r"P\[0\]\[0\] has reward 1e\+308; rewards must be finite, at most 2.2e\+307"):
         of(1e308)
-    sets, unit = stationary.enumerate_sets(of(most)), stationary.enumerate_sets(of(1.0))
+    sets, unit = stationary_sets.enumerate_sets(of(most)), stationary.enumerate_sets(of(1.0))
     assert sets.J_optimal == pytest.approx(most * unit.J_optimal)
     assert sets.histogram == unit.histogram
     for depth in range(3):

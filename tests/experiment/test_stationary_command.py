@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from pgts_torch.experiment.cli import STATIONARY_OPTIONS, main
-from pgts_torch.tabular import deep_sea, exact, grid, ladder, random_mdp, tightrope
-from pgts_torch.tabular import stationary as theory
+from pgts_torch.tabular import deep_sea, exact, grid, ladder, random_mdp, stationary_sets, tightrope
 from tests.forks import PATIENCE
 
 LADDER = """\
@@ -111,7 +110,7 @@ def test_the_json_holds_the_same_numbers(capsys):
     ],
 )
 def test_each_mdp_is_the_one_that_was_asked_for(arguments, mdp, npz, capsys):
-    told, sets = answer(capsys, *arguments), theory.enumerate_sets(mdp())
+    told, sets = answer(capsys, *arguments), stationary_sets.enumerate_sets(mdp())
     assert told["J_optimal"] == pytest.approx(exact.optimal(mdp()).J)
     assert told["num_policies"] == len(sets.J_P)
     assert told["sufficient_depth"] == sets.sufficient_depth

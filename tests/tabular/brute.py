@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from pgts_torch.seeding import numpy_stream
-from pgts_torch.tabular import TabularMDP, random_mdp, stationary
+from pgts_torch.tabular import TabularMDP, random_mdp, stationary_sets
 from tests.support import weights
 
 DEPTHS = range(5)
@@ -21,7 +21,7 @@ class Brute:
     """All deterministic policies of an MDP: their values, where they go, what a lookahead of each depth sees."""
 
     mdp: TabularMDP
-    sets: stationary.StationarySets
+    sets: stationary_sets.StationarySets
     action_PS: np.ndarray
     v_PS: np.ndarray
     sigma_PS: np.ndarray
@@ -58,7 +58,7 @@ def brute(mdp: TabularMDP) -> Brute:
     for _ in DEPTHS:
         look.append(reward_SA + np.einsum("sat,pt->psa", weight_SAS, best_PS))
         best_PS = look[-1].max(-1)
-    return Brute(mdp, stationary.enumerate_sets(mdp), action_PS, v_PS, sigma_PS, np.stack(look))
+    return Brute(mdp, stationary_sets.enumerate_sets(mdp), action_PS, v_PS, sigma_PS, np.stack(look))
 
 
 def with_ends(mdp: TabularMDP, seed: int) -> TabularMDP:

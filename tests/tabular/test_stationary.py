@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.tabular import exact, ladder, stationary, tightrope
+from pgts_torch.tabular import exact, ladder, stationary, stationary_sets, tightrope
 from tests.support import ZOO, always, mdps, mdps_with_policy, right_with, uniform_policy, zoo
 
 LEFT, RIGHT = 0, 1
@@ -96,7 +96,7 @@ def test_a_policy_is_stationary_up_to_the_tolerance():
 
 @given(mdps(max_states=3, max_actions=2))
 def test_the_enumerated_sets_are_what_membership_says_of_each_policy(mdp):
-    sets = stationary.enumerate_sets(mdp)
+    sets = stationary_sets.enumerate_sets(mdp)
     every = list(itertools.product(range(mdp.num_actions), repeat=mdp.num_states))
     assert sets.action_PS.tolist() == [list(actions) for actions in every]
     slack = stationary.TOLERANCE * max(1.0, float(exact.optimal(mdp).q_SA.abs().max()))
@@ -111,7 +111,7 @@ def test_the_enumerated_sets_are_what_membership_says_of_each_policy(mdp):
 
 @given(mdps(max_states=4, max_actions=2))
 def test_the_worst_stationary_policy_gets_better_with_depth_and_is_optimal_at_the_sufficient_one(mdp):
-    sets = stationary.enumerate_sets(mdp)
+    sets = stationary_sets.enumerate_sets(mdp)
     worst = [sets.worst_return(depth) for depth in range(sets.sufficient_depth + 2)]
     assert worst == sorted(worst)
     assert worst[-1] == worst[-2] == pytest.approx(exact.optimal(mdp).J, abs=1e-6)
@@ -120,7 +120,7 @@ def test_the_worst_stationary_policy_gets_better_with_depth_and_is_optimal_at_th
 
 
 def test_the_worst_stationary_policy_of_the_ladder_earns_nothing_below_depth_4():
-    sets = stationary.enumerate_sets(ladder(5))
+    sets = stationary_sets.enumerate_sets(ladder(5))
     best = exact.optimal(ladder(5)).J
     assert [sets.worst_return(depth) for depth in range(6)] == pytest.approx([0, 0, 0, 0, best, best])
     assert sets.sufficient_depth == 4
@@ -135,9 +135,9 @@ def stays_at_depth_0() -> list[bool]:
 @pytest.mark.parametrize("n", range(2, 8))
 def test_always_left_escapes_from_the_ladder_at_depth_n_minus_1_and_an_optimal_policy_never(n):
     mdp = ladder(n)
-    assert stationary.escape_depth(mdp, always(mdp, LEFT)) == n - 1
-    assert stationary.escape_depth(mdp, always(mdp, RIGHT)) == stationary.NEVER
-    assert stationary.escape_depth(mdp, uniform_policy(mdp)) == 0
+    assert stationary_sets.escape_depth(mdp, always(mdp, LEFT)) == n - 1
+    assert stationary_sets.escape_depth(mdp, always(mdp, RIGHT)) == stationary_sets.NEVER
+    assert stationary_sets.escape_depth(mdp, uniform_policy(mdp)) == 0
 
 
 @given(mdps_with_policy())
@@ -145,20 +145,20 @@ def test_the_escape_depth_is_the_first_at_which_a_policy_is_not_stationary(mdp_a
     mdp, pi_SA = mdp_and_policy
     pi_SA = torch.nn.functional.one_hot(pi_SA.argmax(-1), mdp.num_actions).double()
     slack = stationary.TOLERANCE * max(1.0, float(exact.optimal(mdp).q_SA.abs().max()))
-    escape = stationary.escape_depth(mdp, pi_SA)
-    last = 40 if escape == stationary.NEVER else escape
+    escape = stationary_sets.escape_depth(mdp, pi_SA)
+    last = 40 if escape == stationary_sets.NEVER else escape
     verdicts = [
         stationary.is_stationary(mdp, pi_SA, depth, tolerance=slack) for depth in sorted({0, max(last - 1, 0), last})
     ]
-    assert verdicts[-1] == (escape == stationary.NEVER)
+    assert verdicts[-1] == (escape == stationary_sets.NEVER)
     assert all(verdicts[:-1])
 
 
 def test_more_policies_than_can_be_enumerated_are_refused_with_their_number():
     with pytest.raises(PgtsError, match=r"4\^100 deterministic policies; at most 1048576"):
-        stationary.enumerate_sets(zoo("grid"))
+        stationary_sets.enumerate_sets(zoo("grid"))
     with pytest.raises(PgtsError, match=r"2\^5 deterministic policies; at most 31"):
-        stationary.enumerate_sets(ladder(5), max_policies=31)
+        stationary_sets.enumerate_sets(ladder(5), max_policies=31)
 
 
 # Table 2 of the paper, with 0.3, 0.6, 0.8 for x, y, z

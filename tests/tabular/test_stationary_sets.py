@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pgts_torch.bellman import sweep
 from pgts_torch.errors import PgtsError
 from pgts_torch.seeding import numpy_stream
-from pgts_torch.tabular import TabularMDP, deep_sea, exact, ladder, random_mdp, stationary
+from pgts_torch.tabular import TabularMDP, deep_sea, exact, ladder, random_mdp, stationary, stationary_sets
 from tests.support import always, mdps, mdps_with_policy, random_policy
 from tests.tabular.brute import DEPTHS, EXACT, family, stationary_ones, with_ends
 
@@ -47,10 +47,10 @@ def test_the_enumeration_finds_what_plain_numpy_finds():
 @pytest.mark.parametrize("entries", [1, 40, 1000])
 def test_the_enumeration_does_not_depend_on_how_much_is_worked_on_at_once(entries, monkeypatch):
     mdps = [random_mdp(5, 3, branching=2, seed=1), ladder(6), deep_sea(2, gamma=1.0), random_mdp(40, 1)]
-    expected = [stationary.enumerate_sets(mdp) for mdp in mdps]
-    monkeypatch.setattr(stationary, "_BATCH_ENTRIES", entries)
+    expected = [stationary_sets.enumerate_sets(mdp) for mdp in mdps]
+    monkeypatch.setattr(stationary_sets, "_BATCH_ENTRIES", entries)
     for mdp, all_at_once in zip(mdps, expected, strict=True):
-        sets = stationary.enumerate_sets(mdp)
+        sets = stationary_sets.enumerate_sets(mdp)
         np.testing.assert_allclose(sets.J_P, all_at_once.J_P, rtol=1e-12, atol=1e-12)
         assert torch.equal(sets.escape_P, all_at_once.escape_P)
 
@@ -60,19 +60,19 @@ def test_the_enumeration_does_not_depend_on_how_much_is_worked_on_at_once(entrie
 def test_rewards_in_other_units_change_no_stationary_set(scale):
     for case in family()[:40]:
         scaled = replace(case.mdp.outcomes, reward_NA=scale * case.mdp.outcomes.reward_NA)
-        sets = stationary.enumerate_sets(replace(case.mdp, outcomes=scaled))
+        sets = stationary_sets.enumerate_sets(replace(case.mdp, outcomes=scaled))
         assert torch.equal(sets.escape_P, case.sets.escape_P)
 
 
 def test_the_histogram_counts_every_policy_at_its_escape_depth():
-    sets = stationary.enumerate_sets(ladder(5))
-    assert sets.histogram == {stationary.NEVER: 1, 0: 5, 1: 4, 2: 6, 3: 8, 4: 8}
+    sets = stationary_sets.enumerate_sets(ladder(5))
+    assert sets.histogram == {stationary_sets.NEVER: 1, 0: 5, 1: 4, 2: 6, 3: 8, 4: 8}
 
 
 def test_a_policy_that_never_ends_at_gamma_1_is_refused_and_ends_are_enough():
     with pytest.raises(PgtsError, match="gamma is 1 and from state 0 some policy never ends"):
-        stationary.enumerate_sets(ladder(4, gamma=1.0))
-    sets = stationary.enumerate_sets(deep_sea(3, gamma=1.0))
+        stationary_sets.enumerate_sets(ladder(4, gamma=1.0))
+    sets = stationary_sets.enumerate_sets(deep_sea(3, gamma=1.0))
     assert (sets.J_optimal, sets.sufficient_depth) == (pytest.approx(0.99), 2)
 
 
@@ -151,7 +151,7 @@ def end_or_stay(gamma: float, reward: float = 1.0) -> TabularMDP:
 
 def test_an_end_counts_as_a_reward_of_0():
     mdp = end_or_stay(0.9)
-    sets = stationary.enumerate_sets(mdp)
+    sets = stationary_sets.enumerate_sets(mdp)
     assert sets.J_optimal - float(sets.J_P.min()) == pytest.approx(9)
     assert stationary.closed_form_bound(mdp, 0) == pytest.approx(9)
     same_everywhere = TabularMDP.from_dense(np.ones((1, 2, 1)), np.ones((1, 2)), 0.9)
@@ -163,7 +163,7 @@ def test_the_depth_for_eps_is_the_first_at_which_the_closed_form_is_at_most_eps(
     depth = stationary.depth_for(mdp, eps)
     assert stationary.closed_form_bound(mdp, depth) <= eps
     assert depth == 0 or stationary.closed_form_bound(mdp, depth - 1) > eps
-    sets = stationary.enumerate_sets(mdp)
+    sets = stationary_sets.enumerate_sets(mdp)
     assert sets.J_optimal - sets.worst_return(depth) <= eps + EXACT
 
 
