@@ -192,7 +192,7 @@ def report(arguments: Arguments) -> None:
     parser.add_argument("--json", action="store_true", help="print what the page shows as one JSON object")
     _add_trust(parser)
     given = parser.parse_args(arguments)
-    from pgts_torch.experiment.report.command import write
+    from pgts_torch.experiment.report.page import write
 
     answer = write(given.run_dir, given.out, trust_imports=given.trust_imports)
     print(json.dumps(answer) if given.json else answer["page"])

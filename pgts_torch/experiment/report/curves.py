@@ -1,18 +1,17 @@
-"""The curves of metrics.jsonl, and which of them share a panel."""
+"""The curves of metrics.jsonl: which of them share a panel, and how a panel is drawn."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
-MOST_POINTS = 400
-"""Of a line; of more points the lowest and the highest of each stretch are kept."""
-
+RETURN, MISSING = "Discounted return", "What is missing"
 SHARED = {
-    "Discounted return": {"exact/J": "J, exact", "charts/discounted_return": "episodes"},
-    "What is missing": {
-        "exact/optimality_gap": "J* - J, exact",
+    RETURN: {"exact/J": "J, exact", "charts/discounted_return": "episodes"},
+    MISSING: {
+        "exact/optimality_gap": "J* \N{MINUS SIGN} J, exact",
         "search/certificate": "certificate",
         "search/stationarity_gap": "stationarity gap",
     },
@@ -32,100 +31,87 @@ SHARED = {
 HEADINGS = {"search": "Lookahead", "exact": "Lookahead", "losses": "Learning", "charts": "Learning"}
 """Of the panels of a single tag, by what it begins with."""
 
-NAMES = {"charts/SPS": "Environment steps a second"}
 INTERVAL = "_half_width"
+INK, GREY = "#010203", "#8a8a8a"
+"""The colour of text, which is light on a dark page; and that of lines behind the curves."""
+
+COLOURS, WIDTHS = ("#2b7bba", "#e07b18", "#3a9a5b"), (2.8, 1.8, 1.2)
+"""Curves that lie on each other stay visible: the last is thin and on top."""
 
 
-@dataclass(frozen=True)
-class Curve:
-    """One tag over environment steps; None is a value that is not finite.
-
-    half_widths: of the 95 % confidence interval, where there is one.
-    """
+class Curve(TypedDict):
+    """One tag over environment steps, with half-widths of 95 % confidence intervals; None: not finite, or not known."""
 
     tag: str
     label: str
     steps: Sequence[int]
     values: Sequence[float | None]
-    half_widths: Sequence[float | None] | None = None
+    half_widths: Sequence[float | None] | None
 
 
-@dataclass(frozen=True)
-class Panel:
-    """Curves with one axis. `level` is a value to compare them with, J*."""
+class Panel(TypedDict):
+    """Curves with one axis, and a value to compare them with."""
 
     title: str
     curves: Sequence[Curve]
-    level: float | None = None
+    level: float | None
 
 
-@dataclass(frozen=True)
-class Curves:
-    """All tags: panels by heading, tags that never changed with their value, and tags that never were finite."""
-
-    groups: Mapping[str, Sequence[Panel]]
-    constant: Mapping[str, float]
-    never_finite: Sequence[str]
-
-
-def panels(lines: Sequence[Mapping[str, Any]]) -> Curves:
-    """The tags of these lines of metrics.jsonl; half-widths belong to their means."""
+def panels(lines: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[Panel]], dict[str, float], list[str]]:
+    """Panels by heading, tags that never change with their value, and tags that are never finite."""
     tags = list(dict.fromkeys(tag for line in lines for tag in line if tag != "step"))
     finite = {tag for line in lines for tag, value in line.items() if value is not None}
-    groups: dict[str, list[Panel]] = {}
+    groups: dict[str, list[Panel]] = {heading: [] for heading in ("Return", *HEADINGS.values(), "More")}
     constant: dict[str, float] = {}
+    pairs = [(line.get("exact/J"), line.get("exact/optimality_gap")) for line in lines]
+    optimum = next((J + gap for J, gap in pairs if J is not None and gap is not None), None)
     for title, labels in SHARED.items():
-        if curves := [_curve(lines, tag, label) for tag, label in labels.items() if tag in finite]:
-            level = _optimum(lines) if any(curve.tag == "exact/J" for curve in curves) else None
-            groups.setdefault("Return", []).append(Panel(title, curves, level))
-    drawn = {tag for labels in SHARED.values() for tag in labels}
-    for tag in tags:
-        if tag in drawn or tag not in finite or (tag.endswith(INTERVAL) and tag.removesuffix(INTERVAL) in tags):
-            continue
+        if found := [_curve(lines, tag, label) for tag, label in labels.items() if tag in finite]:
+            groups["Return"].append(Panel(title=title, curves=found, level=optimum if title == RETURN else None))
+    drawn = {tag for labels in SHARED.values() for tag in labels} | {f"{tag}{INTERVAL}" for tag in tags}
+    for tag in (tag for tag in tags if tag in finite - drawn):
         curve = _curve(lines, tag, "")
-        if len(set(curve.values)) == 1:
-            constant[tag] = next(value for value in curve.values if value is not None)
+        if len(set(curve["values"])) == 1:
+            constant[tag] = lines[-1].get(tag, curve["values"][0])
             continue
-        room, _, name = tag.partition("/")
-        title = NAMES.get(tag, name.replace("_", " ").capitalize() if room in HEADINGS else tag)
-        groups.setdefault(HEADINGS.get(room, "More"), []).append(Panel(title, [curve]))
-    order = ["Return", *HEADINGS.values(), "More"]
-    return Curves(
-        {heading: groups[heading] for heading in order if heading in groups},
-        constant,
-        [tag for tag in tags if tag not in finite],
-    )
+        kind, _, name = tag.replace("/SPS", "/environment steps a second").partition("/")
+        title = name[:1].upper() + name[1:].replace("_", " ") if kind in HEADINGS else tag
+        groups[HEADINGS.get(kind, "More")].append(Panel(title=title, curves=[curve], level=None))
+    never = [tag for tag in tags if tag not in finite]
+    return {heading: found for heading, found in groups.items() if found}, constant, never
 
 
 def _curve(lines: Sequence[Mapping[str, Any]], tag: str, label: str) -> Curve:
     points = [line for line in lines if tag in line]
-    kept = _thinned([line[tag] for line in points])
-    widths = [points[k].get(tag + INTERVAL) for k in kept]
-    return Curve(
-        tag,
-        label,
-        [points[k]["step"] for k in kept],
-        [points[k][tag] for k in kept],
-        widths if any(width is not None for width in widths) else None,
-    )
+    steps, values = [line["step"] for line in points], [line[tag] for line in points]
+    widths = [line.get(tag + INTERVAL) for line in points]
+    return Curve(tag=tag, label=label, steps=steps, values=values, half_widths=widths if any(widths) else None)
 
 
-def _thinned(values: Sequence[float | None]) -> list[int]:
-    """The indices that a curve needs: of many points the first, the last, and each stretch's extremes or a gap."""
-    if len(values) <= MOST_POINTS:
-        return list(range(len(values)))
-    kept = {0, len(values) - 1}
-    for stretch in np.array_split(np.arange(len(values)), MOST_POINTS // 2):
-        finite = [(value, k) for k in stretch.tolist() if (value := values[k]) is not None]
-        kept |= {min(finite)[1], max(finite)[1]} if finite else {int(stretch[0])}
-    return sorted(kept)
-
-
-def _optimum(lines: Sequence[Mapping[str, Any]]) -> float | None:
-    """J*, which is J and what is missing to it."""
-    known = (line["exact/J"] + line["exact/optimality_gap"] for line in lines if _has_both(line))
-    return next(known, None)
-
-
-def _has_both(line: Mapping[str, Any]) -> bool:
-    return line.get("exact/J") is not None and line.get("exact/optimality_gap") is not None
+def draw(panel: Panel) -> Figure:
+    """The curves of a panel, with a legend where there is more than one line."""
+    figure = Figure(figsize=(5, 2.9), layout="constrained")
+    axes = figure.subplots()
+    for curve, colour, width in zip(panel["curves"], COLOURS, WIDTHS[-len(panel["curves"]) :], strict=False):
+        value_K = np.array(curve["values"], dtype=np.float64)  # None becomes nan, which leaves a gap
+        marker = "." if len(value_K) <= 40 else ""
+        axes.plot(curve["steps"], value_K, color=colour, linewidth=width, marker=marker, label=curve["label"])
+        if curve["half_widths"] is not None:
+            width_K = np.array(curve["half_widths"], dtype=np.float64)
+            band = (value_K - width_K, value_K + width_K)
+            axes.fill_between(curve["steps"], *band, color=colour, alpha=0.2, linewidth=0)
+    if panel["level"] is not None:
+        axes.axhline(panel["level"], color=GREY, linewidth=1.2, linestyle="--", label="J*")
+    positive = [value for curve in panel["curves"] for value in curve["values"] if value is not None and value > 0]
+    if panel["title"] == MISSING and positive and max(positive) > 100 * min(positive):
+        axes.set_yscale("log", nonpositive="clip")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.set_xlabel("environment steps", color=INK)
+    axes.tick_params(color=GREY, labelcolor=INK)
+    axes.margins(x=0.01)
+    axes.grid(alpha=0.25, color=GREY)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(GREY)
+    if len(axes.lines) > 1:
+        figure.legend(loc="outside upper left", ncols=4, frameon=False, labelcolor=INK, handlelength=1.6)
+    return figure

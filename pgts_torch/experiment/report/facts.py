@@ -1,159 +1,171 @@
-"""What the folder of a run says about it. Whatever of it is missing or damaged becomes a note."""
+"""What the folder of a run says about it. Whatever is missing, damaged or just being written becomes a note."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import checkpoint
-from pgts_torch.experiment.checkpoint import Notes
+from pgts_torch.experiment import checkpoint, ownership
+from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.loading import load
-from pgts_torch.experiment.ownership import CONFIG_FILE, VERSIONS_FILE
-from pgts_torch.experiment.report import reading
-from pgts_torch.experiment.report.curves import Panel, panels
-from pgts_torch.experiment.report.settings import Setting, settings
-from pgts_torch.experiment.summary import Summary, rows
-from pgts_torch.tabular.mdp import TabularMDP
+from pgts_torch.experiment.report.curves import panels
+from pgts_torch.experiment.resume import flat
+from pgts_torch.experiment.schema import Schema
+from pgts_torch.experiment.summary import Summary, from_json, rows
+from pgts_torch.files import PARTIAL
+
+Values = Mapping[str, Any]
+
+PROGRESS = {
+    "exact/J": "return of the policy, J",
+    "search/stationarity_gap": "stationarity gap",
+    "search/certificate": "certificate, J* - J <=",
+    "charts/episodic_return": "return of episodes",
+}
+"""What is said of the last iteration of a run that has not come to its end."""
 
 
-@dataclass(frozen=True)
-class Certificate:
-    """An upper bound on J* - J^pi; None: there is none.
+def gather(run: Path, *, trust_imports: bool = False) -> tuple[dict[str, Any], PGTS | None]:
+    """What a run folder says, as plain values, and what its newest intact checkpoint holds.
 
-    is_proved: whether that is a proof.
-    missing: J* - J^pi itself, where it is known.
-    is_known: whether there was an iteration that could say.
-    """
-
-    bound: float | None
-    is_proved: bool
-    missing: float | None
-    is_known: bool
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What there is to say about a run.
-
-    state: finished, unfinished or failed.
-    failure: what failure.json says.
-    step: environment steps that were made.
-    world_size: how many processes made them.
-    rows: what the run came to, or how far it is: names and values as text.
-    curves: by heading.
-    files: their sizes in bytes; a folder counts as one.
-    notes: what is missing or damaged.
-    """
-
-    run: str
-    name: str
-    env: str
-    seed: int
-    state: str
-    failure: Mapping[str, Any] | None
-    step: int
-    total_steps: int
-    world_size: int
-    rows: Mapping[str, str]
-    certificate: Certificate
-    curves: Mapping[str, Sequence[Panel]]
-    constant: Mapping[str, float]
-    never_finite: Sequence[str]
-    config: Sequence[Setting]
-    versions: Mapping[str, Any]
-    files: Mapping[str, int]
-    notes: Sequence[str]
-
-
-@dataclass(frozen=True)
-class Trained:
-    """The policy of the newest intact checkpoint, where all states can be listed."""
-
-    mdp: TabularMDP
-    pi_SA: Tensor
-    step: int
-
-
-def gather(run: Path, *, trust_imports: bool = False) -> tuple[Facts, Trained | None]:
-    """What a run folder says, and the policy in it.
+    Among the values: `state`, finished, unfinished or failed; `rows`, what the run came to or how far it is, names and
+    values as text; `curves` by heading; `config`, each key with its default under the types that were chosen (None for
+    kwargs); `notes`, what is missing or damaged.
 
     Raises:
-        PgtsError: its configuration cannot be read.
+        PgtsError: the configuration cannot be read.
     """
-    config = load(run / CONFIG_FILE)
-    notes: list[str] = []
-    summary, failure = reading.summary(run, notes), reading.failure(run, notes)
-    lines = reading.metrics(run, notes)
-    path, last = reading.last_checkpoint(run, notes) or (None, None)
-    trained = None if path is None or last is None else _trained(path, last, notes, trust_imports=trust_imports)
+    config, notes = load(run / ownership.CONFIG_FILE), list[str]()
+    summary = _read(run / ownership.SUMMARY_FILE, _summary, notes)
+    failure = _read(run / ownership.FAILURE_FILE, dict, notes)
+    versions = _read(run / ownership.VERSIONS_FILE, dict, notes)
+    lines = _metrics(run, notes)
     latest = {tag: value for line in lines for tag, value in line.items()}
-    curves = panels(lines)
-    facts = Facts(
-        run=str(run),
-        name=config.name,
-        env=config.env.id,
-        seed=config.seed,
-        state="failed" if failure is not None else "unfinished" if summary is None else "finished",
-        failure=failure,
-        step=max(0 if last is None else last.env_steps, latest.get("step", 0)),
-        total_steps=config.total_steps,
-        world_size=1 if last is None else last.world_size,
-        rows=dict(_progress(last, latest)) if summary is None else rows(summary),
-        certificate=_certificate(summary, latest),
-        curves=curves.groups,
-        constant=curves.constant,
-        never_finite=curves.never_finite,
-        config=list(settings(config)),
-        versions=reading.json_object(run / VERSIONS_FILE, notes) or {},
-        files=dict(reading.files(run)),
-        notes=notes,
-    )
-    return facts, trained
-
-
-def _trained(path: Path, last: Notes, notes: list[str], *, trust_imports: bool) -> Trained | None:
+    curves, constant, never_finite = panels(lines)
+    path, last = _last_checkpoint(run, notes)
+    algorithm = None
     try:
-        algorithm = PGTS.load(path / checkpoint.MODEL_FILE, device="cpu", trust_imports=trust_imports)
+        if last is not None:
+            algorithm = PGTS.load(path / checkpoint.MODEL_FILE, device="cpu", trust_imports=trust_imports)
     except PgtsError as error:
         notes.append(f"The trained policy cannot be loaded, so there are no pictures of it: {error}.")
+    facts = {
+        "run": str(run),
+        "name": config.name,
+        "env": config.env.id,
+        "seed": config.seed,
+        "state": "failed" if failure else "finished" if summary else "unfinished",
+        "failure": failure,
+        "step": max(0 if last is None else last.env_steps, latest.get("step", 0)),
+        "total_steps": config.total_steps,
+        "world_size": 1 if last is None else last.world_size,
+        "rows": rows(summary) if summary else dict(_progress(last, latest)),
+        "certificate": _certificate(summary, latest),
+        "curves": curves,
+        "constant": constant,
+        "never_finite": never_finite,
+        "config": list(_settings(config)),
+        "versions": versions or {},
+        "files": dict(_files(run)),
+        "notes": notes,
+    }
+    return facts, algorithm
+
+
+def number(value: Any) -> float | None:
+    """A value that can be drawn, else None: differences of two of them are finite, too."""
+    return value if isinstance(value, int | float) and abs(value) <= 1e300 else None
+
+
+def _read(path: Path, parse: Callable[[Any], Any], notes: list[str]) -> Any:
+    """What `parse` makes of the JSON in a file; None where there is none, or another form."""
+    try:
+        return parse(json.loads(path.read_bytes()))
+    except FileNotFoundError:
         return None
-    if algorithm.world.mdp is None:
-        return None
-    return Trained(algorithm.mdp, algorithm.policy_table().cpu(), last.env_steps)
+    except (OSError, ValueError, RecursionError, TypeError, KeyError, AttributeError):
+        notes.append(f"{path.name} cannot be read, or is not as this version writes it; it is left out.")
 
 
-def _certificate(summary: Summary | None, latest: Mapping[str, Any]) -> Certificate:
-    if summary is None:
-        bound, missing = latest.get("search/certificate"), latest.get("exact/optimality_gap")
-        is_proved = latest.get("search/proved") == 1
-    else:
-        bound, missing, is_proved = summary.certificate, None, summary.certificate_is_proved
-        if summary.J is not None and summary.J_optimal is not None:
-            missing = max(summary.J_optimal - summary.J, 0.0)
-    is_known = summary is not None or "search/certificate" in latest
-    return Certificate(bound, is_proved, missing, is_known)
+def _summary(content: Any) -> Summary:
+    summary = from_json(content)
+    rows(summary)  # raises an error where something cannot be said
+    return summary
 
 
-def _progress(last: Notes | None, latest: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """How far an unfinished run is, in the order of a summary."""
-    J, missing = latest.get("exact/J"), latest.get("exact/optimality_gap")
-    if J is not None and missing is not None:
-        yield "return of the policy, J", f"{J:.4g} in the last iteration"
-        yield "optimal return, J*", f"{J + missing:.4g}"
-    for tag, name in [
-        ("search/stationarity_gap", "stationarity gap"),
-        ("search/certificate", "certificate, J* - J <="),
-        ("charts/episodic_return", "return of episodes"),
-    ]:
+def _metrics(run: Path, notes: list[str]) -> list[Values]:
+    """The lines of metrics.jsonl that can be read; what is not a number that can be drawn is None."""
+    lines, unread = list[Values](), 0
+    with suppress(OSError):
+        for raw in (run / ownership.METRICS_FILE).read_bytes().splitlines():
+            try:
+                line = json.loads(raw)
+                lines.append({"step": int(line.pop("step"))} | {tag: number(value) for tag, value in line.items()})
+            except (ValueError, RecursionError, AttributeError, TypeError, KeyError):
+                unread += 1
+    if unread:
+        notes.append(f"{unread} of {len(lines) + unread} lines of metrics.jsonl cannot be read; they are left out.")
+    if not lines:
+        notes.append("metrics.jsonl holds no iteration, so there are no curves.")
+    return lines
+
+
+def _last_checkpoint(run: Path, notes: list[str]) -> tuple[Path, checkpoint.Notes | None]:
+    """The newest checkpoint that is intact, and what it says."""
+    for path in reversed(checkpoint.listed(run)):
+        try:
+            return path, checkpoint.read(path)[0]
+        except PgtsError as error:
+            notes.append(f"{error}.")
+    notes.append("There is no intact checkpoint, so nothing can be said about the trained policy itself.")
+    return run, None
+
+
+def _progress(last: checkpoint.Notes | None, latest: Values) -> Iterator[tuple[str, str]]:
+    for tag, name in PROGRESS.items():
         if latest.get(tag) is not None:
             yield name, f"{latest[tag]:.4g} in the last iteration"
     if latest.get("search/model_calls") is not None:
         yield "model calls", f"{latest['search/model_calls']:.0f}"
     if last is not None:
         yield "last checkpoint", f"{last.env_steps} steps in {last.iterations} iterations"
-        if reading.is_number(last.progress.get("seconds")):
-            yield "seconds", f"{last.progress['seconds']:.1f} up to the last checkpoint"
+
+
+def _certificate(summary: Summary | None, latest: Values) -> Values:
+    """An upper bound on J* - J^pi (None: there is none), whether it is proved, what is missing where that is known, and
+    whether there was an iteration that could say."""
+    if summary is None:
+        bound, missing = latest.get("search/certificate"), latest.get("exact/optimality_gap")
+        proved, known = latest.get("search/proved") == 1, "search/certificate" in latest
+    else:
+        bound, proved, known, missing = summary.certificate, summary.certificate_is_proved, True, None
+        if summary.J is not None and summary.J_optimal is not None:
+            missing = max(summary.J_optimal - summary.J, 0.0)
+    return {"bound": bound, "is_proved": proved, "missing": missing, "is_known": known}
+
+
+def _settings(config: Config) -> Iterator[Values]:
+    values = flat(config)
+    defaults = {option.key: option.default for option in Schema(Config).options() if _applies(option.when, values)}
+    for key, value in values.items():
+        is_default = key in defaults and value == defaults[key]
+        yield {"key": key, "value": value, "default": defaults.get(key), "is_default": is_default}
+
+
+def _applies(when: str, values: Values) -> bool:
+    """Whether a condition of `Option.when` holds."""
+    conditions = (condition.split(" ") for condition in when.split(" and ") if condition)
+    return all(values.get(key) in choices.split("|") for key, choices in conditions)
+
+
+def _files(run: Path) -> Iterator[tuple[str, int]]:
+    """Names and bytes of what a run has left; a checkpoint counts as one."""
+    hidden = (ownership.CHECKPOINTS, ownership.LOCK_FILE, ownership.MARK_FILE, ownership.REPORT_FILE)
+    for path in sorted([*run.iterdir(), *checkpoint.listed(run)]):
+        if path.name not in hidden and not path.name.endswith(PARTIAL):
+            parts = path.glob("*") if path.parent != run else [path]
+            with suppress(FileNotFoundError):  # a run that is being trained removes old checkpoints
+                yield str(path.relative_to(run)), sum(part.stat().st_size for part in parts)
