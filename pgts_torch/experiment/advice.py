@@ -1,4 +1,4 @@
-"""What a finished run has to say about itself: that it hardly learned, or that its most probable actions are bad."""
+"""Advice at the end of a run: the policy hardly moved, has not converged, or is worse when it acts greedily."""
 
 import math
 from typing import Any
@@ -17,23 +17,23 @@ from pgts_torch.agent.updates import TabularUpdate, Update
 from pgts_torch.errors import PgtsError
 
 HARDLY = 0.05
-"""A policy of which less than this share of probability is elsewhere than at first has hardly moved."""
+"""A policy whose total variation distance from the initial one is smaller has hardly moved."""
 
 RESTLESS = 0.05
-"""A policy of which an iteration still moves more than this share of probability at the end has not come to rest."""
+"""A policy that still moves by a larger total variation distance per iteration at the end has not come to rest."""
 
 LARGE = 0.1
-"""What is missing is large if it is more than this share of what actions differ by."""
+"""An optimality gap is large if it is more than this share of max_a q - min_a q."""
 
 _DECAY = 0.9
-"""What the average over iterations keeps from one to the next, so that it speaks of the last ten or so."""
+"""Decay of the running mean over iterations: about the last ten count."""
 
 
 class Movement:
-    """How far a policy has come since before the first iteration, and what a lookahead still sees better.
+    """How far a policy has moved since the first iteration, and how much better a lookahead still finds its actions.
 
     Args:
-        first: the policy as it was then.
+        first: the initial policy.
     """
 
     def __init__(self, first: Policy) -> None:
@@ -43,24 +43,24 @@ class Movement:
         self.pace: float | None = None
 
     def follow(self, algorithm: PGTS, iteration: Iteration) -> None:
-        """Take in an iteration that was made just now: `pace`, a running mean over iterations of
+        """Update `pace` with the latest iteration: a running mean of
 
             sum_s w(s) 1/2 sum_a |pi_{k+1}(a|s) - pi_k(a|s)|,        in [0, 1], w the weights of the update, of sum 1
 
-        Of tables only, where it costs next to nothing.
+        Of tabular policies only, where it costs next to nothing.
         """
         if isinstance(algorithm.policy, TabularPolicy):
-            moved = self._apart(algorithm, iteration, iteration.pi_NA)
+            moved = self._distance(algorithm, iteration, iteration.pi_NA)
             self.pace = moved if self.pace is None else _DECAY * self.pace + (1 - _DECAY) * moved
 
     def measure(self, algorithm: PGTS, iteration: Iteration) -> None:
-        """At the states of an iteration that was made just now, by their weights in the update:
+        """Update, at the states of the latest iteration and with their weights in the update:
 
         moved = mean of 1/2 sum_a |pi - pi_first|, in [0, 1];   gap_share = mean g_m / mean (max_a q - min_a q)
         """
         share_N = _shares(iteration)
         first_NA = self.first.probs(iteration.observation_N)
-        self.moved = self._apart(algorithm, iteration, first_NA)
+        self.moved = self._distance(algorithm, iteration, first_NA)
         self.gap_share = None
         if iteration.look is not None:
             span = float(span_of(iteration.look.q_BA) @ share_N.to(iteration.look.q_BA.dtype))
@@ -68,8 +68,8 @@ class Movement:
             self.gap_share = gap / span if 0 < span < math.inf else None
 
     @staticmethod
-    def _apart(algorithm: PGTS, iteration: Iteration, other_NA: Tensor) -> float:
-        """Which share of probability the policy has elsewhere than another one has it."""
+    def _distance(algorithm: PGTS, iteration: Iteration, other_NA: Tensor) -> float:
+        """Mean total variation distance between the policy and another one at the states of an iteration."""
         probs_NA = algorithm.policy.probs(iteration.observation_N)
         share_N = _shares(iteration)
         return float((probs_NA - other_NA).abs().sum(-1).to(share_N.dtype) @ share_N) / 2
@@ -79,7 +79,7 @@ class Movement:
         return {"moved": self.moved, "gap_share": self.gap_share, "pace": self.pace}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave; PgtsError if it is something else."""
+        """Load what `state_dict` returned; PgtsError if it is something else."""
         check_keys("movement", state, {"moved", "gap_share", "pace"})
         if not all(isinstance(value, float | None) for value in state.values()):
             raise PgtsError(f"movement is {state}; it must be numbers")
@@ -87,17 +87,17 @@ class Movement:
 
 
 def _shares(iteration: Iteration) -> Float[Tensor, "N"]:
-    """w(s), of sum 1."""
+    """The weights of the states, normalised to sum 1."""
     return iteration.weight_N / iteration.weight_N.sum()
 
 
 def span_of(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
-    """max_a q - min_a q, over the actions that are allowed."""
+    """max_a q - min_a q, over the legal actions (q > -inf)."""
     least_NA = torch.where(q_NA.isfinite(), q_NA, math.inf)
     return q_NA.amax(-1) - least_NA.amin(-1)
 
 
-def stuck(
+def hardly_moved(
     movement: Movement,
     update: Update,
     *,
@@ -105,13 +105,13 @@ def stuck(
     missing_share: float | None,
     stationary_share: float | None,
 ) -> str | None:
-    """That the policy hardly moved though much is missing, and what to change; None where that is not so.
+    """Advice where the policy hardly moved though its optimality gap is large; else None.
 
     Args:
         depth: m, the largest of the run.
-        missing_share: (J* - J) / (max q* - min q*), where the truth is known. Else the gap of the last lookahead says
-            what is missing, as far as the critic is right.
-        stationary_share: the largest exact g_m as such a share, where the truth is known.
+        missing_share: (J* - J) / (max q* - min q*), where the truth is known; None: the gap of the last lookahead is
+            used instead.
+        stationary_share: the largest exact g_m in the same unit, where the truth is known.
     """
     if movement.moved is None or movement.moved >= HARDLY:
         return None
@@ -126,9 +126,10 @@ def stuck(
     return f"{told}. Set {_longer_steps(update)}, more total_steps, or a deeper lookahead, search.depth above {depth}"
 
 
-def restless(movement: Movement, update: Update, *, missing_share: float | None) -> str | None:
-    """That the policy of a table has not come to rest though much is missing: it may go round for ever, because its
-    steps do not shrink, or it is still on its way. None where that is not so.
+def not_converged(movement: Movement, update: Update, *, missing_share: float | None) -> str | None:
+    """Advice where a tabular policy still moves at the end though its optimality gap is large; else None.
+
+    It may cycle for ever, because its steps do not shrink, or need more steps.
 
     Args:
         missing_share: as in `stuck`.
@@ -153,8 +154,7 @@ def _longer_steps(update: Update) -> str:
 
 
 def greedy_is_worse(greedy: Evaluation, drawn: Evaluation) -> str | None:
-    """That episodes of the most probable actions return less than those of drawn ones, beyond both confidence
-    intervals; None where that is not so, or one episode tells nothing."""
+    """Advice where greedy episodes return less than sampled ones, beyond both confidence intervals; else None."""
     one, other = greedy.episodic_return, drawn.episodic_return
     if one.half_width is None or other.half_width is None or one.mean + one.half_width >= other.mean - other.half_width:
         return None

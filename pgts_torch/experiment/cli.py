@@ -31,7 +31,7 @@ from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.ownership import SUMMARY_FILE
 from pgts_torch.experiment.schema import Schema
-from pgts_torch.experiment.terminal import plain_warnings, tell, telling
+from pgts_torch.experiment.terminal import plain_warnings, print_kept, safe_output
 from pgts_torch.trust import check_imports
 
 CHECK_FAILED = TRAINING_FAILED = 1
@@ -61,7 +61,7 @@ def main(arguments: Arguments | None = None) -> int:
 
 def exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> int:
     """Run a command and return its exit code, as `main` says; mistakes and failures go to stderr, a line each."""
-    with telling(), plain_warnings():
+    with safe_output(), plain_warnings():
         return _exit_code(function, arguments)
 
 
@@ -130,7 +130,7 @@ def train(arguments: Arguments) -> None:
 
     summary = run.train(config, strict_resume=fixed.strict_resume, any_world_size=fixed.any_world_size)
     if _rank() == 0:
-        tell(json.dumps(asdict(summary)) if fixed.json else describe(summary), kept=f"{SUMMARY_FILE} of the run")
+        print_kept(json.dumps(asdict(summary)) if fixed.json else describe(summary), kept=f"{SUMMARY_FILE} of the run")
 
 
 @command
@@ -151,7 +151,7 @@ def sweep(arguments: Arguments) -> None:
 
     runs = sweeping.plan(fixed.config, overrides, depths=fixed.depths, num_seeds=fixed.seeds, out=fixed.out)
     answer = sweeping.sweep(runs, jobs=fixed.jobs, out=fixed.out)
-    tell(json.dumps(asdict(answer)) if fixed.json else sweeping.describe(answer), kept=f"{fixed.out}/table.json")
+    print_kept(json.dumps(asdict(answer)) if fixed.json else sweeping.describe(answer), kept=f"{fixed.out}/table.json")
     for name, mistake in answer.failures.items():
         print(f"error: {name}: {mistake}", file=sys.stderr)
     if answer.failures:

@@ -1,4 +1,4 @@
-"""What is worth watching in an iteration. Nothing here draws a random number or feeds back into training."""
+"""The logged metrics of an iteration. Nothing here draws a random number or feeds back into training."""
 
 import torch
 from jaxtyping import Float
@@ -12,7 +12,7 @@ from pgts_torch.tabular.ascent import softmax_direction
 
 
 def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
-    """Tags of one iteration, all of the policy pi_k that made its episodes."""
+    """The tags of one iteration, all about the policy pi_k that collected its episodes."""
     episodes = iteration.experience
     entropy_N = -torch.special.xlogy(iteration.pi_NA, iteration.pi_NA).sum(-1)
     tags = {
@@ -38,10 +38,10 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
 
 
 class Truth:
-    """What the exact world says of a policy and of an estimate.
+    """Compares a policy and its lookahead estimates with the exact values of the MDP.
 
     Args:
-        algorithm: whose estimates are to be held to the truth.
+        algorithm: whose `mdp` and `update` are used.
     """
 
     def __init__(self, algorithm: PGTS) -> None:
@@ -50,10 +50,10 @@ class Truth:
         self.optimum = exact.optimal(self.mdp)
 
     def metrics(self, pi_SA: Float[Tensor, "S A"], iteration: Iteration) -> dict[str, float]:
-        """The `exact/*` tags of an iteration that was made with pi_SA.
+        """The `exact/*` tags of an iteration whose policy was pi_SA.
 
-        J and J* - J; where there was a lookahead, its largest error at the visited states, and the cosine between the
-        direction that the policy moved in and the exact one, which is left out where one of the two is 0.
+        J and J* - J; with a lookahead also its largest error at the visited states, and the cosine between the
+        estimated and the exact update direction, left out where one of the two is 0.
         """
         evaluation = exact.evaluate(self.mdp, pi_SA)
         tags = {"exact/J": evaluation.J, "exact/optimality_gap": max(self.optimum.J - evaluation.J, 0.0)}
@@ -65,15 +65,15 @@ class Truth:
         tags["exact/lookahead_error"] = float(error_NA.abs().max())
         weight_S = evaluation.d_S if self.update.state_weight != "uniform" else (evaluation.d_S > 0).double()
         true_SA = self._direction(pi_SA, look_SA, weight_S)
-        made_SA = torch.zeros_like(true_SA)
-        made_SA[states] = self._direction(pi_SA[states], iteration.look.q_BA.cpu(), iteration.weight_N.cpu())
-        norms = float(true_SA.norm() * made_SA.norm())
+        estimated_SA = torch.zeros_like(true_SA)
+        estimated_SA[states] = self._direction(pi_SA[states], iteration.look.q_BA.cpu(), iteration.weight_N.cpu())
+        norms = float(true_SA.norm() * estimated_SA.norm())
         if norms > 0:
-            tags["exact/gradient_cosine"] = float((true_SA * made_SA).sum()) / norms
+            tags["exact/gradient_cosine"] = float((true_SA * estimated_SA).sum()) / norms
         return tags
 
     def _direction(self, pi_NA: Tensor, q_NA: Tensor, weight_N: Tensor) -> Tensor:
-        """The direction of the update, without what the simplex forbids: equal steps of all actions."""
+        """The update direction, projected on the tangent space of the simplex (its entries sum to 0)."""
         if isinstance(self.update, SoftmaxUpdate):
             return softmax_direction(pi_NA, q_NA, weight_N)
         return weight_N[:, None] * (q_NA - q_NA.mean(-1, keepdim=True))

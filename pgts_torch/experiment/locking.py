@@ -20,14 +20,14 @@ _BEYOND = 2**30
 
 
 class RunLock:
-    """Keeps other processes from a run folder, as long as this one lives. Use it as a context.
+    """Locks a run folder against other processes until this one ends. Use it as a context.
 
     Args:
         path: the folder; made here, with all parents.
 
     Raises:
-        PgtsError: it cannot be made or written to; or another process has it, naming its id; or the lock is no file of
-            ours.
+        PgtsError: it cannot be made or written to; or another process, named by its id, holds it; or the lock file
+            was not made by a run.
     """
 
     def __init__(self, path: Path) -> None:
@@ -53,7 +53,7 @@ class RunLock:
             raise
 
     def check(self) -> None:
-        """PgtsError where another folder is now in the place of the one that was locked."""
+        """PgtsError if the locked folder has been moved or replaced."""
         try:
             now = os.stat(self.path / LOCK_FILE, follow_symlinks=False)
         except OSError:
@@ -67,11 +67,11 @@ class RunLock:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        os.close(self._handle)  # the system gives the lock back
+        os.close(self._handle)  # releases the lock
 
 
 def _opened(path: Path) -> int:
-    """A handle of a plain file, made if there is none; nothing in it has changed."""
+    """Open a plain file for reading and writing, unchanged; create it if it does not exist."""
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     found = files.kind(path)
     if found not in (None, "file"):
@@ -84,7 +84,7 @@ def _opened(path: Path) -> int:
 
 
 def _take(handle: int) -> bool:
-    """Whether the lock is ours now."""
+    """Try to take the lock; whether this succeeded."""
     try:
         if fcntl is not None:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -93,6 +93,6 @@ def _take(handle: int) -> bool:
 
             os.lseek(handle, _BEYOND, os.SEEK_SET)
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-    except (BlockingIOError, PermissionError):  # which of them, differs by system
+    except (BlockingIOError, PermissionError):  # which of the two depends on the platform
         return False
     return True

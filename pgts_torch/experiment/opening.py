@@ -1,4 +1,4 @@
-"""The folder of a run: chosen, made, and emptied of an earlier run, without touching what no run has left."""
+"""Choose, create and clear the folder of a run, without touching files that no run has written."""
 
 import json
 import os
@@ -29,11 +29,11 @@ from pgts_torch.experiment.resume import Start, is_kept
 from pgts_torch.experiment.tracking import RunFolder, versions
 
 RUNS = Path("runs")
-"""Where runs are whose configuration names no folder."""
+"""The parent of run folders where a configuration names none."""
 
 
 def check_dir(config: Config) -> None:
-    """PgtsError if the folder that a configuration names cannot be a run's; nothing was written."""
+    """PgtsError if the configured folder cannot be used as a run folder. Writes nothing."""
     if config.run.dir:
         with files.named(f"run.dir {config.run.dir!a}"):
             config.run.dir.encode()  # it is written down in config.yaml
@@ -43,7 +43,7 @@ def check_dir(config: Config) -> None:
 
 
 def claimed(config: Config) -> RunLock:
-    """The lock of the folder that a configuration names, or of a new one; PgtsError as from `check_folder`."""
+    """The lock of the configured folder, or of a new one; PgtsError as from `check_folder`."""
     lock = RunLock(Path(config.run.dir) if config.run.dir else _new_folder(config))
     try:
         is_kept(config, lock.path, check_folder(lock.path))
@@ -54,7 +54,7 @@ def claimed(config: Config) -> RunLock:
 
 
 def _new_folder(config: Config) -> Path:
-    """A folder in runs/ that nobody had before; of two processes that make one at a time each has its own."""
+    """Create a new folder in runs/. Two processes that do this at the same time get different ones."""
     stem = RUNS / f"{config.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     number = 1
     while True:
@@ -70,7 +70,7 @@ def _new_folder(config: Config) -> Path:
 
 
 def opened(config: Config, lock: RunLock, start: Start | None) -> RunFolder:
-    """The folder with what a run leaves before it begins; of earlier runs it holds nothing, or what it goes on from."""
+    """Write the configuration and the versions; files of earlier runs are removed, or kept where the run resumes."""
     path = lock.path
     lock.check()
     mark = check_folder(path)
@@ -79,7 +79,7 @@ def opened(config: Config, lock: RunLock, start: Start | None) -> RunFolder:
     position: dict[str, Any] = {}
     if start is None:
         mark = replace(mark, has_checkpoints=False)
-    write_mark(path, mark.of(text))  # before all else: it makes this the folder of a run
+    write_mark(path, mark.of(text))  # first of all: the mark makes this a run folder
     if start is None:
         if left := [name for name in clear(path, mark) if not (keeps_config and name == CONFIG_FILE)]:
             print(f"note: run.dir {path} also holds {listing(left)}, which no run has left; it stays", file=sys.stderr)

@@ -1,7 +1,7 @@
-"""Which files in a folder a run has made: only those are ever replaced or removed.
+"""Which files of a folder belong to a run: only those are ever replaced or removed.
 
-A run leaves a mark in its folder before anything else. In a folder with a mark the files of a run are known by their
-names; folders without one are left alone, but for runs of version 0.1, which are known by what they say.
+A run writes a mark into its folder before anything else. In a folder with a mark, the files of a run are recognised by
+their names. A folder without a mark is not touched, unless its content is that of a run of version 0.1.
 """
 
 import hashlib
@@ -47,11 +47,11 @@ _FORMAT = 1
 
 @dataclass(frozen=True)
 class Mark:
-    """What a run says of itself in its folder.
+    """The content of the mark of a run.
 
-    configs: the SHA-256 of each config.yaml that it has written.
-    events: event files by name, of a run that version 0.1 began.
-    has_checkpoints: whether it has ever written one.
+    configs: the SHA-256 of each config.yaml that the run has written.
+    events: names of the event files, for a run begun by version 0.1.
+    has_checkpoints: whether the run has ever written one.
     """
 
     configs: tuple[str, ...] = ()
@@ -59,7 +59,7 @@ class Mark:
     has_checkpoints: bool = False
 
     def of(self, config: bytes) -> "Mark":
-        """With one more configuration."""
+        """This mark with the hash of one more configuration."""
         return replace(self, configs=tuple(dict.fromkeys((*self.configs, digest(config)))))
 
 
@@ -72,7 +72,7 @@ def write_mark(run: Path, mark: Mark) -> None:
 
 
 def read_mark(run: Path) -> Mark | None:
-    """The mark of a run's folder, or what stands for it in one of version 0.1; None: no run has made it.
+    """The mark of a run folder, or one made for a folder of version 0.1; None: this is no run folder.
 
     Raises:
         PgtsError: the mark is damaged, or of a later version.
@@ -89,12 +89,14 @@ def read_mark(run: Path) -> Mark | None:
 
 
 def _earlier_mark(run: Path) -> Mark | None:
-    """Of a run of version 0.1: a sealed manifest, its metrics or its versions say that it is one."""
+    """The mark of a run of version 0.1, which is recognised by a sealed manifest, its metrics or its versions."""
     proofs = [_is_manifest(path / MANIFEST_FILE) for path in checkpoints(run)]
     if not (any(proofs) or _are_metrics(run / METRICS_FILE) or _are_versions(run / VERSIONS_FILE)):
         return None
     config, has_checkpoints = _content(run / CONFIG_FILE), files.kind(run / CHECKPOINTS) == "folder"
-    own = () if config is None or b"#" in config else (digest(config),)  # a comment is somebody else's
+    own = (
+        () if config is None or b"#" in config else (digest(config),)
+    )  # a run writes no comments: somebody has edited it
     return Mark(own, tuple(name for name in _names(run) if _EVENTS.fullmatch(name)), has_checkpoints)
 
 
@@ -125,13 +127,13 @@ def _object(raw: bytes) -> dict[str, Any]:
 
 
 def check_folder(path: Path) -> Mark:
-    """Make sure that `path` can be the folder of a run, without touching it.
+    """Check that `path` can be a run folder, without writing to it.
 
     Returns:
-        The mark in it; an empty one where there is none.
+        Its mark; an empty one where there is none.
 
     Raises:
-        PgtsError: it is no folder, or holds something that no run has left.
+        PgtsError: it is no folder, or holds files that no run has written.
     """
     found = files.kind(path, follow=True)
     if found is None and files.kind(path) is None:
@@ -154,7 +156,7 @@ def check_folder(path: Path) -> Mark:
 
 
 def listing(names: list[str], most: int = 5) -> str:
-    """A few names in one line."""
+    """The first names in one line, and how many more there are."""
     shown = [ascii(name)[1:-1] for name in names[:most]]
     return ", ".join([*shown, f"{len(names) - most} more"] if len(names) > most else shown)
 
@@ -165,37 +167,37 @@ def _names(folder: Path) -> list[str]:
 
 
 def _is_left_over(path: Path) -> bool:
-    """Whether a file comes from a run that was killed before it had left its mark."""
+    """Whether a file is left from a run that was killed before it wrote its mark."""
     if files.kind(path) != "file":
         return False
     return is_lock(files.read(path)) if path.name == LOCK_FILE else _is_partial(path.name)
 
 
 def is_lock(raw: bytes) -> bool:
-    """Whether this is the content of a lock: the id of a process."""
+    """Whether this is the content of a lock file: a process id, or nothing."""
     return re.fullmatch(rb"(\d+\r?\n)?", raw) is not None
 
 
 def _is_partial(name: str) -> bool:
-    """Whether a name is that of a file of ours that is being written."""
+    """Whether this is the temporary name of a file of a run that is being written."""
     own = re.fullmatch(rf"\.(.+)\.\d+{re.escape(files.PARTIAL)}", name)
     return own is not None and own[1] in (*_OWN_FILES, MODEL_FILE, MANIFEST_FILE)
 
 
 def is_events(name: str, mark: Mark = Mark()) -> bool:
-    """Whether a name is that of an event file of a run, or of the one with this mark."""
+    """Whether this is the name of an event file of a run (of the run with this mark)."""
     return name in mark.events or (name.endswith(EVENTS_SUFFIX) and _EVENTS.fullmatch(name) is not None)
 
 
 def clear(run: Path, mark: Mark) -> list[str]:
-    """Remove what a run has left, all but its lock and its mark; the names of what else lies there, and stays.
+    """Remove the files of a run except its lock and its mark; returns the names of the files that stay.
 
-    The summary goes first and the configuration last: a run that is half cleared is an unfinished one.
+    The summary is removed first and the configuration last, so that a half cleared run is an unfinished one.
     """
     for path in checkpoints(run):
         remove_checkpoint(path)
     remove_partial(run)
-    with suppress(OSError):  # missing, or somebody else's things are in it
+    with suppress(OSError):  # missing, or files of the user are in it
         (run / CHECKPOINTS).rmdir()
     ours = [name for name in _names(run) if name != MARK_FILE and _is_removable(run / name, mark)]
     for name in sorted(ours, key=lambda name: (name == CONFIG_FILE, name != SUMMARY_FILE)):
@@ -221,7 +223,7 @@ def _is_removable(path: Path, mark: Mark) -> bool:
 
 
 def checkpoints(run: Path) -> list[Path]:
-    """The checkpoints of a run folder, oldest first, intact or not: folders with a file of a checkpoint in them."""
+    """The checkpoint folders of a run, oldest first, intact or damaged."""
     if files.kind(run / CHECKPOINTS) != "folder":
         return []
     named = [run / CHECKPOINTS / name for name in _names(run / CHECKPOINTS) if re.fullmatch(r"\d{12,}", name)]
@@ -233,7 +235,7 @@ def _has_model(path: Path) -> bool:
 
 
 def remove_checkpoint(path: Path) -> None:
-    """Remove the files of a checkpoint, and its folder if nothing else is in it. What cannot be removed stays."""
+    """Remove the files of a checkpoint, and its folder if it is then empty. What cannot be removed stays."""
     if files.kind(path) != "folder":
         return
     with suppress(OSError):
@@ -244,7 +246,7 @@ def remove_checkpoint(path: Path) -> None:
 
 
 def remove_partial(run: Path) -> None:
-    """Remove what a process that was killed has left half written: nobody else may be writing."""
+    """Remove half written files of a killed process. The caller must hold the lock."""
     for name in filter(_is_partial, _names(run)):
         if files.kind(run / name) == "file":
             with suppress(OSError):
@@ -256,14 +258,14 @@ def remove_partial(run: Path) -> None:
 
 
 def sealed(content: Mapping[str, Any]) -> bytes:
-    """JSON that holds its own checksum; each content has one such text, so that no bit of it may differ."""
+    """JSON that contains its own SHA-256, in one canonical form, so that any changed bit is noticed."""
     plain = json.dumps(content, sort_keys=True)
     seal = digest(plain.encode())
     return (json.dumps({"content": content, "sha256": seal}, sort_keys=True, indent=1) + "\n").encode()
 
 
 def unsealed(raw: bytes) -> dict[str, Any] | None:
-    """What was sealed; None if this is not exactly what `sealed` made."""
+    """The sealed content; None if this is not exactly what `sealed` returns for it."""
     try:
         content = json.loads(raw)["content"]
         return content if sealed(content) == raw else None

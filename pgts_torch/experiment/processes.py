@@ -1,4 +1,4 @@
-"""Several trainings at once, each in a process of its own; a signal ends them together, and nothing is lost."""
+"""Several trainings at once, each in its own process; a signal stops all of them, each with a checkpoint."""
 
 import os
 import signal
@@ -14,10 +14,10 @@ from pgts_torch.errors import Stopped
 from pgts_torch.experiment.signals import StopFlag
 
 _POLL = 0.05
-"""Seconds from one look at the processes to the next."""
+"""Seconds between two polls of the processes."""
 
 _STOPPED = (128 + signal.SIGTERM, -signal.SIGTERM)
-"""Exit codes of a training that was told to end: it has saved, or had not begun."""
+"""Exit codes of a training that was terminated: it has saved, or had not begun."""
 
 
 def train_all(trainings: Mapping[str, Sequence[str]], *, jobs: int) -> dict[str, str]:
@@ -27,7 +27,7 @@ def train_all(trainings: Mapping[str, Sequence[str]], *, jobs: int) -> dict[str,
         trainings: the arguments, by the name of the training.
 
     Returns:
-        What failed, by name, with the last line that it wrote.
+        The last line on stderr of each training that failed, by name.
 
     Raises:
         Stopped: SIGTERM, SIGINT or SIGHUP came. The trainings have finished their iterations and saved; a second
@@ -40,7 +40,7 @@ def train_all(trainings: Mapping[str, Sequence[str]], *, jobs: int) -> dict[str,
             while running or (waiting and stop.signal is None):
                 while waiting and len(running) < jobs and stop.signal is None:
                     running.append(_Training(*waiting.popleft()))
-                for training in [each for each in running if each.ended(ask=stop.signal is not None)]:
+                for training in [each for each in running if each.ended(terminate=stop.signal is not None)]:
                     running.remove(training)
                     code, seconds, last = training.outcome()
                     if code == 0:
@@ -62,42 +62,42 @@ def train_all(trainings: Mapping[str, Sequence[str]], *, jobs: int) -> dict[str,
 
 @final
 class _Training:
-    """A process that trains. Signals of the terminal do not reach it: it is told to end once, by us."""
+    """A training process in a process group of its own, so that it gets no signals from the terminal, only from us."""
 
     def __init__(self, name: str, arguments: Sequence[str]) -> None:
         self.name = name
-        self._started, self._asked = time.perf_counter(), False
-        self.complaints = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 (outlives this)
+        self._started, self._is_terminated = time.perf_counter(), False
+        self.stderr = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 (outlives this)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "pgts_torch.experiment.cli", "train", *arguments],
             stdout=subprocess.DEVNULL,
-            stderr=self.complaints,
+            stderr=self.stderr,
             env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
             process_group=0,
         )
 
-    def ended(self, *, ask: bool) -> bool:
-        """Whether it has; if not, it may be asked to."""
+    def ended(self, *, terminate: bool) -> bool:
+        """Whether the process has ended; if not and `terminate`, send it SIGTERM once."""
         if self.process.poll() is not None:
             return True
-        if ask and not self._asked:
+        if terminate and not self._is_terminated:
             self.process.terminate()
-            self._asked = True
+            self._is_terminated = True
         return False
 
     def outcome(self) -> tuple[int, float, str]:
-        """The exit code, seconds, and the last line that it wrote to stderr."""
-        self.complaints.seek(0)
-        code, lines = self.process.returncode, self.complaints.read().strip().splitlines()
-        self.complaints.close()
+        """Exit code, seconds, and last line on stderr."""
+        self.stderr.seek(0)
+        code, lines = self.process.returncode, self.stderr.read().strip().splitlines()
+        self.stderr.close()
         last = f"killed by the signal {-code}" if code < 0 else (lines or [f"exit code {code}"])[-1]
         return code, time.perf_counter() - self._started, last.removeprefix("error: ")
 
 
 def _kill(trainings: Sequence[_Training]) -> None:
-    """End these at once; what they have saved stays."""
+    """Kill processes at once; their checkpoints stay."""
     for each in trainings:
         each.process.kill()
     for each in trainings:
         each.process.wait()
-        each.complaints.close()
+        each.stderr.close()

@@ -1,4 +1,4 @@
-"""What a person sees while a training runs."""
+"""Progress on the terminal while a training runs."""
 
 import sys
 from collections.abc import Mapping
@@ -10,11 +10,11 @@ PLAIN_LINES = 20
 
 
 class Reporter:
-    """A progress bar on a terminal, a line now and then elsewhere.
+    """A progress bar on a terminal; elsewhere about `PLAIN_LINES` lines in all.
 
     Args:
         total_steps: of the training.
-        shown: whether anything is shown at all.
+        shown: False: print nothing.
     """
 
     def __init__(self, total_steps: int, *, shown: bool) -> None:
@@ -24,7 +24,7 @@ class Reporter:
         self._next = 0
 
     def line(self, step: int, tags: Mapping[str, float]) -> None:
-        """What a person wants to see while it runs."""
+        """Show return, J and gap of one iteration, those that there are."""
         shown_as = {"charts/episodic_return": "return", "exact/J": "J", "search/stationarity_gap": "gap"}
         numbers = {name: tags[tag] for tag, name in shown_as.items() if tag in tags}
         if self._terminal:

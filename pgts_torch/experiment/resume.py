@@ -27,7 +27,7 @@ from pgts_torch.experiment.ownership import (
     is_events,
     read_mark,
 )
-from pgts_torch.experiment.tracking import Growing, versions
+from pgts_torch.experiment.tracking import GrowingDigest, versions
 
 FREE_SECTIONS = ("run", "log")
 FREE_KEYS = ("name", "eval.every", "eval.episodes", "eval.keep_best")
@@ -191,7 +191,7 @@ def _changed(path: Path, size: int, sha256: str | None) -> str:
         return f"{path} is missing"
     if (now := path.stat().st_size) < size:
         return f"{path} has {now} bytes; it had {size}"
-    if sha256 is not None and Growing(path).now(size) != (size, sha256):
+    if sha256 is not None and GrowingDigest(path).now(size) != (size, sha256):
         return f"{path} was changed"
     return ""
 
@@ -223,7 +223,7 @@ def _lost_best(run: Path, notes: checkpoint.Notes) -> str:
         return str(error)
     except (KeyError, TypeError):
         return f"{path} holds no model"
-    is_noted = told is None or Growing(path).now() == tuple(told)
+    is_noted = told is None or GrowingDigest(path).now() == tuple(told)
     return "" if is_noted or steps > notes.env_steps else f"{path} was changed"
 
 

@@ -1,4 +1,4 @@
-"""The loop around the algorithm: build it from a configuration, iterate, write down what happened."""
+"""Train from a configuration: build the algorithm, iterate, log, save, summarise."""
 
 import copy
 import json
@@ -23,7 +23,7 @@ from pgts_torch.agent.ranks import joined_ranks
 from pgts_torch.agent.states import check_keys, take_over
 from pgts_torch.errors import Failed, ModelMismatch, NotFinite, PgtsError, Stopped, check_count, failure
 from pgts_torch.experiment import checkpoint, diagnostics
-from pgts_torch.experiment.advice import Movement, greedy_is_worse, restless, span_of, stuck
+from pgts_torch.experiment.advice import Movement, greedy_is_worse, hardly_moved, not_converged, span_of
 from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import KINDS
@@ -40,7 +40,7 @@ from pgts_torch.experiment.tracking import Folder, NoFolder, event_writer, versi
 from pgts_torch.tabular import exact, stationary
 
 MOST_SECONDS = 60
-"""An iteration that ends later than this after the last checkpoint is followed by one, too."""
+"""The most seconds between two checkpoints, up to one iteration."""
 
 
 def build(config: Config) -> PGTS:
@@ -132,7 +132,7 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
 
 
 def _out_of_reach(config: Config, algorithm: PGTS) -> str:
-    """Why no certificate can come down to search.stop_at; empty where one can."""
+    """Why search.stop_at cannot be reached by any certificate; empty where it can."""
     target, certificates, episodes = config.search.stop_at, algorithm.certificates, config.rollout.num_envs
     if target is None or certificates is None or certificates.trust != "drawn starts":
         return ""
@@ -174,9 +174,9 @@ def _loop(
 
 
 class _Recorder:
-    """Called after each iteration: writes down what it was like.
+    """The callback of a run: logs, evaluates and saves after each iteration.
 
-    The tags of an iteration speak of the policy that made its episodes, which is the one before its update.
+    The logged metrics describe the policy that collected the episodes, which is the one before the update.
     """
 
     def __init__(self, config: Config, algorithm: PGTS, folder: Folder, stop: StopFlag, movement: Movement) -> None:
@@ -196,11 +196,11 @@ class _Recorder:
 
     @property
     def finished(self) -> bool:
-        """Whether the training has come to its end."""
+        """Whether the training is complete, not only interrupted."""
         return self.ended_by is not None
 
     def __call__(self, algorithm: PGTS, iteration: Iteration) -> bool:
-        """Whether training may go on."""
+        """Log, evaluate and save; False ends the training."""
         seconds = time.perf_counter() - self._clock
         k, step = algorithm.num_iterations, algorithm.num_env_steps
         self._deepest, self._certificate = max(self._deepest, iteration.depth), iteration.certificate
@@ -224,19 +224,19 @@ class _Recorder:
         elif step >= self.config.total_steps:
             self.ended_by = "total_steps"
         every = self.config.log.checkpoint_every
-        is_due = every and (k % every == 0 or algorithm.ranks.first("the time", self._is_long_ago))
+        is_due = every and (k % every == 0 or algorithm.ranks.first("the time", self._is_checkpoint_due))
         if is_due and not self.finished:  # the last one waits until the training has ended
             self.save()
         self._pi_SA = self._table()
         self._clock = time.perf_counter()
         return not self.finished and self.stop.signal is None
 
-    def _is_long_ago(self) -> bool:
-        """The last checkpoint."""
+    def _is_checkpoint_due(self) -> bool:
+        """Whether the last checkpoint is more than `MOST_SECONDS` old."""
         return time.perf_counter() - self._saved_clock > MOST_SECONDS
 
     def save(self) -> None:
-        """A checkpoint, unless the last one was taken just now."""
+        """Write a checkpoint, unless there is one of this step."""
         if self._saved_at == self.algorithm.num_env_steps:
             return
         if self._last is not None:
@@ -264,7 +264,7 @@ class _Recorder:
         self._saved_at, self._saved_clock = self.algorithm.num_env_steps, time.perf_counter()
 
     def load(self, start: Start) -> None:
-        """Go on from what `save` wrote; the algorithm has been loaded. PgtsError if this is something else."""
+        """Resume from what `save` wrote; the algorithm itself is loaded already. PgtsError if it is something else."""
         notes, progress = start.notes, start.notes.progress
         check_keys("progress", progress, {"ended_by", "depth", "certificate", "seconds", "evaluations", "movement"})
         plain = {name: value for name, value in progress.items() if name != "movement"}
@@ -291,7 +291,7 @@ class _Recorder:
                 take_over(f"evaluations.{kind}", state, evaluation.load_state_dict, evaluation.state_dict)
 
     def _scores(self, kind: str, step: int) -> Iterator[tuple[str, float]]:
-        """The tags of the evaluation that was made just now, if one was."""
+        """The tags of the evaluation made at this step, if there was one."""
         history = self._evaluations[kind].history
         if not history or history[-1].env_steps != step:
             return
@@ -303,7 +303,7 @@ class _Recorder:
                 yield f"eval/{kind}_{short}_half_width", score.half_width
 
     def _certified(self) -> dict[str, Any]:
-        """What the summary says of the certificate: a proof is made for the policy as it is after its last update."""
+        """The certificate's fields of the summary. A proof is made again for the policy after its last update."""
         certificates, bound = self.algorithm.certificates, self._certificate
         trust = None if certificates is None else certificates.trust
         if certificates is not None and trust == "proved":
@@ -317,11 +317,11 @@ class _Recorder:
         }
 
     def _table(self) -> Tensor | None:
-        """The policy in all states, where they can be listed."""
+        """The policy in all states, where there is an exact MDP."""
         return None if self.truth is None else self.algorithm.policy_table()
 
     def finish(self) -> Summary:
-        """The picture and the summary of the trained policy."""
+        """Draw the policy and summarise the run."""
         seconds = time.perf_counter() - self._started
         config, algorithm, exactly = self.config, self.algorithm, dict[str, float | None]()
         assert self.ended_by is not None
@@ -359,21 +359,21 @@ class _Recorder:
         )
 
     def _advice(self, exactly: Mapping[str, float | None]) -> list[str]:
-        """That the policy hardly moved, if it did not and should have, or that it has not come to rest."""
+        """Advice that the policy hardly moved or has not come to rest, where that is so."""
         missing = stationary_gap = None
         if self.truth is not None:
             span = float(span_of(self.truth.optimum.q_SA.reshape(1, -1)))
             J, best, gap = (exactly[name] or 0.0 for name in ("J", "J_optimal", "stationarity_gap"))
             missing, stationary_gap = ((best - J) / span, gap / span) if span > 0 else (0.0, 0.0)
         movement, update = self.movement, self.algorithm.update
-        told = stuck(
+        advice = hardly_moved(
             movement, update, depth=self._deepest, missing_share=missing, stationary_share=stationary_gap
-        ) or restless(movement, update, missing_share=missing)
-        return [] if told is None else [told]
+        ) or not_converged(movement, update, missing_share=missing)
+        return [] if advice is None else [advice]
 
 
 def _evaluations(config: EvalConfig, seed: int, folder: Folder) -> dict[str, EvalCallback]:
-    """The evaluations during training, by how actions are taken; the deterministic ones say what is best and enough."""
+    """The evaluations during training; the deterministic one picks the best model and may end the training."""
     if config.every is None:
         return {}
     shared: dict[str, Any] = {"every": config.every, "episodes": config.episodes, "seed": seed}

@@ -13,19 +13,19 @@ _HANG_UP = getattr(signal, "SIGHUP", None)
 
 @final
 class StopFlag:
-    """Remembers the first signal; a second one ends the process at once, with exit code 128 + signal.
+    """Records the first signal; a second one ends the process at once, with exit code 128 + signal.
 
-    Heard are SIGTERM, SIGINT and, unless it is ignored (as under nohup), SIGHUP. A second SIGHUP changes nothing: a
-    terminal that closes may send two.
+    Handles SIGTERM, SIGINT and, unless it is ignored (as under nohup), SIGHUP. A second SIGHUP is ignored: a closing
+    terminal may send two.
 
-    Use it as a context: leaving it restores what the signals did before. Outside the main thread, where Python hears
-    no signals, it remembers nothing.
+    Use it as a context: leaving it restores the previous handlers. Outside the main thread, where Python receives no
+    signals, it records nothing.
 
     Args:
-        at_once: called before a second one ends the process.
+        at_once: called before a second signal ends the process.
 
     Attributes:
-        signal: the number of the first one; None: there was none.
+        signal: the number of the first signal; None: there was none.
     """
 
     def __init__(self, *, at_once: Callable[[], object] = lambda: None) -> None:
@@ -38,7 +38,7 @@ class StopFlag:
             heard = [signal.SIGTERM, signal.SIGINT]
             if _HANG_UP is not None and signal.getsignal(_HANG_UP) is not signal.SIG_IGN:
                 heard.append(_HANG_UP)
-            self._before = {each: signal.signal(each, self._hear) for each in heard}
+            self._before = {each: signal.signal(each, self._on_signal) for each in heard}
         return self
 
     def __exit__(
@@ -47,7 +47,7 @@ class StopFlag:
         for each, handler in self._before.items():
             signal.signal(each, handler)
 
-    def _hear(self, number: int, frame: FrameType | None) -> None:
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.signal is None:
             self.signal = number
         elif number != _HANG_UP:

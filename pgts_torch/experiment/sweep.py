@@ -1,4 +1,4 @@
-"""One configuration at several depths and with several seeds: `pgts sweep`."""
+"""Train one configuration at several depths and with several seeds: `pgts sweep`."""
 
 import io
 import json
@@ -29,7 +29,7 @@ SET_BY_SWEEP = {
     "run.overwrite": "finished runs are kept, others go on",
     "threads": "every run has one, --jobs says how many run at once",
 }
-"""Keys that a sweep sets itself, and what is to be said instead."""
+"""Keys that a sweep sets itself, and which option to use instead."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class Row:
-    """What a depth came to.
+    """The results at one depth.
 
     score: of the trained policies, J where it is known exactly, else the mean return of sampled episodes.
     greedy: the mean return of greedy episodes.
@@ -79,7 +79,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a sweep came to: a row for each depth with a finished run, what `score` is, and what failed and why."""
+    """The results of a sweep: a row for each depth with a finished run, what `score` means, and the failed runs."""
 
     rows: tuple[Row, ...]
     score_is: str
@@ -121,9 +121,9 @@ def plan(
 
 
 def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
-    """Run those that are not finished, each in a process of its own, and write table.json and curves.png.
+    """Run the unfinished trainings, each in its own process, and write table.json and curves.png.
 
-    A run that was cut off goes on from its last checkpoint.
+    An interrupted training resumes from its last checkpoint.
 
     Raises:
         PgtsError: what a configuration describes cannot be built; nothing was started.

@@ -1,4 +1,4 @@
-"""What a process says, wherever that goes: a full disk or a closed terminal ends no training."""
+"""Output that cannot stop a training: a full disk or a closed terminal is survived."""
 
 import contextlib
 import os
@@ -10,44 +10,44 @@ from typing import Any, TextIO, cast
 from pgts_torch.errors import PgtsError
 
 
-class Telling:
-    """A stream of text that escapes what its encoding lacks, and falls silent once it cannot be written to.
+class SafeStream:
+    """A text stream that escapes characters outside its encoding and discards everything after a failed write.
 
     Args:
-        stream: takes what is written.
-        must: what is written is what was asked for, so that it is an error if it is lost. A reader that leaves early
-            is BrokenPipeError.
+        stream: where the text goes.
+        required: the text is the answer of the command, so losing it is an error: PgtsError, or BrokenPipeError where
+            the reader has closed the pipe.
     """
 
-    def __init__(self, stream: TextIO, *, must: bool) -> None:
-        self._stream, self._must = stream, must
+    def __init__(self, stream: TextIO, *, required: bool) -> None:
+        self._stream, self._required = stream, required
 
     def write(self, text: str) -> int:
-        """As that of a stream. PgtsError or BrokenPipeError where text that must be written cannot be."""
+        """Write text. PgtsError or BrokenPipeError where required text cannot be written."""
         encoding = self._stream.encoding or "utf-8"
-        with self._heard():
+        with self._failures():
             self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
 
     def flush(self) -> None:
-        """As `write`."""
-        with self._heard():
+        """Flush the buffer; errors as in `write`."""
+        with self._failures():
             self._stream.flush()
 
     @contextlib.contextmanager
-    def _heard(self) -> Iterator[None]:
+    def _failures(self) -> Iterator[None]:
         try:
             yield
-        except (OSError, ValueError) as error:  # ValueError: it was closed
-            self._silence()
-            if isinstance(error, BrokenPipeError) and self._must:
+        except (OSError, ValueError) as error:  # ValueError: the stream is closed
+            self._discard()
+            if isinstance(error, BrokenPipeError) and self._required:
                 raise
-            if self._must:
+            if self._required:
                 reason = getattr(error, "strerror", None) or error
                 raise PgtsError(f"the answer cannot be written to stdout: {reason}") from error
 
-    def _silence(self) -> None:
-        """What is still in the buffer, and all that follows, goes nowhere."""
+    def _discard(self) -> None:
+        """Send what is still in the buffer, and everything after it, to the null device."""
         with contextlib.suppress(OSError, ValueError):
             handle = os.open(os.devnull, os.O_WRONLY)
             os.dup2(handle, self._stream.fileno())
@@ -59,7 +59,7 @@ class Telling:
 
 @contextlib.contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Warnings to the user are one line, without the place in the code that they come from."""
+    """Print warnings to the user as one line, without the line of code that raised them."""
     original = warnings.formatwarning
 
     def formatted(message: Warning | str, category: type[Warning], *place: Any) -> str:
@@ -73,12 +73,12 @@ def plain_warnings() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def telling() -> Iterator[None]:
-    """Has stdout and stderr of this process as streams that end no training, while the context lasts."""
+def safe_output() -> Iterator[None]:
+    """Replace stdout and stderr by `SafeStream`s while the context lasts."""
     _open_standard_files()
     before = sys.stdout, sys.stderr
     out, err = (stream or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w") for stream in before)
-    sys.stdout, sys.stderr = cast(TextIO, Telling(out, must=True)), cast(TextIO, Telling(err, must=False))
+    sys.stdout, sys.stderr = cast(TextIO, SafeStream(out, required=True)), cast(TextIO, SafeStream(err, required=False))
     try:
         yield
     finally:
@@ -86,19 +86,19 @@ def telling() -> Iterator[None]:
 
 
 def _open_standard_files() -> None:
-    """Take the numbers of stdin, stdout and stderr where they are closed, lest a file of ours get one of them."""
+    """Open closed file descriptors 0, 1 and 2 on the null device, so that no file of ours gets one of these numbers."""
     while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(handle)
 
 
-def tell(text: str, *, kept: str) -> None:
-    """Print what also stands in a file: that stdout cannot be written to is only said then.
+def print_kept(text: str, *, kept: str) -> None:
+    """Print text that is also in the file `kept`: a failed write is only a warning.
 
     Raises:
-        BrokenPipeError: the reader has left.
+        BrokenPipeError: the reader has closed the pipe.
     """
     try:
         print(text, flush=True)
     except PgtsError as error:
-        print(f"warning: {error}; it stands in {kept}", file=sys.stderr)
+        print(f"warning: {error}; it is in {kept}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What a run writes while it trains: metrics, TensorBoard events, texts and pictures."""
+"""Write the files of a run while it trains: metrics, TensorBoard events, texts and pictures."""
 
 import hashlib
 import json
@@ -28,62 +28,62 @@ _PACKAGES = ("pgts_torch", "torch", "numpy", "scipy", "gymnasium", "tensorboard"
 
 
 class Folder(ABC):
-    """Where a run leaves what it has to say."""
+    """Where a run writes its files."""
 
     path: Path
 
     @abstractmethod
     def log(self, step: int, tags: dict[str, float]) -> None:
-        """Numbers of one step."""
+        """Write the metrics of one step."""
 
     @abstractmethod
     def flush(self) -> dict[str, tuple[int, str]]:
-        """Have all that was logged on the disk; length and SHA-256 of the metrics, the events and the best model."""
+        """Flush everything to the disk; the length and SHA-256 of the metrics, event files and best model, by name."""
 
     @abstractmethod
     def text(self, name: str, content: str) -> None:
-        """A text file, which is whole or not there."""
+        """Write a text file atomically."""
 
     @abstractmethod
     def picture(self, name: str, figure: Figure, step: int) -> None:
-        """A picture."""
+        """Write a figure as `name`.png."""
 
 
 @final
 class NoFolder(Folder):
-    """Of a process that leaves nothing, because another one writes for it."""
+    """The folder of a process that writes nothing, because rank 0 writes."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def log(self, step: int, tags: dict[str, float]) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def flush(self) -> dict[str, tuple[int, str]]:
-        """Nothing."""
+        """Do nothing."""
         return {}
 
     def text(self, name: str, content: str) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def picture(self, name: str, figure: Figure, step: int) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 @final
 class RunFolder(Folder):
-    """Writes what a run leaves. Use it as a context: leaving it closes the files.
+    """Writes the files of a run. Use it as a context: leaving it closes the files.
 
     Args:
         path: the folder; made here, with all parents.
         tensorboard: write events beside metrics.jsonl.
-        lock: of the folder; it is looked at before each file, so that nothing gets into a folder that took its place.
-        metrics_bytes: what is kept of metrics.jsonl; the rest is cut off.
+        lock: of the folder; checked before each write, so that nothing is written into a folder that replaced it.
+        metrics_bytes: metrics.jsonl is truncated to this length.
         after_step: the last step whose events are kept; TensorBoard hides later ones of a process that was killed.
-        rebuild: make the events anew from the metrics that are kept.
+        rebuild: write the events again, from the kept part of metrics.jsonl.
 
     Raises:
-        PgtsError: from all that writes, if the disk is full.
+        PgtsError: from every method that writes, if the disk is full.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class RunFolder(Folder):
         (path / FAILURE_FILE).unlink(missing_ok=True)
         self._metrics = (path / METRICS_FILE).open("ab", buffering=0)
         self._metrics.truncate(metrics_bytes)
-        self._growing = {METRICS_FILE: Growing(path / METRICS_FILE)}
+        self._growing = {METRICS_FILE: GrowingDigest(path / METRICS_FILE)}
         purge_step = None if after_step is None else after_step + 1
         self._thread_hook = threading.excepthook
         with self._writing("events"):
@@ -114,7 +114,7 @@ class RunFolder(Folder):
                 self._add_scalars(line.pop("step"), line)
 
     def __enter__(self) -> Self:
-        threading.excepthook = self._hear
+        threading.excepthook = self._on_thread_error
         return self
 
     def __exit__(
@@ -131,14 +131,14 @@ class RunFolder(Folder):
         finally:
             threading.excepthook = self._thread_hook
 
-    def _hear(self, failed: threading.ExceptHookArgs) -> None:
-        """The thread that writes events cannot: it raises that again in ours, where it is said in one line."""
+    def _on_thread_error(self, failed: threading.ExceptHookArgs) -> None:
+        """Ignore an OSError of TensorBoard's writer thread: it is raised again in ours, as one line."""
         if not isinstance(failed.exc_value, OSError):
             self._thread_hook(failed)
 
     @contextmanager
     def _writing(self, what: str) -> Iterator[None]:
-        """PgtsError where something cannot be written, or must not."""
+        """Turn an OSError into a PgtsError that names the file; check the lock first."""
         if self._lock is not None:
             self._lock.check()
         try:
@@ -147,14 +147,14 @@ class RunFolder(Folder):
             raise PgtsError(f"{self.path / what} cannot be written to: {error.strerror}") from error
 
     def log(self, step: int, tags: dict[str, float]) -> None:
-        """One line of metrics.jsonl, and the same numbers as TensorBoard scalars."""
+        """Write one line of metrics.jsonl, and the same numbers as TensorBoard scalars."""
         line = {"step": step} | {tag: value if math.isfinite(value) else None for tag, value in tags.items()}
         raw = json.dumps(line).encode() + b"\n"
         try:
-            whole = self._metrics.write(raw) == len(raw)
+            is_written = self._metrics.write(raw) == len(raw)
         except OSError:
-            whole = False
-        if not whole:
+            is_written = False
+        if not is_written:
             raise PgtsError(f"{self.path / METRICS_FILE} cannot be written to at step {step}; is the disk full?")
         if self._events is not None:
             self._add_scalars(step, tags)
@@ -173,18 +173,18 @@ class RunFolder(Folder):
                 self._events.flush()
         names = [path.name for path in self.path.iterdir() if self._events is not None and is_events(path.name)]
         with self._writing("its files"):
-            told = {name: self._growing.setdefault(name, Growing(self.path / name)).now() for name in names}
-            told[METRICS_FILE] = self._growing[METRICS_FILE].now()
+            states = {name: self._growing.setdefault(name, GrowingDigest(self.path / name)).now() for name in names}
+            states[METRICS_FILE] = self._growing[METRICS_FILE].now()
             if files.kind(self.path / BEST_FILE) is not None:
-                told[BEST_FILE] = Growing(self.path / BEST_FILE).now()
-        return told
+                states[BEST_FILE] = GrowingDigest(self.path / BEST_FILE).now()
+        return states
 
     def text(self, name: str, content: str) -> None:
         with self._writing(name):
             files.replace(self.path / name, content.encode())
 
     def picture(self, name: str, figure: Figure, step: int) -> None:
-        """`name`.png, and the same picture in TensorBoard."""
+        """Write `name`.png, and the same picture to TensorBoard."""
         with self._writing(f"{name}.png"):
             figure.savefig(self.path / f"{name}.png", dpi=120)
         if self._events is not None:
@@ -193,14 +193,14 @@ class RunFolder(Folder):
 
 
 @final
-class Growing:
-    """Length and SHA-256 of a file that only ever grows; what was read before is not read again."""
+class GrowingDigest:
+    """Length and SHA-256 of a file that is only appended to; each byte is read once."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._hash, self._bytes = path, hashlib.sha256(), 0
 
     def now(self, most: int | None = None) -> tuple[int, str]:
-        """Of the whole file, or of its first `most` bytes."""
+        """Length and SHA-256 of the whole file, or of its first `most` bytes."""
         with self._path.open("rb") as file:
             file.seek(self._bytes)
             while chunk := file.read(2**20 if most is None else min(2**20, most - self._bytes)):
@@ -210,7 +210,7 @@ class Growing:
 
 
 def event_writer() -> "type[SummaryWriter]":
-    """What writes TensorBoard events; PgtsError where TensorBoard is missing."""
+    """TensorBoard's SummaryWriter; PgtsError where TensorBoard is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -221,7 +221,7 @@ def event_writer() -> "type[SummaryWriter]":
 
 
 def versions() -> dict[str, Any]:
-    """Python and the packages that numbers depend on; None: it is not installed."""
+    """Versions of Python and of the packages that results depend on; None: not installed."""
     return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.cli import main
-from pgts_torch.experiment.terminal import Telling
+from pgts_torch.experiment.terminal import SafeStream
 from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.tabular import TabularMDP
 from tests.experiment.test_surroundings import started
@@ -37,7 +37,7 @@ def test_output_that_cannot_be_written_ends_no_training(redirections, codes, tmp
     assert len(read_metrics(tmp_path / "run")) == 3
     assert "Traceback" not in done.stderr
     if redirections == ">/dev/full":
-        mistake = "warning: the answer cannot be written to stdout: No space left on device; it stands in summary.json"
+        mistake = "warning: the answer cannot be written to stdout: No space left on device; it is in summary.json"
         assert mistake in done.stderr
 
 
@@ -50,14 +50,14 @@ def test_an_answer_that_cannot_be_written_is_an_error_of_other_commands(tmp_path
 
 def test_a_stream_escapes_what_its_encoding_lacks_and_falls_silent_once_it_fails(tmp_path):
     with (tmp_path / "told").open("w", encoding="ascii") as file:
-        print("run.dir ä日\udcc3", file=Telling(file, must=True))
+        print("run.dir ä日\udcc3", file=SafeStream(file, required=True))
     assert (tmp_path / "told").read_text() == "run.dir \\xe4\\u65e5\\udcc3\n"
     with Path("/dev/full").open("w") as full:
-        told = Telling(full, must=False)
+        told = SafeStream(full, required=False)
         print("x", file=told, flush=True)
         print("x", file=told, flush=True)
     with Path("/dev/full").open("w") as full, pytest.raises(PgtsError, match="cannot be written to stdout: No space"):
-        print("x", file=Telling(full, must=True), flush=True)
+        print("x", file=SafeStream(full, required=True), flush=True)
 
 
 @pytest.mark.fault("pipe in place of a file")
