@@ -48,7 +48,7 @@ FAULTS: dict[str, dict[str, str]] = {
         "autoreset in the next step": "refused with the mode that works",
         "environment raises an error": "environment, step and seed are named, `failure.json`, exit code 2",
         "a table of transitions that is not that of step and reset": UNUSED,
-        "copies of an environment that differ, or differ from the instance that was given": "the attribute is named",
+        "environments that differ, or differ from the instance that was given": "the attribute is named",
         "a subclass with a state of its own beside the snapshots of its family": "attribute and remedy are named",
         "get_state or set_state that does not hold what step reads or changes": "refused in the words of `check-model`",
         "a wrapper that has a step of its own, a memory, or draws": "refused by its name; stateless ones are applied",

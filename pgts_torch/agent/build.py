@@ -8,10 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
-from gymnasium.vector import VectorEnv
 
 from pgts_torch.agent.advantages import Estimator, LookaheadAdvantages, SampledAdvantages
-from pgts_torch.agent.copies import env_name
 from pgts_torch.agent.critics import Critic, ExactCritic, MonteCarlo, RolloutCritic, TabularCritic, TDLambda
 from pgts_torch.agent.networks import CNN, MLP
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
@@ -22,6 +20,7 @@ from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate, Tar
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate, Update
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models.snapshots import env_name
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
 from pgts_torch.tabular.exact import check_depth
@@ -190,13 +189,8 @@ def check_parts(
         shape, found = _tabular(world, "the policy").mdp_shape, (policy.num_states, policy.num_actions)
         if found != shape:
             raise PgtsError(f"the policy is one of (states, actions) = {found}; the environment has {shape}")
-    if not isinstance(arguments["env"], str):
-        if arguments["gamma"] not in (None, world.gamma):
-            raise PgtsError(f"gamma is {arguments['gamma']}; the given environment has its own, {world.gamma}")
-        if given := arguments["env_kwargs"]:
-            raise PgtsError(f"env_kwargs is {given}; an environment that is given as an object takes none")
-    if isinstance(arguments["env"], VectorEnv) and (count := arguments["actions_per_dimension"]) is not None:
-        raise PgtsError(f"actions_per_dimension is {count}; a VectorEnv takes its own actions, make them discrete")
+    if arguments["gamma"] not in (None, world.gamma):
+        raise PgtsError(f"gamma is {arguments['gamma']}; the environment has its own, {world.gamma}")
     if not isinstance(estimator, SampledAdvantages):
         return
     for name, default in (("depth", 0), ("search", "auto"), ("stop_at", None)):
@@ -220,13 +214,11 @@ def check_parts(
 
 
 def described(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of `PGTS` as plain values, without an environment that was given as an object; PgtsError where a
-    part was given as one."""
+    """The arguments of `PGTS` as plain values; PgtsError where a part was given as an object."""
     for name in ("search", "estimator", "policy", "critic", "update", "horizon"):
         if not isinstance(arguments[name], str | Mapping | None):
             raise PgtsError(f"{name} was given as {arguments[name]!r}; only models made from descriptions can be saved")
-    env = arguments["env"] if isinstance(arguments["env"], str) else None
-    return {**arguments, "env": env, "env_kwargs": dict(arguments["env_kwargs"] or {})}
+    return {**arguments, "env_kwargs": dict(arguments["env_kwargs"] or {})}
 
 
 def _tabular(world: World, what: str) -> TabularWorld:

@@ -7,8 +7,15 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.environments import check_step
-from pgts_torch.models.steps import check_discounts, check_rewards, discount_of, names_discounts, number_of, rewards_of
+from pgts_torch.models.steps import (
+    check_discounts,
+    check_rewards,
+    check_step,
+    discount_of,
+    names_discounts,
+    number_of,
+    rewards_of,
+)
 
 
 @final

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgts_torch.agent.copies import close_copies
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import FixedHorizon, rollout
 from pgts_torch.errors import check_count
+from pgts_torch.models.environments import close_environments
 from pgts_torch.seeding import SharedGenerators, stream
 
 UNLIMITED_LENGTH = 1000
@@ -56,8 +56,8 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
         seed: of these episodes alone; training is not touched.
 
     Raises:
-        PgtsError: episodes is below 1; `PGTS.make_copies` cannot make copies; or the environment failed, naming step
-            and seeds.
+        PgtsError: episodes is below 1; no others of its environments can be made (`EnvSource.make`); or the environment
+            failed, naming step and seeds.
 
     Warns:
         UserWarning: an environment raised an error in `close`.
@@ -65,16 +65,16 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
     check_count("episodes", episodes)
     names = ("evaluate", "deterministic" if deterministic else "sampled")
     with SharedGenerators(seed, *names, "construction"):
-        env = algorithm.make_copies(episodes)
+        env, limit = algorithm.source.make(episodes), algorithm.source.time_limit
     made = rollout(
         algorithm.world.of(env),
         Greedy(algorithm.policy) if deterministic else algorithm.policy,
-        FixedHorizon(algorithm.time_limit or UNLIMITED_LENGTH),
+        FixedHorizon(limit or UNLIMITED_LENGTH),
         seed=seed,
         names=names,
         generator=stream(seed, *names, device=algorithm.device),
     )
-    close_copies(env)
+    close_environments(env)
     return Evaluation(
         episodes,
         Score.of((made.reward_TB * made.alive_TB).sum(0)),

@@ -13,25 +13,26 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv, VectorEnv
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
-from pgts_torch.agent.copies import check_vector_env, env_name, make_vector_env, normalizing_wrapper
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models.actions import base_actions
 from pgts_torch.models.adapters import adapter_for
-from pgts_torch.models.attributes import attributes, changing, different, own_to_each, told
+from pgts_torch.models.attributes import attributes, different, own_to_each, unlike
 from pgts_torch.models.classic import CLASSIC
-from pgts_torch.models.environments import EnvSource, base_actions
+from pgts_torch.models.environments import EnvSource, kinds_of
 from pgts_torch.models.fidelity import why_not
 from pgts_torch.models.published import publishes_table, table_of
 from pgts_torch.models.simulator import SimulatorModel
+from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.trial import dynamics_contradiction
 from pgts_torch.models.walks import Setup
 from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_of, wrappers_of
@@ -45,16 +46,14 @@ DEFAULT_GAMMA = 0.99
 
 
 def make_world(
-    env: EnvSource | VectorEnv,
+    source: EnvSource,
     *,
     num_envs: int,
     gamma: float | None,
     observation_key: str | None,
     plain: bool,
-    actions_per_dimension: int | None = None,
     action_repeat: int = 1,
     device: torch.device | str,
-    **kwargs: Any,
 ) -> World:
     """The world of an environment: what can be asked about it decides.
 
@@ -62,10 +61,9 @@ def make_world(
     simulated. It has no model where none is needed and there is no table.
 
     Args:
-        env: what `num_envs` copies are made from (`make_vector_env`, with `kwargs`), or copies.
+        source: what `num_envs` environments are made from, unless it was given some.
         gamma: discount; None: the environment's own (pgts/*), else 0.99.
         observation_key: which part of dictionary observations a policy sees.
-        actions_per_dimension: into how many values each dimension of continuous actions is divided.
         plain: whether a world without a model will do: then snapshots are not taken.
         action_repeat: how often an action is taken in one outcome of the model (`TensorModel`).
 
@@ -74,34 +72,31 @@ def make_world(
             in a table, or where there is no model.
         MissingModel: it has no model, and needs one; the message says why each is not used.
     """
-    if isinstance(env, VectorEnv):
-        copies = env
-    else:
-        copies = make_vector_env(env, num_envs, gamma=gamma, actions_per_dimension=actions_per_dimension, **kwargs)
-    check_vector_env(copies)
+    env = source.make(num_envs) if source.given is None else source.given
     discount = DEFAULT_GAMMA if gamma is None else gamma
     check_gamma(discount)
-    sought = _Sought(copies, discount, observation_key, action_repeat, torch.device(device))
+    sought = _Sought(source, env, discount, observation_key, action_repeat, torch.device(device))
     with SharedGenerators(0, "models"):
         world, reasons = _first_model(sought, (_table,) if plain else (_table, _dynamics, _simulator))
     if world is not None:
         return world
     if not plain:
         raise MissingModel("; ".join(reversed(reasons)) + _NO_MODEL_NEEDED)
-    if name := normalizing_wrapper(copies):
+    if name := _normalizing_wrapper(env):
         raise PgtsError(
-            f"{env_name(copies)} is wrapped in {name}, whose running statistics no evaluation shares and no file "
+            f"{env_name(env)} is wrapped in {name}, whose running statistics no evaluation shares and no file "
             "keeps: leave it out, and set normalize of the network or normalize_returns of the critic"
         )
     _check_single(action_repeat, "without a model")
-    return World(copies, gamma=discount, observation_key=observation_key, device=device)
+    return World(env, gamma=discount, observation_key=observation_key, device=device)
 
 
 @dataclass(frozen=True)
 class _Sought:
     """What a model is sought for."""
 
-    copies: VectorEnv
+    source: EnvSource
+    env: VectorEnv
     gamma: float
     observation_key: str | None
     action_repeat: int
@@ -109,7 +104,7 @@ class _Sought:
 
     @cached_property
     def name(self) -> str:
-        return env_name(self.copies)
+        return env_name(self.env)
 
     @cached_property
     def random(self) -> np.random.Generator:
@@ -118,17 +113,17 @@ class _Sought:
 
     @property
     def envs(self) -> SyncVectorEnv:
-        """The copies, each an environment of its own."""
-        assert isinstance(self.copies, SyncVectorEnv)
-        return self.copies
+        """The environments, each of which can be looked into."""
+        assert isinstance(self.env, SyncVectorEnv)
+        return self.env
 
     def fresh(self, k: int = 0) -> gymnasium.Env:
-        """A new instance, made as copy k was; no state of a copy is touched."""
-        return self.envs.env_fns[k % len(self.envs.env_fns)]()
+        """A new instance, as environment k is; no state of those that are trained in is touched."""
+        return self.source.like(k)
 
     @cached_property
     def actions(self) -> list[int]:
-        return list(range(int(self.copies.single_action_space.n)))  # type: ignore[attr-defined]  # checked before
+        return list(range(int(self.env.single_action_space.n)))  # type: ignore[attr-defined]  # checked before
 
     @cached_property
     def new(self) -> gymnasium.Env:
@@ -137,13 +132,13 @@ class _Sought:
 
     @cached_property
     def others(self) -> list[set[str]]:
-        """The attributes in which each copy differs from a new instance, in whatever state it is."""
+        """The attributes in which each environment differs from a new instance, in whatever state it is."""
         held = attributes(self.new)
-        return [different(held, attributes(copy)) for copy in self.envs.envs]
+        return [different(held, attributes(env)) for env in self.envs.envs]
 
     @cached_property
     def own_to_each(self) -> frozenset[str]:
-        """The attributes in which new instances differ; more of them are made only where the copies do."""
+        """The attributes in which new instances differ; more of them are made only where the environments do."""
         return frozenset(own_to_each(self.fresh)) if any(self.others) else frozenset()
 
 
@@ -151,12 +146,12 @@ def _first_model(
     sought: _Sought, candidates: tuple[Callable[[_Sought], ModelWorld | None], ...]
 ) -> tuple[ModelWorld | None, list[str]]:
     """The world of the first model that is not refused, and why those before it were."""
-    copies, reasons = sought.copies, list[str]()
-    if type(copies) is TabularVectorEnv:
+    env, reasons = sought.env, list[str]()
+    if type(env) is TabularVectorEnv:
         _check_single(sought.action_repeat, "in a table")
-        return TabularWorld(copies, copies.mdp, device=sought.device), []
-    if type(copies) is not SyncVectorEnv:
-        return None, [f"{sought.name} steps its copies together; a simulator needs a SyncVectorEnv of them"]
+        return TabularWorld(env, env.mdp, device=sought.device), []
+    if type(env) is not SyncVectorEnv:
+        return None, [f"{sought.name} is a VectorEnv that nothing looks into; a simulator needs a SyncVectorEnv"]
     try:
         _check_wrappers(sought)
         _check_alike(sought)
@@ -180,29 +175,20 @@ def _check_wrappers(sought: _Sought) -> None:
 
 
 def _check_alike(sought: _Sought) -> None:
-    """MissingModel if a copy is not what making another one gives, in whatever state it is: a model is made of that."""
-    if any(_kinds(copy) != _kinds(sought.new) for copy in sought.envs.envs):
-        raise MissingModel(f"the copies of {sought.name} are of different classes, and a model is of one of them")
+    """MissingModel if an environment, in whatever state it is, is not what making another one gives: a model is made of
+    that."""
+    if any(kinds_of(env) != kinds_of(sought.new) for env in sought.envs.envs):
+        raise MissingModel(f"the environments of {sought.name} are of different classes, and a model is of one of them")
     if not any(sought.others):
         return
-    of_state = _changing(sought) | sought.own_to_each
-    for k, others in enumerate(sought.others):
-        if names := others - of_state:
-            what = told(min(names), attributes(sought.envs.envs[k]), attributes(sought.new))
-            raise MissingModel(f"copy {k} of {sought.name} has {what}, and a model is of all: make them alike")
-
-
-def _changing(sought: _Sought) -> set[str]:
-    """The attributes that are a matter of state."""
-    found = set[str]()
+    envs, found = sought.envs.envs, None
     with _told_where_it_stops_a_training():
-        found = changing(sought.fresh(), sought.actions, sought.random)
-    return found
-
-
-def _kinds(env: gymnasium.Env) -> list[type]:
-    """The class of an environment and of each wrapper, from the outside."""
-    return [*map(type, wrappers_of(env)), type(env.unwrapped)]
+        new = itertools.repeat(sought.new)
+        found = unlike(envs, new, sought.fresh(), sought.random, apart=sought.own_to_each)
+    if found is not None:
+        raise MissingModel(
+            f"environment {found.number} of {sought.name} has {found.what}, and a model is of all: make them alike"
+        )
 
 
 @contextmanager
@@ -219,13 +205,12 @@ def _told_where_it_stops_a_training() -> Iterator[None]:
 
 def _table(sought: _Sought) -> TabularWorld | None:
     """The table that an environment publishes; None where it shows no numbers, or publishes nothing."""
-    discrete = isinstance(sought.copies.single_observation_space, spaces.Discrete)
+    discrete = isinstance(sought.env.single_observation_space, spaces.Discrete)
     if sought.observation_key is not None or not discrete or not publishes_table(sought.envs.envs[0]):
         return None
     if own := sought.own_to_each & {"P", "mdp", "initial_state_distrib"}:
         raise MissingModel(
-            f"each instance of {sought.name} has its own {min(own)}, so that no table holds for all copies: make them "
-            "alike"
+            f"each instance of {sought.name} has its own {min(own)}, so that no table holds for all: make them alike"
         )
     mdp, starts_known = table_of(sought.fresh(), gamma=sought.gamma, generator=sought.random)
     _check_single(sought.action_repeat, "in a table")
@@ -235,7 +220,7 @@ def _table(sought: _Sought) -> TabularWorld | None:
             "1,000 resets",
             stacklevel=4,
         )
-    return TabularWorld(sought.copies, mdp, starts_known=starts_known, device=sought.device)
+    return TabularWorld(sought.env, mdp, starts_known=starts_known, device=sought.device)
 
 
 def _dynamics(sought: _Sought) -> DynamicsWorld | None:
@@ -271,7 +256,7 @@ def _simulator(sought: _Sought) -> SimulatedWorld:
     if why := why_not(setup):
         raise MissingModel(f"{sought.name} cannot serve as a model: {why}")
     model = SimulatorModel(
-        sought.envs.env_fns[0],
+        sought.fresh,
         gamma=sought.gamma,
         action_repeat=sought.action_repeat,
         adapter=adapter,
@@ -279,6 +264,13 @@ def _simulator(sought: _Sought) -> SimulatedWorld:
         device=sought.device,
     )
     return SimulatedWorld(sought.envs, model, observation_key=key, device=sought.device)
+
+
+def _normalizing_wrapper(env: VectorEnv) -> str:
+    """The name of a wrapper that normalises by running statistics of its own; empty where there is none."""
+    around = wrappers_of(env.envs[0]) if isinstance(env, SyncVectorEnv) else []
+    kinds = NormalizeObservation, NormalizeReward
+    return next((type(wrapper).__name__ for wrapper in around if isinstance(wrapper, kinds)), "")
 
 
 def _own(sought: _Sought, names: Iterable[str]) -> str:

@@ -8,13 +8,13 @@ from typing import Any, Literal, final, get_args
 import numpy as np
 import torch
 
-from pgts_torch.agent.copies import env_name
 from pgts_torch.agent.frequencies import MARGINS, Frequencies
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import ModelMismatch, PgtsError
 from pgts_torch.models.base import DENIED, DRAWN, ExactModel, Happened, step_text
+from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.seeding import numpy_stream
 

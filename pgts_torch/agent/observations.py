@@ -9,8 +9,8 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Int
 from torch import Tensor
 
-from pgts_torch.agent.copies import env_name
 from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.models.snapshots import env_name
 
 
 @final

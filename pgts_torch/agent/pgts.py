@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple, Self, final
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -31,7 +30,6 @@ from pgts_torch.agent.build import (
     make_update,
 )
 from pgts_torch.agent.certificate import Certificates
-from pgts_torch.agent.copies import make_vector_env, more_copies, own_actions, registered_limit
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.iteration import Iteration, PolicyBatch
 from pgts_torch.agent.make_world import make_world
@@ -44,7 +42,7 @@ from pgts_torch.agent.states import NO_STATE, check_keys, take_over
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import ModelWorld
 from pgts_torch.errors import PgtsError, check_count
-from pgts_torch.models.environments import EnvSource
+from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Leaf, Lookahead, check_finite
@@ -81,10 +79,10 @@ class PGTS:
     the same calls, with the same arguments.
 
     Args:
-        env: a Gymnasium id; or an environment or a spec, of which copies are made by its spec; or a function that makes
-            one; or copies as a VectorEnv that resets by mask. What a lookahead asks is the environment's table
-            (pgts/*, or a P table), else its dynamics in torch (CartPole, Acrobot, MountainCar, Pendulum), else a
-            simulator that is restored from snapshots.
+        env: a Gymnasium id; a spec; an instance, of whose spec others are made, which have to be like it; a function
+            that makes one; or several as a VectorEnv that resets by mask (`EnvSource`). What a lookahead queries is
+            the environment's table (pgts/*, or a P table), else its dynamics in torch (CartPole, Acrobot, MountainCar,
+            Pendulum), else a simulator that is restored from snapshots.
         depth: m. 0 is plain policy gradient. "adaptive": in each iteration the smallest m at which the policy is far
             from stationary, because then it deserves no deeper look: sum_s d(s) g_m(s) >
             tolerance * sum_s d(s) (v_hat(s) - v(s)), where v_hat >= v* is that of the certificate.
@@ -98,7 +96,8 @@ class PGTS:
             A2C, which need depth 0, a network and no model.
         policy, critic, update, horizon: a part, or its description (`agent.build`): "softmax", "mlp",
             {"type": "tabular", "target": "q"}, ... Default: tables where the environment is tabular, else networks.
-        num_envs: episodes in each iteration, of all processes together; copies that are given belong to this one alone.
+        num_envs: episodes in each iteration, of all processes together; a VectorEnv belongs to this one alone and
+            keeps its own number.
         actions_per_dimension: into how many evenly spaced values, from the lowest to the highest, each dimension of
             continuous actions is divided; None: actions are discrete, of MultiDiscrete each combination of them.
         model_check: each step of the environment is held to its model (`ModelCheck`). "error": the first contradiction
@@ -110,7 +109,7 @@ class PGTS:
         observation_key: which part of dictionary observations policy and critic see.
         reward_range: the lowest and the highest reward of a single step, to which environment and model are held.
             `stop_at` and an adaptive depth need it where the model knows no largest reward (simulators).
-        gamma: discount. Default: the environment's own (pgts/*), else 0.99. Copies of pgts/* bring their own.
+        gamma: discount. Default: the environment's own (pgts/*), else 0.99. A VectorEnv of pgts/* brings its own.
         seed: of everything random.
         device: where policy, critic and model live.
         env_kwargs: for gymnasium.make, if the environment is given by its id.
@@ -125,7 +124,7 @@ class PGTS:
     @torch.enable_grad()
     def __init__(
         self,
-        env: EnvSource | VectorEnv,
+        env: Given,
         *,
         depth: int | Literal["adaptive"] = 4,
         max_depth: int | None = None,
@@ -161,20 +160,22 @@ class PGTS:
         self.device = make_device(device)
         self.estimator = make_estimator(estimator)
         self.ranks = present_ranks()
-        if num_envs < self.ranks.size > 1 and not isinstance(env, VectorEnv):
-            raise PgtsError(f"num_envs is {num_envs}; {self.ranks.size} ranks need at least as many")
+        num_envs = self._arguments["num_envs"]
+        check_count("num_envs", num_envs)
         with SharedGenerators(seed, "construction"):
+            self.source = EnvSource.of(env, kwargs=env_kwargs, gamma=gamma, actions_per_dimension=actions_per_dimension)
+            if num_envs < self.ranks.size and self.source.given is None:
+                raise PgtsError(f"num_envs is {num_envs}; {self.ranks.size} ranks need at least as many")
             self.world = make_world(
-                env,
+                self.source,
                 num_envs=self.ranks.count(num_envs),
                 gamma=gamma,
                 observation_key=observation_key,
                 plain=isinstance(self.estimator, SampledAdvantages),
-                actions_per_dimension=actions_per_dimension,
                 action_repeat=action_repeat,
                 device=device,
-                **(env_kwargs or {}),
             )
+        self._arguments["env"] = self.source.description
         if reward_range is not None:
             self.world.promise(RewardRange.of(reward_range))
         if not isinstance(policy, Policy):
@@ -202,7 +203,7 @@ class PGTS:
         is_asked = self.search is not None
         self.model_check = ModelCheck(self.world, mode=model_check, is_asked=is_asked, seed=seed, ranks=self.ranks)
         check_parts(self._arguments, self.world, self.policy, self.critic, self.update, self.estimator)
-        self._own_actions = None if isinstance(env, VectorEnv) else own_actions(self.world.env)
+        self._own_actions = self.source.own_actions(self.world.env)
         self._predicting = stream(seed, "predict", device=self.device)
         self.num_iterations = 0
         self.num_env_steps = 0
@@ -324,30 +325,13 @@ class PGTS:
     def mdp(self) -> TabularMDP:
         """The exact truth behind the environment; PgtsError where there is none."""
         if self.world.mdp is None:
-            raise PgtsError(f"nothing exact is known of {self._arguments['env']}")
+            raise PgtsError(f"nothing exact is known of {self.source.name}")
         return self.world.mdp
 
     def policy_table(self) -> Float[Tensor, "S A"]:
         """pi(.|s) for all states, on the CPU in float64; PgtsError where they cannot be listed."""
         states = torch.arange(self.mdp.num_states, device=self.device)
         return listed(self.policy, states)
-
-    @property
-    def time_limit(self) -> int | None:
-        """The most steps of an episode of the environment as it is registered; None: there is no limit."""
-        return registered_limit(self._arguments["env"], self.world.env)
-
-    def make_copies(self, num_envs: int) -> VectorEnv:
-        """Fresh copies of the environment, without its registered time limit.
-
-        Raises:
-            PgtsError: it was given as copies that are no SyncVectorEnv.
-        """
-        env = self._arguments["env"]
-        if isinstance(env, VectorEnv):
-            return more_copies(env, num_envs)
-        options = {name: self._arguments[name] for name in ("gamma", "actions_per_dimension")}
-        return make_vector_env(env, num_envs, **options, **(self._arguments["env_kwargs"] or {}))
 
     def lookahead(self, state_N: Int[Tensor, "N"], *, depth: int | None = None) -> Lookahead:
         """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves.
@@ -452,7 +436,7 @@ class PGTS:
         cls,
         path: str | Path,
         *,
-        env: EnvSource | VectorEnv | None = None,
+        env: Given | None = None,
         device: torch.device | str | None = None,
         trust_imports: bool = False,
     ) -> Self:

@@ -12,12 +12,12 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from pgts_torch.agent.copies import env_name
 from pgts_torch.agent.episodes import Episodes
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.base import SamplingModel
+from pgts_torch.models.snapshots import env_name
 from pgts_torch.seeding import SharedGenerators, draw_keys, seed_sequence
 
 StateWeight = Literal["occupancy", "visits", "uniform"]

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from pgts_torch.errors import MissingModel
-from pgts_torch.models.environments import make_env
+from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.fidelity import Check, Report, check_model, held
 from pgts_torch.models.tabular import tabular_truth
 
@@ -42,14 +42,15 @@ class Table:
 def answer(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Report | Table:
     """What `check_model` finds of an id and the arguments of `gymnasium.make`, on one thread."""
     torch.set_num_threads(1)
+    source = EnvSource.of(env_id, kwargs=kwargs)
     try:
-        return check_model(lambda: make_env(env_id, **kwargs), seed=seed)
+        return check_model(source.make_one, seed=seed)
     except MissingModel as missing:
         try:
-            mdp = tabular_truth(make_env(env_id, **kwargs), gamma=1.0)
+            mdp = tabular_truth(source.make_one(), gamma=1.0)
         except MissingModel:
             raise missing from None
-        checks = held(make_env(env_id, **kwargs), seed=seed)
+        checks = held(source.make_one(), seed=seed)
         return Table(env_id, mdp.num_states, mdp.num_actions, tuple(checks))
 
 

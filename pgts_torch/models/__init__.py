@@ -1,8 +1,8 @@
 """Models of environments: what a lookahead may ask."""
 
+from pgts_torch.models.actions import with_torques
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.classic import Acrobot, CartPole, MountainCar, Pendulum
-from pgts_torch.models.environments import with_torques
 from pgts_torch.models.fidelity import check_model
 from pgts_torch.models.numbering import Numbering
 from pgts_torch.models.simulator import SimulatorModel

@@ -1,6 +1,7 @@
 """What an environment holds, in values that can be compared: are two instances alike, and what changes in a step?"""
 
 import collections
+import contextlib
 import enum
 import functools
 import hashlib
@@ -9,8 +10,8 @@ import pickle
 import random
 import time
 import types
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence, Set
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -35,19 +36,28 @@ _EPISODES, _LOOKED_AFTER, _LONGEST, _SECONDS = 3, 5, 200, 0.2
 """How `changing` walks: so many episodes, looking after each of the first steps and at the end, which is after so many
 steps at the latest, and after one step once these seconds are over."""
 
+_ACTIONS = 20
+"""That are drawn for a walk in which `unlike` looks for differences."""
+
+_LEAST_RESETS, _MOST_RESETS = 10, 100
+"""So often an environment is reset until an attribute that differs is taken for one that lasts: of two goals, each
+drawn in every second reset, one is missed in less than one in a thousand cases."""
+
 
 def attributes(env: gymnasium.Env, *, but: Iterable[str] = ()) -> dict[str, Any]:
     """Every attribute of an environment and its wrappers by its name, as what `fingerprint` makes of it.
 
-    Attributes of a wrapper are called `WRAPPER.NAME`. What classes outside of Gymnasium keep for all their instances is
-    among them. Generators are not.
+    Attributes of a wrapper are called `WRAPPER.NAME`, those of a second of its kind `WRAPPER.2.NAME`. What classes
+    outside of Gymnasium keep for all their instances is among them. Generators are not.
     """
     but, layers = _NOT_COMPARED.union(but), list[Any]([env])
     while isinstance(layers[-1], gymnasium.Wrapper):
         layers.append(layers[-1].env)
-    held = dict[str, Any]()
+    held, met = dict[str, Any](), collections.Counter[type]()
     for layer in layers:
-        start = "" if layer is layers[-1] else f"{type(layer).__name__}."
+        met[type(layer)] += 1
+        number = f"{met[type(layer)]}." if met[type(layer)] > 1 else ""
+        start = "" if layer is layers[-1] else f"{type(layer).__name__}.{number}"
         own = {name: value for cls in reversed(_classes_outside(type(layer))) for name, value in _data_of(cls).items()}
         named = {name: value for name, value in (own | vars(layer)).items() if name not in but}
         # The layers themselves are no part of what they hold: a function may enclose one of them.
@@ -62,20 +72,75 @@ def changing(env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Ge
         env: an instance that nobody else needs.
         but: as in `attributes`.
     """
-    now, found, until = attributes(env, **but), set[str](), time.monotonic() + _SECONDS
+    return set(_changes(env, actions, generator, **but))
+
+
+def _changes(
+    env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Generator, **but: Any
+) -> collections.Counter[str]:
+    """How often each attribute is seen to change in a random walk."""
+    now, found, until = attributes(env, **but), collections.Counter[str](), time.monotonic() + _SECONDS
     for _ in range(_EPISODES):
         env.reset(seed=int(generator.integers(2**31)))
         over, taken = False, 0
         while not over:
             if taken <= _LOOKED_AFTER:
                 before, now = now, attributes(env, **but)
-                found |= different(before, now)
+                found.update(different(before, now))
             *_, terminated, truncated, _ = env.step(actions[int(generator.integers(len(actions)))])
             taken += 1
             over = terminated or truncated or taken == _LONGEST or time.monotonic() > until
         before, now = now, attributes(env, **but)
-        found |= different(before, now)
+        found.update(different(before, now))
     return found
+
+
+class Unlike(NamedTuple):
+    """What an environment is found to differ in from another instance: its number, and the attribute in words."""
+
+    number: int
+    what: str
+
+
+def unlike(
+    envs: Iterable[gymnasium.Env],
+    new: Iterable[gymnasium.Env],
+    walked: gymnasium.Env,
+    generator: np.random.Generator,
+    *,
+    apart: Set[str] = frozenset(),
+) -> Unlike | None:
+    """The first environment that is not like the new instance beside it, in whatever state it is; None: all are.
+
+    An attribute makes a difference if its value is neither that of the new instance nor the one that an instance has
+    after episodes, unless it keeps changing: what changes once, as a goal that is set in the first reset, may be
+    another one in an environment for ever.
+
+    Args:
+        envs: the environments.
+        new: instances that are only looked at.
+        walked: an instance that nobody else needs; it is walked in, and rendered if it can be.
+        apart: attributes of which each instance has its own.
+    """
+    pairs = [(attributes(env), attributes(other)) for env, other in zip(envs, new, strict=False)]
+    left = [different(*pair) - apart for pair in pairs]
+    if not any(left):
+        return None
+    walked.action_space.seed(int(generator.integers(2**31)))
+    actions = [walked.action_space.sample() for _ in range(_ACTIONS)]
+    of_state = {name for name, count in _changes(walked, actions, generator).items() if count > 1}
+    if walked.render_mode is not None:  # what rendering leaves behind is no difference
+        with contextlib.suppress(Exception):
+            walked.render()
+    until = time.monotonic() + _SECONDS
+    for k in range(_MOST_RESETS):
+        now = attributes(walked)
+        left = [(names - of_state) & different(held, now) for names, (held, _) in zip(left, pairs, strict=True)]
+        if not any(left) or (k >= _LEAST_RESETS and time.monotonic() > until):
+            break
+        walked.reset(seed=int(generator.integers(2**31)))
+        of_state |= different(now, attributes(walked))
+    return next((Unlike(k, told(min(names), pairs[k][0], now)) for k, names in enumerate(left) if names), None)
 
 
 def own_to_each(make: Callable[[], gymnasium.Env]) -> set[str]:

@@ -22,8 +22,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models.actions import base_actions
 from pgts_torch.models.base import ExactModel
-from pgts_torch.models.environments import base_actions
 from pgts_torch.models.numbering import Merge
 from pgts_torch.models.provenance import overridden
 from pgts_torch.models.rewards import value_range

@@ -1,102 +1,296 @@
-"""Environments as models need them: made anew, their actions in a list, what they say held to what they declare."""
+"""The environment that a user gives, understood once: `EnvSource` makes others of its kind, whatever it is."""
 
-import contextlib
 import importlib
-import itertools
-from collections.abc import Callable, Iterator
-from typing import Any
+import warnings
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from typing import Any, final
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces, wrappers
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers import TimeLimit
 
-from pgts_torch.errors import NotFinite, PgtsError, failure
-from pgts_torch.models.attributes import attributes, changing, different, told
+from pgts_torch.errors import PgtsError, check_count, failure
+from pgts_torch.models.actions import Numbered, is_numbered, numbered
+from pgts_torch.models.attributes import Unlike, own_to_each, unlike
 from pgts_torch.models.snapshots import env_name
-from pgts_torch.models.steps import check_rewards
-from pgts_torch.models.wrappers import transforms_of, wrappers_of
+from pgts_torch.models.wrappers import wrappers_of
 from pgts_torch.seeding import numpy_stream
 
-EnvSource = str | EnvSpec | gymnasium.Env | Callable[[], gymnasium.Env]
-"""What an environment can be made from: an id, a spec, another instance (by its spec) or a function."""
+Given = str | EnvSpec | gymnasium.Env | VectorEnv | Callable[[], gymnasium.Env]
+"""What a user may give as an environment."""
 
-MOST_ACTIONS = 10_000
-"""That are made of those of several dimensions."""
-
-_ACTIONS_DRAWN = 20
+_Maker = Callable[..., gymnasium.Env]
+"""Makes a new environment; takes the arguments of `gymnasium.make`, and heeds them where it is made by that."""
 
 
-def make_env(env: EnvSource, **kwargs: Any) -> gymnasium.Env:
-    """A new environment, with these arguments if `env` is an id or a spec. An instance is not used itself: another one
-    is made from its spec, and has to be like it.
+@final
+class EnvSource:
+    """What environments are made from. `EnvSource.of` reads what a user gives; everything else takes this.
 
-    Raises:
-        PgtsError: there is no such id, an extra is missing, an instance is not what its spec makes (`spec_like`), a
-            function makes none, or the environment raises an error of its own.
+    Attributes:
+        name: what errors call it.
+        description: what a saved model says of it, its id; None where it was given as an object, which no file holds.
+        given: environments that were given as a VectorEnv, to train in; None: some are made for that, too.
+        time_limit: the most steps of an episode, as it is registered or by a TimeLimit around it; None: no limit.
     """
-    if isinstance(env, gymnasium.Env):
-        env = spec_like(env)
-    if not isinstance(env, str | EnvSpec):
-        try:
-            made = env()
-        except PgtsError:
-            raise
-        except BaseException as error:
-            raise failure(f"{getattr(env, '__name__', env)} cannot be made", error) from error
-        if not isinstance(made, gymnasium.Env):
-            raise PgtsError(f"{env!r} gave {made!r}; it must be a Gymnasium environment")
+
+    def __init__(
+        self,
+        name: str,
+        makers: Sequence[_Maker],
+        *,
+        spec: EnvSpec | None = None,
+        description: str | None = None,
+        given: VectorEnv | None = None,
+        make_together: Callable[[int], VectorEnv] | None = None,
+        actions_per_dimension: int | None = None,
+    ) -> None:
+        self.name, self.description, self.given = name, description, given
+        self._makers, self._spec, self._make_together = makers, spec, make_together
+        self._actions_per_dimension = actions_per_dimension
+        self._known = weakref.WeakValueDictionary[int, gymnasium.Env]()
+
+    @classmethod
+    def of(
+        cls,
+        env: Given,
+        *,
+        kwargs: Mapping[str, Any] | None = None,
+        gamma: float | None = None,
+        actions_per_dimension: int | None = None,
+    ) -> "EnvSource":
+        """Read what a user gives.
+
+        Args:
+            env: an id, as gymnasium.make takes it; a spec; an instance, which is only looked at: others are made from
+                its spec and have to be like it; a function that makes a new environment; or several as a VectorEnv that
+                resets by mask.
+            kwargs: for gymnasium.make, of an id.
+            gamma: handed to environments that carry a discount of their own, pgts/*, by their id.
+            actions_per_dimension: into how many evenly spaced values each dimension of continuous actions is divided;
+                None: actions are discrete.
+
+        Raises:
+            PgtsError: it is none of these, or takes none of these options; an instance is not what its spec makes; or
+                a VectorEnv does not take numbers as actions, or resets in another way.
+        """
+        if isinstance(env, str):
+            return cls._of_id(env, dict(kwargs or {}), gamma, actions_per_dimension)
+        if kwargs:
+            raise PgtsError(f"env_kwargs is {kwargs}; an environment that is given as an object takes none")
+        if isinstance(env, VectorEnv):
+            if (count := actions_per_dimension) is not None:
+                raise PgtsError(
+                    f"actions_per_dimension is {count}; a VectorEnv takes its own actions, make them discrete"
+                )
+            return cls._of_several(env)
+        if isinstance(env, gymnasium.Env):
+            env = _spec_like(env)
+        if isinstance(env, EnvSpec):
+            make = _registered(env)
+            return cls(env.id, [make], spec=env, actions_per_dimension=actions_per_dimension)
+        if callable(env):
+            function = env
+            name = getattr(function, "__name__", str(function))
+            return cls(name, [lambda **_: function()], actions_per_dimension=actions_per_dimension)
+        raise PgtsError(
+            f"the environment is {env!r}; it must be a Gymnasium id, an environment, a function that makes one, or a "
+            "VectorEnv"
+        )
+
+    @classmethod
+    def _of_id(cls, env_id: str, kwargs: dict[str, Any], gamma: float | None, count: int | None) -> "EnvSource":
+        _import(env_id)
+        spec = gymnasium.registry.get(env_id.rpartition(":")[2])
+        if spec is None or spec.namespace != "pgts":
+            make = _registered(env_id, **kwargs)
+            return cls(env_id, [make], spec=spec, description=env_id, actions_per_dimension=count)
+        if count is not None:
+            raise PgtsError(f"actions_per_dimension is {count}; {env_id} has discrete actions")
+        kwargs |= {} if gamma is None else {"gamma": gamma}
+        options: dict[str, Any] = {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.DISABLED}
+        options |= {"max_episode_steps": -1, **kwargs}
+        together: Callable[[int], VectorEnv] = lambda n: gymnasium.make_vec(env_id, num_envs=n, **options)  # noqa: E731
+        return cls(env_id, [_registered(env_id, **kwargs)], spec=spec, description=env_id, make_together=together)
+
+    @classmethod
+    def _of_several(cls, env: VectorEnv) -> "EnvSource":
+        check_vector_env(env)
+        if not isinstance(env, SyncVectorEnv):
+            return cls(env_name(env), [], spec=env.spec, given=env)
+        source = cls(env_name(env), [lambda make=make, **_: make() for make in env.env_fns], given=env)
+        for one in env.envs:
+            source._check_new(one)
+        return source
+
+    def make(self, num_envs: int) -> VectorEnv:
+        """New environments that step together and reset by mask. Their actions are numbers from 0 on, and they have no
+        registered time limit: the horizon of a rollout ends their episodes.
+
+        Raises:
+            PgtsError: `num_envs` is no whole number above 0; Gymnasium knows no such environment or cannot make it; its
+                actions cannot be numbered; or a VectorEnv was given, of which no others can be made or others than it.
+        """
+        check_count("num_envs", num_envs)
+        with _making(self.name):
+            if self._make_together is not None:
+                return self._make_together(num_envs)
+            makers = [lambda k=k: self.like(k) for k in range(num_envs)]
+            made = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
+        check_vector_env(made)
+        if isinstance(self.given, SyncVectorEnv):
+            self._check_like(self.given.envs, made.envs)
         return made
-    name = env if isinstance(env, str) else env.id
-    register(name)
+
+    def like(self, k: int = 0) -> gymnasium.Env:
+        """A new environment, as environment k of those that `make` gives."""
+        return numbered(self._new(k, max_episode_steps=-1), per_dimension=self._actions_per_dimension)
+
+    def make_one(self) -> gymnasium.Env:
+        """A new environment as it is registered or given, with its own actions and time limit; PgtsError as `make`."""
+        return self._new()
+
+    def own_actions(self, envs: VectorEnv) -> np.ndarray | None:
+        """What the numbers of the actions stand for in environments that `make` gave, a row each; None: the numbers
+        themselves."""
+        outermost = envs.envs[0] if isinstance(envs, SyncVectorEnv) and envs is not self.given else None
+        return np.stack(outermost.actions) if isinstance(outermost, Numbered) else None
+
+    @cached_property
+    def time_limit(self) -> int | None:
+        """The most steps of an episode, as registered or by a TimeLimit around the environment; None: no limit."""
+        spec, limits = self._spec, list[int]()
+        if spec is None and self._makers:
+            env = self.given.envs[0] if isinstance(self.given, SyncVectorEnv) else self.make_one()
+            spec = env.spec
+            limits = [each._max_episode_steps for each in wrappers_of(env) if isinstance(each, TimeLimit)]
+        limit = min(limits, default=None) if spec is None else spec.max_episode_steps
+        return limit if limit is not None and limit > 0 else None
+
+    def _new(self, k: int = 0, **options: Any) -> gymnasium.Env:
+        if not self._makers:
+            raise PgtsError(
+                f"{self.name} was given as a VectorEnv of which no others can be made; give a SyncVectorEnv or an id"
+            )
+        with _making(self.name):
+            made = self._makers[k % len(self._makers)](**options)
+        if not isinstance(made, gymnasium.Env):
+            raise PgtsError(f"{self.name} gave {made!r}; it must be a Gymnasium environment")
+        self._check_new(made)
+        return made
+
+    def _check_new(self, env: gymnasium.Env) -> None:
+        """PgtsError if this environment was made before."""
+        base = env.unwrapped
+        if self._known.get(id(base)) is base:
+            raise PgtsError(
+                f"{self.name} gave the same environment twice; the function that makes it must make a new one each time"
+            )
+        self._known[id(base)] = base
+
+    def _check_like(self, envs: Sequence[gymnasium.Env], made: Sequence[gymnasium.Env]) -> None:
+        """PgtsError if environments that were given are not what their functions make."""
+        found = _unlike(envs, made, self.like())
+        if found and (found := _unlike(envs, made, self.like(), apart=own_to_each(self.like))):
+            raise PgtsError(
+                f"environment {found.number} of {self.name} has {found.what}: others come from its function, "
+                "which has to make it as it is"
+            )
+
+
+def check_vector_env(env: VectorEnv) -> None:
+    """PgtsError unless rollouts can be made in these environments: discrete actions, reset by mask."""
+    space = env.single_action_space
+    if isinstance(space, spaces.Box):
+        raise PgtsError(
+            f"the actions of {env_name(env)} are continuous, {space}: set actions_per_dimension, into how many values "
+            "each dimension of them is divided"
+        )
+    if not is_numbered(space):
+        raise PgtsError(f"the actions of {env_name(env)} are {space}; they must be Discrete(n) counted from 0")
+    mode = env.metadata.get("autoreset_mode")
+    if mode != AutoresetMode.DISABLED:
+        raise PgtsError(f"the environment resets by {mode}; make it with autoreset_mode=AutoresetMode.DISABLED")
+
+
+def close_environments(env: VectorEnv) -> None:
+    """Close them all; what one of them raises is a warning, for all that was wanted of it is done."""
+    for one in env.envs if isinstance(env, SyncVectorEnv) else [env]:
+        try:
+            one.close()
+        except BaseException as error:
+            warnings.warn(str(failure(f"{env_name(env)} failed in close", error)), stacklevel=2)
+    env.closed = True
+
+
+def kinds_of(env: gymnasium.Env) -> list[type]:
+    """The class of each wrapper, from the outside, and of the environment."""
+    return [*map(type, wrappers_of(env)), type(env.unwrapped)]
+
+
+def _registered(env: str | EnvSpec, **kwargs: Any) -> _Maker:
+    return lambda **options: gymnasium.make(env, **(options | kwargs))
+
+
+@contextmanager
+def _making(name: str) -> Iterator[None]:
+    """An error of an environment that is being made, as one of ours."""
     try:
-        return gymnasium.make(env, **kwargs)
+        yield
+    except PgtsError:
+        raise
     except gymnasium.error.DependencyNotInstalled as error:
         raise PgtsError(f"{name} needs something that is not installed: {error}") from error
-    except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
+    except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
         raise PgtsError(f"{name} cannot be made: {error}") from error
     except BaseException as error:
         raise failure(f"{name} cannot be made", error) from error
 
 
-def spec_like(env: gymnasium.Env) -> EnvSpec:
+def _spec_like(env: gymnasium.Env) -> EnvSpec:
     """The spec of an instance, from which others are made that are like it, in whatever state it is.
 
     Raises:
-        PgtsError: it has none, or what this makes has other wrappers, or another value of an attribute that neither
-            reset nor step changes: the message names it.
+        PgtsError: it has none, or what this makes has other wrappers, or another value of an attribute that does not
+            change from reset to reset or step to step: the message names it.
     """
     name = env_name(env)
     if env.spec is None:
         raise PgtsError(f"{name} has no spec to make another instance from: give a function that makes one")
-    way_out = "give a function that makes it as it is"
+    given, way_out = f"{name} was given as an instance", "give a function that makes it as it is"
     try:
-        made = make_env(env.spec)
+        with _making(name):
+            made = gymnasium.make(env.spec)
     except PgtsError as error:
-        raise PgtsError(
-            f"{name} was given as an instance that its spec cannot make again ({error}): {way_out}"
-        ) from error
-    kinds = [[type(layer) for layer in (*wrappers_of(one), one.unwrapped)] for one in (env, made)]
-    if kinds[0] != kinds[1]:
-        given, other = (" in ".join(kind.__name__ for kind in reversed(each)) for each in kinds)
-        raise PgtsError(f"{name} was given as an instance, {given}, of whose spec comes {other}: {way_out}")
-    own, held = attributes(env), attributes(made)
-    names = different(own, held)
-    if names:
-        try:
-            names -= changing(made, drawn_actions(made, 0), numpy_stream(0, "spec_like"))
-        except Exception as error:
-            raise failure(f"{name} failed in a random walk", error) from error
-    if names:
-        raise PgtsError(f"{name} was given as an instance with {told(min(names), own, held)} of its spec: {way_out}")
+        raise PgtsError(f"{given} that its spec cannot make again ({error}): {way_out}") from error
+    if kinds_of(env) != kinds_of(made):
+        own, other = (" in ".join(kind.__name__ for kind in reversed(kinds_of(each))) for each in (env, made))
+        raise PgtsError(f"{given}, {own}, of whose spec comes {other}: {way_out}")
+    if found := _unlike([env], [made], made):
+        raise PgtsError(f"{given} with {found.what} of its spec: {way_out}")
     return env.spec
+
+
+def _unlike(
+    envs: Sequence[gymnasium.Env], new: Sequence[gymnasium.Env], walked: gymnasium.Env, **apart: Any
+) -> Unlike | None:
+    try:
+        return unlike(envs, new, walked, numpy_stream(0, "unlike"), **apart)
+    except Exception as error:
+        raise failure(f"{env_name(walked)} failed in a random walk", error) from error
 
 
 _MODULES = {"MiniGrid-": ("minigrid", "envs"), "BabyAI-": ("minigrid", "envs"), "ALE/": ("ale_py", "atari")}
 """Environments that are registered by a module, by the start of their ids, and the extra that installs it."""
 
 
-def register(env_id: str) -> None:
+def _import(env_id: str) -> None:
     """Import what registers an environment with Gymnasium: the module of `MODULE:ID`, or one that is known.
 
     Raises:
@@ -116,130 +310,8 @@ def register(env_id: str) -> None:
                 raise PgtsError(f"{env_id} needs {module}: pip install 'pgts_torch[{extra}]'") from error
 
 
-def spec_of(env_id: str) -> EnvSpec:
-    """What Gymnasium knows of an id; its own error where it knows nothing."""
-    register(env_id)
-    return gymnasium.spec(env_id.rpartition(":")[2])
-
-
-def all_actions(space: spaces.Space) -> Iterator[Any]:
-    """Every action of a Discrete or MultiDiscrete space.
-
-    Raises:
-        PgtsError: the space is another one.
-    """
-    if isinstance(space, spaces.Discrete):
-        return (int(space.start) + a for a in range(int(space.n)))
-    if isinstance(space, spaces.MultiDiscrete):
-        shape, start = space.nvec.shape, space.start
-        each = itertools.product(*[range(n) for n in space.nvec.reshape(-1)])
-        return (np.array(action, dtype=space.dtype).reshape(shape) + start for action in each)
-    raise PgtsError(f"the actions of {space} cannot be listed: give some, as grid_actions or sampled_actions do")
-
-
-def grid_actions(space: spaces.Space, per_dimension: int) -> list[np.ndarray]:
-    """A grid over a bounded Box, `per_dimension` values from lowest to highest in each dimension.
-
-    Raises:
-        PgtsError: the space is no bounded Box, there are fewer than 2 values, or more than 10,000 actions.
-    """
-    low, high = _bounds(space)
-    if per_dimension < 2 or per_dimension**low.size > MOST_ACTIONS:
-        raise PgtsError(
-            f"per_dimension is {per_dimension}; it must be at least 2 and give at most 10,000 actions in "
-            f"{low.size} dimensions: see sampled_actions"
-        )
-    values = np.linspace(low.reshape(-1), high.reshape(-1), per_dimension, dtype=low.dtype)
-    return [np.array(action, low.dtype).reshape(low.shape) for action in itertools.product(*values.T)]
-
-
-def sampled_actions(space: spaces.Space, count: int, *, seed: int) -> list[np.ndarray]:
-    """`count` actions drawn uniformly from a bounded Box.
-
-    Raises:
-        PgtsError: the space is no bounded Box, or count is below 1.
-    """
-    low, high = _bounds(space)
-    if count < 1:
-        raise PgtsError(f"count is {count}; it must be at least 1")
-    drawn = numpy_stream(seed, "actions").uniform(low, high, (count, *low.shape))
-    return list(drawn.astype(low.dtype))
-
-
-def _bounds(space: spaces.Space) -> tuple[np.ndarray, np.ndarray]:
-    if not (isinstance(space, spaces.Box) and space.is_bounded()):
-        raise PgtsError(f"{space} is no bounded Box")
-    return space.low, space.high
-
-
-def check_step(space: spaces.Space, observation: Any, reward: float) -> None:
-    """PgtsError, NotFinite where that is it, unless a step may give this."""
-    check_rewards(reward)
-    _check_observation(space, observation)
-
-
-def _check_observation(space: spaces.Space, value: Any) -> None:
-    if isinstance(space, spaces.Box):
-        try:
-            array = np.asarray(value)
-        except ValueError:
-            raise PgtsError(f"the observation is {value!r}, which has no shape; {space.shape} is declared") from None
-        if array.shape != space.shape:
-            raise PgtsError(f"the observation has shape {array.shape}; {space.shape} is declared")
-        # What a vector environment would put into its array of this dtype.
-        if array.dtype != space.dtype and not np.can_cast(array.dtype, space.dtype, "same_kind"):
-            raise PgtsError(f"the observation is of {array.dtype}; {space.dtype} is declared")
-        if space.dtype.kind == "f" and not np.isfinite(array).all():
-            raise NotFinite(f"the observation is {array.tolist()}; it must be finite", what="observation")
-    elif isinstance(space, spaces.Dict):
-        if not isinstance(value, dict) or value.keys() != space.keys():
-            raise PgtsError(f"the observation is no dict of {', '.join(map(str, space.keys()))}")
-        for name in space:
-            _check_observation(space[name], value[name])
-    elif isinstance(space, spaces.Tuple):
-        if not isinstance(value, tuple) or len(value) != len(space):
-            raise PgtsError(f"the observation is no tuple of {len(space)} parts")
-        for part, content in zip(space, value, strict=True):
-            _check_observation(part, content)
-    elif isinstance(space, spaces.Discrete) and not space.contains(value):
-        raise PgtsError(f"the observation is {value!r}, which is not in {space}")
-
-
-def as_declared(space: spaces.Space, value: Any) -> Any:
-    """An observation in the dtypes that its space declares, in which a policy sees it; what the space cannot hold stays
-    as it is."""
-    if isinstance(space, spaces.Dict) and isinstance(value, dict):
-        return {name: as_declared(space[name], part) if name in space.spaces else part for name, part in value.items()}
-    if isinstance(space, spaces.Tuple) and isinstance(value, tuple) and len(value) == len(space):
-        return tuple(map(as_declared, space, value))
-    if isinstance(space, spaces.Box):
-        with contextlib.suppress(PgtsError), np.errstate(over="ignore"):
-            _check_observation(space, value)
-            return np.asarray(value).astype(space.dtype)
-    return value
-
-
-def with_torques(env: gymnasium.Env, count: int = 5) -> gymnasium.Env:
-    """An environment with continuous actions, as Pendulum, under `count` values of each dimension of them, evenly
-    spaced from the lowest to the highest. PgtsError as in `grid_actions`."""
-    actions = grid_actions(env.action_space, count)
-    return wrappers.TransformAction(env, actions.__getitem__, spaces.Discrete(len(actions)))
-
-
-def base_actions(env: gymnasium.Env) -> list[Any]:
-    """What each action of a discrete space becomes on its way through the wrappers of `env`."""
-    inner = transforms_of(env).action
-    return [inner(action) for action in all_actions(env.action_space)]
-
-
-def drawn_actions(env: gymnasium.Env, seed: int) -> list[Any]:
-    """Some actions of an instance that nobody else needs."""
-    env.action_space.seed(seed)
-    return [env.action_space.sample() for _ in range(_ACTIONS_DRAWN)]
-
-
 _OWN_GENERATORS = ("gymnasium.envs.toy_text.", "gymnasium.envs.classic_control.", "pgts_torch.envs.")
-_WITHOUT_GENERATORS = ("gymnasium.wrappers.common", "pgts_torch.agent.copies")
+_WITHOUT_GENERATORS = ("gymnasium.wrappers.common", Numbered.__module__)
 
 
 def draws_its_own(env: Any) -> bool:

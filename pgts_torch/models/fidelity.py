@@ -15,9 +15,10 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch.errors import PgtsError, text_of
+from pgts_torch.models.actions import all_actions, sampled_actions
 from pgts_torch.models.adapters import adapter_for, methods_for
 from pgts_torch.models.attributes import changing, own_to_each
-from pgts_torch.models.environments import EnvSource, all_actions, make_env, sampled_actions
+from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.snapshots import env_name, generator_state
 from pgts_torch.models.trial import claims
 from pgts_torch.models.walks import Setup, Walk, again, live, replays, walks_of
@@ -109,7 +110,7 @@ class _Missing(Exception):
     """A check failed; the message is its detail."""
 
 
-def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, length: int = 20) -> Report:
+def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: int = 20) -> Report:
     """Try out whether an environment can serve as a `SimulatorModel`.
 
         answers     rewards and observations are finite and fit the spaces that the environment declares
@@ -139,13 +140,14 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
     """
     if min(continuations, length) < 1:
         raise PgtsError(f"continuations is {continuations} and length is {length}; both must be at least 1")
-    first = make_env(env)
+    make = EnvSource.of(env).make_one
+    first = make()
     space, continuous = first.action_space, isinstance(first.action_space, spaces.Box)
     outer = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if continuous else all_actions(space)
     actions = [*map(transforms_of(first).action, outer)]
     random = numpy_stream(seed, "check_model")
-    alike = not own_to_each(lambda: make_env(env))
-    setup = Setup(env_name(first), lambda: make_env(env).unwrapped, adapter_for(first), actions, random, alike=alike)
+    alike = not own_to_each(make)
+    setup = Setup(env_name(first), lambda: make().unwrapped, adapter_for(first), actions, random, alike=alike)
     try:
         walks = walks_of(setup, continuations, length)
     except BaseException as error:
@@ -158,7 +160,7 @@ def check_model(env: EnvSource, *, seed: int = 0, continuations: int = 20, lengt
         _check("merge", lambda: _merge(walks, repeated()), needed=False),
         _check("chance", lambda: _chance(setup, walks)),
         _check("untouched", lambda: _untouched(setup, length)),
-        *held(make_env(env), seed=seed),
+        *held(make(), seed=seed),
     )
     report = Report(setup.name, setup.adapter.name, len(actions), tried.random_share, checks, cost=None)
     try:

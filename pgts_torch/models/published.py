@@ -10,7 +10,7 @@ import torch
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel
-from pgts_torch.models.environments import base_actions
+from pgts_torch.models.actions import base_actions
 from pgts_torch.models.provenance import origin, overridden
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.steps import number_of

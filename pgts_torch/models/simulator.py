@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, failure
+from pgts_torch.models.actions import all_actions
 from pgts_torch.models.adapters import adapter_for
 from pgts_torch.models.answers import Answers, Step, copied
 from pgts_torch.models.base import (
@@ -29,9 +30,9 @@ from pgts_torch.models.base import (
     Transitions,
     step_text,
 )
-from pgts_torch.models.environments import EnvSource, all_actions, check_step, draws_its_own, make_env
+from pgts_torch.models.environments import EnvSource, Given, draws_its_own
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name, generator_state
-from pgts_torch.models.steps import discount_of, names_discounts, number_of
+from pgts_torch.models.steps import check_step, discount_of, names_discounts, number_of
 from pgts_torch.models.wrappers import transforms_of
 from pgts_torch.seeding import SharedGenerators
 
@@ -78,7 +79,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
 
     def __init__(
         self,
-        env: EnvSource,
+        env: Given,
         *,
         gamma: float,
         actions: Sequence[Any] | None = None,
@@ -96,7 +97,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         if action_repeat > 1 and highest_value < math.inf:
             raise PgtsError(f"highest_value is {highest_value}; under repeated actions no bound of v* stays one")
         self.action_repeat = action_repeat
-        made = make_env(env)
+        made = EnvSource.of(env).make_one()
         self.name = env_name(made)
         self.env: Any = made.unwrapped
         self.adapter = adapter or adapter_for(made)

@@ -24,6 +24,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import SyncVectorEnv, VectorEnv
 
 _MASK = 2**64 - 1
 _ODD = 0x9E3779B97F4A7C15
@@ -126,6 +127,9 @@ def _avalanche(x: int) -> int:
     return x ^ (x >> 31)
 
 
-def env_name(env: gymnasium.Env) -> str:
-    """The id of an environment, or the name of its class where it has none."""
+def env_name(env: gymnasium.Env | VectorEnv) -> str:
+    """The id of an environment, or the name of its class where it has none; of several that step together, that of the
+    first."""
+    if env.spec is None and isinstance(env, SyncVectorEnv):
+        env = env.envs[0]
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__

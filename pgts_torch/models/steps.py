@@ -1,10 +1,12 @@
 """What an environment says of one step, in the forms in which environments say it."""
 
+import contextlib
 from decimal import Decimal
 from numbers import Real
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from torch import Tensor, float64
 
 from pgts_torch.bellman import LARGEST_REWARD
@@ -102,3 +104,50 @@ def check_discounts(discount_B: np.ndarray) -> None:
     off_B = (discount_B < 0) | (discount_B > 1)
     if off_B.any():
         raise PgtsError(f"the discount is {discount_B[off_B][0]}; it must be in [0, 1]")
+
+
+def check_step(space: spaces.Space, observation: Any, reward: float) -> None:
+    """PgtsError, NotFinite where that is it, unless a step may give this."""
+    check_rewards(reward)
+    _check_observation(space, observation)
+
+
+def _check_observation(space: spaces.Space, value: Any) -> None:
+    if isinstance(space, spaces.Box):
+        try:
+            array = np.asarray(value)
+        except ValueError:
+            raise PgtsError(f"the observation is {value!r}, which has no shape; {space.shape} is declared") from None
+        if array.shape != space.shape:
+            raise PgtsError(f"the observation has shape {array.shape}; {space.shape} is declared")
+        # What a vector environment would put into its array of this dtype.
+        if array.dtype != space.dtype and not np.can_cast(array.dtype, space.dtype, "same_kind"):
+            raise PgtsError(f"the observation is of {array.dtype}; {space.dtype} is declared")
+        if space.dtype.kind == "f" and not np.isfinite(array).all():
+            raise NotFinite(f"the observation is {array.tolist()}; it must be finite", what="observation")
+    elif isinstance(space, spaces.Dict):
+        if not isinstance(value, dict) or value.keys() != space.keys():
+            raise PgtsError(f"the observation is no dict of {', '.join(map(str, space.keys()))}")
+        for name in space:
+            _check_observation(space[name], value[name])
+    elif isinstance(space, spaces.Tuple):
+        if not isinstance(value, tuple) or len(value) != len(space):
+            raise PgtsError(f"the observation is no tuple of {len(space)} parts")
+        for part, content in zip(space, value, strict=True):
+            _check_observation(part, content)
+    elif isinstance(space, spaces.Discrete) and not space.contains(value):
+        raise PgtsError(f"the observation is {value!r}, which is not in {space}")
+
+
+def as_declared(space: spaces.Space, value: Any) -> Any:
+    """An observation in the dtypes that its space declares, in which a policy sees it; what the space cannot hold stays
+    as it is."""
+    if isinstance(space, spaces.Dict) and isinstance(value, dict):
+        return {name: as_declared(space[name], part) if name in space.spaces else part for name, part in value.items()}
+    if isinstance(space, spaces.Tuple) and isinstance(value, tuple) and len(value) == len(space):
+        return tuple(map(as_declared, space, value))
+    if isinstance(space, spaces.Box):
+        with contextlib.suppress(PgtsError), np.errstate(over="ignore"):
+            _check_observation(space, value)
+            return np.asarray(value).astype(space.dtype)
+    return value

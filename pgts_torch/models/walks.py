@@ -7,10 +7,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from pgts_torch.models.environments import as_declared
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter
-from pgts_torch.models.steps import number_of
+from pgts_torch.models.steps import as_declared, number_of
 
 
 @dataclass(frozen=True)

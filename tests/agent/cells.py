@@ -1,6 +1,7 @@
 """Small environments that publish a table, or are restored, and what tests of their worlds share."""
 
 from collections.abc import Callable, Sequence
+from inspect import signature
 from typing import Any
 
 import gymnasium
@@ -13,13 +14,18 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.environments import EnvSource
 
 KEYWORDS: dict[str, Any] = {"num_envs": 2, "gamma": 0.9, "observation_key": None, "plain": False, "device": "cpu"}
 N = 6
 
 
-def world_of(env: Any, **options: Any) -> World:
-    return make_world(env, **KEYWORDS | options)
+def world_of(env: Any, *, actions_per_dimension: int | None = None, **options: Any) -> World:
+    """The world of an environment; options that `make_world` does not know are for the environment."""
+    kwargs = {name: options.pop(name) for name in options.keys() - signature(make_world).parameters}
+    gamma = options.get("gamma", KEYWORDS["gamma"])
+    source = EnvSource.of(env, kwargs=kwargs, gamma=gamma, actions_per_dimension=actions_per_dimension)
+    return make_world(source, **KEYWORDS | options)
 
 
 def refusal_of(env: Any, **options: Any) -> str:

@@ -137,7 +137,7 @@ def test_an_evaluation_is_the_mean_of_its_episodes_with_the_interval_of_student(
 def test_an_evaluation_without_a_time_limit_ends_at_our_own(monkeypatch):
     monkeypatch.setattr("pgts_torch.agent.evaluate.UNLIMITED_LENGTH", 30)
     model = PGTS("CliffWalking-v1", depth=0, num_envs=2, seed=0)
-    assert model.time_limit is None
+    assert model.source.time_limit is None
     assert evaluate(model, episodes=2, deterministic=True).episodic_length.mean == 30
 
 
@@ -152,7 +152,7 @@ def test_an_environment_given_as_an_object_is_evaluated_in_copies_of_its_own():
     ]
     lengths = [evaluate(PGTS(env, depth=0, num_envs=2), episodes=3).episodic_length.mean for env in given]
     assert lengths == [100.0] * 3  # always left, until the time limit
-    with pytest.raises(PgtsError, match="copies that cannot be made again; give a SyncVectorEnv or an id"):
+    with pytest.raises(PgtsError, match="VectorEnv of which no others can be made; give a SyncVectorEnv or an id"):
         evaluate(PGTS(copies(short_lake().mdp, 2)), episodes=2)
 
 

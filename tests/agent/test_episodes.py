@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrap
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Horizon, Rollout, rollout
+from pgts_torch.models.environments import EnvSource
 from pgts_torch.seeding import stream
 
 
@@ -42,7 +43,7 @@ def copies(kind: type[SyncVectorEnv] = SyncVectorEnv) -> SyncVectorEnv:
 
 
 def made(env: VectorEnv, horizon: Horizon = FixedHorizon(100)) -> Rollout:  # noqa: B008 - frozen
-    world = make_world(env, num_envs=6, gamma=0.9, observation_key=None, plain=True, device="cpu")
+    world = make_world(EnvSource.of(env), num_envs=6, gamma=0.9, observation_key=None, plain=True, device="cpu")
     policy = NetworkPolicy(world.observation_space, 2, seed=1)
     return rollout(world, policy, horizon, seed=0, names=("test",), generator=stream(0, "test"))
 

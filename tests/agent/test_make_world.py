@@ -1,6 +1,7 @@
-"""Which model an environment gets, and which it does not: tables, copies and instances."""
+"""Which model an environment gets, and which it does not: tables, environments and instances."""
 
 import functools
+import operator
 from typing import Any
 
 import gymnasium
@@ -10,10 +11,12 @@ from gymnasium import spaces
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
+from gymnasium.wrappers import TransformReward
 
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel
+from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.fidelity import check_model
 from pgts_torch.tabular import exact
 from tests.agent.cells import FIRST, Cells, N, Walk, agrees, heavier, refusal_of, row_of_cells, vector_of, world_of
@@ -183,7 +186,7 @@ def test_a_table_that_changes_from_episode_to_episode_is_contradicted():
     )
 
 
-# Copies and instances
+# Environments and instances
 
 
 class Longer(Walk):
@@ -196,7 +199,7 @@ def longer() -> gymnasium.Env:
     return env
 
 
-@pytest.mark.fault("copies of an environment that differ, or differ from the instance that was given")
+@pytest.mark.fault("environments that differ, or differ from the instance that was given")
 @pytest.mark.parametrize(
     ("make", "why"),
     [
@@ -204,17 +207,17 @@ def longer() -> gymnasium.Env:
         (lambda: functools.partial(FrozenLakeEnv, map_name=None), "each instance has its own P"),
         (
             lambda: vector_of(FrozenLakeEnv, lambda: FrozenLakeEnv(is_slippery=False)),
-            "copy 1 of FrozenLakeEnv has another P",
+            "environment 1 of FrozenLakeEnv has another P",
         ),
-        (lambda: vector_of(Walk, Longer), "the copies of Walk are of different classes"),
-        (lambda: vector_of(Walk, longer), "copy 1 of Walk has n = 7, where another instance has 5"),
+        (lambda: vector_of(Walk, Longer), "the environments of Walk are of different classes"),
+        (lambda: vector_of(Walk, longer), "environment 1 of Walk has n = 7, where another instance has 5"),
         (
             lambda: vector_of(lambda: gymnasium.make("CartPole-v1"), heavier),
-            r"copy 1 of CartPole-v1 has gravity = 20, where another instance has 9\.8",
+            r"environment 1 of CartPole-v1 has gravity = 20, where another instance has 9\.8",
         ),
     ],
 )
-def test_where_copies_differ_no_model_is_used(make, why):
+def test_where_environments_differ_no_model_is_used(make, why):
     assert why.replace("\\", "") in refusal_of(make())
 
 
@@ -228,6 +231,83 @@ def test_an_instance_that_was_changed_is_refused_by_the_attribute():
     steered: Any = gymnasium.make("CartPole-v1")
     steered.unwrapped.step = functools.partial(lambda step, action: step(1 - action), steered.unwrapped.step)
     assert "another step" in refusal_of(steered)
+
+
+class Aim(Walk):
+    """It is set in the first reset, and stays."""
+
+    metadata, render_mode = {"render_modes": ["ansi"], "render_fps": 4}, "ansi"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.aim: int | None = None
+        self.drawn = ""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.aim = 3 if self.aim is None else self.aim
+        return super().reset(seed=seed)
+
+    def render(self) -> Any:
+        self.drawn = "a picture"
+        return self.drawn
+
+
+gymnasium.register("Aim-v0", Aim)
+
+
+def aimed(env: Any) -> Any:
+    env.unwrapped.aim = 7
+    return env
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_what_only_the_first_reset_sets_is_an_attribute_that_may_differ(num_envs):
+    assert isinstance(world_of(gymnasium.make("Aim-v0"), num_envs=num_envs), SimulatedWorld)
+    assert "given as an instance with aim = 7, where another instance has 3" in refusal_of(
+        aimed(gymnasium.make("Aim-v0")), num_envs=num_envs
+    )
+    envs: Any = vector_of(*[lambda: aimed(Aim())] * num_envs)
+    assert isinstance(world_of(envs), SimulatedWorld)
+    envs = vector_of(*[Aim] * num_envs)
+    aimed(envs.envs[-1])
+    assert f"environment {num_envs - 1} of Aim has aim = 7, where another instance has 3" in refusal_of(envs)
+
+
+def test_others_than_the_environments_that_were_given_are_not_evaluated_in():
+    envs: Any = vector_of(Aim, lambda: aimed(Aim()))
+    source = EnvSource.of(envs)
+    assert [env.aim for env in source.make(4).envs] == [None, 7, None, 7]  # type: ignore[attr-defined]
+    envs.reset(seed=0)
+    envs.step(np.zeros(2, dtype=int))
+    source.make(4)
+    envs.envs[0].aim = 5
+    with pytest.raises(PgtsError, match="environment 0 of Aim has aim = 5, where another instance has 3: others come"):
+        source.make(4)
+
+
+def test_an_instance_that_was_rendered_or_is_in_an_episode_is_not_changed():
+    env = gymnasium.make("Aim-v0")
+    env.reset(seed=0)
+    env.step(0)
+    env.render()
+    assert isinstance(world_of(env), SimulatedWorld)
+
+
+def test_two_wrappers_of_a_kind_are_both_held_to_the_spec():
+    lake, louder = gymnasium.make("FrozenLake-v1"), functools.partial(operator.mul, 2)
+    for k in range(2):
+        env: Any = TransformReward(TransformReward(lake, louder), louder)
+        assert isinstance(world_of(env), TabularWorld)
+        (env if k else env.env).func = operator.neg
+        assert "func" in refusal_of(env)
+
+
+def test_a_function_that_gives_the_same_environment_again_is_refused():
+    env = gymnasium.make("CartPole-v1")
+    for num_envs in (1, 2):
+        refused = refusal_of(lambda: env, num_envs=num_envs)
+        assert "gave the same environment twice; the function that makes it must make a new one each time" in refused
+    assert "gave the same environment twice" in refusal_of(vector_of(lambda: env))
 
 
 def test_an_instance_that_was_only_used_is_not_changed_and_a_function_may_change_what_it_makes():

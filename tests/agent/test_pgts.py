@@ -274,12 +274,12 @@ def test_an_environment_without_a_model_is_refused_with_what_is_missing():
         ({"seed": -1}, "seed is -1"),
         ({"seed": None}, "seed is None; it must be a whole number"),
         ({"device": "auto"}, "device is 'auto', where torch cannot compute: Expected one of cpu"),
-        ({"num_envs": 0}, "num_envs is 0; it must be at least 1"),
+        ({"num_envs": 0}, "num_envs is 0; it must be a whole number of at least 1"),
         ({"env_kwargs": {"length": 3}}, "no argument 'length'"),
         ({"env": "pgts/Nowhere-v0"}, "pgts/Nowhere-v0 cannot be made"),
         ({"horizon": 3}, "horizon is 3"),
         ({"critic": 3}, "critic is 3"),
-        ({"env": copies(ladder(), 2), "gamma": 0.5}, "gamma is 0.5; the given environment has its own, 0.9"),
+        ({"env": copies(ladder(), 2), "gamma": 0.5}, "gamma is 0.5; the environment has its own, 0.9"),
         ({"env": copies(ladder(), 2), "env_kwargs": {"n": 3}}, "takes none"),
     ],
 )
@@ -316,8 +316,8 @@ def test_parts_may_be_given_as_objects():
     )
     assert model.iterate().depth == 4
     assert model.update == SoftmaxUpdate(0.2)
-    with pytest.raises(PgtsError, match="was given as copies that cannot be made again"):
-        model.make_copies(2)
+    with pytest.raises(PgtsError, match="was given as a VectorEnv of which no others can be made"):
+        model.source.make(2)
 
 
 def test_the_defaults_update_every_kind_of_policy():

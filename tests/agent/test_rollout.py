@@ -5,7 +5,6 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
 
-from pgts_torch.agent.copies import check_vector_env, make_vector_env
 from pgts_torch.agent.rollout import (
     FixedHorizon,
     GeometricHorizon,
@@ -16,6 +15,7 @@ from pgts_torch.bellman import Outcomes
 from pgts_torch.envs import TabularVectorEnv
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import TabularModel
+from pgts_torch.models.environments import EnvSource, check_vector_env
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder
 from tests.agent.helpers import (
@@ -203,7 +203,7 @@ def test_episodes_go_on_exactly_until_a_terminal_outcome_or_the_horizon(name, ho
 
 @pytest.mark.parametrize("name", ["FrozenLake-v1", "CliffWalking-v1", "Taxi-v4"])
 def test_rollouts_of_gymnasiums_environments_are_transitions_of_their_tables(name):
-    env = make_vector_env(name, 8, gamma=0.9)
+    env = EnvSource.of(name).make(8)
     assert isinstance(env, SyncVectorEnv)
     check_vector_env(env)
     mdp = TabularMDP.from_gymnasium(env.envs[0], 0.9)
@@ -229,7 +229,7 @@ def test_rollouts_of_gymnasiums_environments_are_transitions_of_their_tables(nam
 @pytest.mark.parametrize("name", ["pgts/Ladder-v0", "pgts/Grid-v0", "pgts/DeepSea-v0", "pgts/Random-v0"])
 def test_our_environments_make_the_same_kind_of_rollout_together_and_one_by_one(name):
     mdp = gymnasium.make(name).unwrapped.mdp
-    together = make_vector_env(name, 3, gamma=None)
+    together = EnvSource.of(name).make(3)
     assert isinstance(together, TabularVectorEnv)
     single = gymnasium.make_vec(
         name, 3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED}
@@ -253,13 +253,13 @@ def test_the_environments_own_discount_goes_before_the_given_one():
     assert TabularVectorEnv(ladder(gamma=0.7), 1).mdp.outcomes.discount_NAK.unique().tolist() == [0.7]
     made = experience(ladder(gamma=0.7), uniform_policy(ladder()), FixedHorizon(3), episodes=4, gamma=0.2)
     assert made.discount_TB.unique().tolist() == [0.7]
-    assert make_vector_env("pgts/Ladder-v0", 2, gamma=0.6).mdp.outcomes.discount_NAK.unique().tolist() == [0.6]
-    assert make_vector_env("pgts/Ladder-v0", 2, gamma=None).mdp.outcomes.discount_NAK.unique().tolist() == [0.9]
+    assert EnvSource.of("pgts/Ladder-v0", gamma=0.6).make(2).mdp.outcomes.discount_NAK.unique().tolist() == [0.6]
+    assert EnvSource.of("pgts/Ladder-v0").make(2).mdp.outcomes.discount_NAK.unique().tolist() == [0.9]
 
 
 @pytest.mark.parametrize("name", ["pgts/Ladder-v0", "FrozenLake-v1"])
 def test_a_time_limit_cuts_an_episode_without_terminating_it(name):
-    env = make_vector_env(name, 50, gamma=0.9, max_episode_steps=4)
+    env = EnvSource.of(name, gamma=0.9, kwargs={"max_episode_steps": 4}).make(50)
     num_states, num_actions = env.single_observation_space.n, env.single_action_space.n
     made = made_in(
         env,
@@ -275,7 +275,7 @@ def test_a_time_limit_cuts_an_episode_without_terminating_it(name):
     assert made.alive_TB[4:].sum() == 0
     assert (made.discount_TB[3, cut_B] == 0.9).all()
     assert (made.survival_TB[3, cut_B] == 0.9).all()
-    assert make_vector_env(name, 2, gamma=0.9).reset(seed=[0, 1])[0].shape == (2,)
+    assert EnvSource.of(name, gamma=0.9).make(2).reset(seed=[0, 1])[0].shape == (2,)
 
 
 def test_a_copy_that_is_cut_earlier_than_the_others_counts_no_longer():
@@ -301,7 +301,7 @@ def test_a_copy_that_is_cut_earlier_than_the_others_counts_no_longer():
 
 def test_without_being_asked_an_environment_has_no_time_limit_but_ours():
     for name in ("pgts/Ladder-v0", "FrozenLake-v1"):
-        env = make_vector_env(name, 1, gamma=0.9, **({"is_slippery": False} if name == "FrozenLake-v1" else {}))
+        env = EnvSource.of(name, gamma=0.9, kwargs={"is_slippery": False} if name == "FrozenLake-v1" else {}).make(1)
         num_states, num_actions = int(env.single_observation_space.n), int(env.single_action_space.n)
         left_SA = torch.eye(num_actions, dtype=torch.float64)[0].repeat(num_states, 1)
         made = made_in(
@@ -319,7 +319,7 @@ def test_without_being_asked_an_environment_has_no_time_limit_but_ours():
 @pytest.mark.parametrize("name", ["pgts/Random-v0", "FrozenLake-v1"])
 @pytest.mark.parametrize("horizon", [FixedHorizon(20), GeometricHorizon()])
 def test_the_same_seed_and_names_give_the_same_rollout_whatever_was_before(name, horizon):
-    env = make_vector_env(name, 4, gamma=0.9)
+    env = EnvSource.of(name, gamma=0.9).make(4)
     pi_SA = torch.full((env.single_observation_space.n, env.single_action_space.n), 1.0, dtype=torch.float64)
     policy = following(pi_SA / pi_SA.sum(-1, keepdim=True))
 
@@ -375,11 +375,9 @@ def test_actions_that_are_not_counted_from_0_are_refused():
         single_action_space = gymnasium.spaces.Discrete(2, start=1)
 
     with pytest.raises(PgtsError, match=r"the actions of Pendulum-v1 are continuous, Box"):
-        check_vector_env(make_vector_env("Pendulum-v1", 2, gamma=None))
+        EnvSource.of("Pendulum-v1").make(2)
     with pytest.raises(PgtsError, match=r"are Discrete\(2, start=1\)"):
         check_vector_env(Shifted(copies(ladder(), 2)))
-    with pytest.raises(PgtsError, match="VectorEnv"):
-        check_vector_env(gymnasium.make("FrozenLake-v1"))
 
 
 @pytest.mark.fault("unknown environment", "deprecated environment")
@@ -396,11 +394,13 @@ def test_actions_that_are_not_counted_from_0_are_refused():
         ("FrozenLake-v1", 2, {"map_name": "none"}),
         ("FrozenLake-v1", 0, {}),
         ("pgts/Ladder-v0", -1, {}),
+        ("FrozenLake-v1", 1.5, {}),
+        ("pgts/Ladder-v0", True, {}),
     ],
 )
 def test_an_environment_that_cannot_be_made_is_one_clear_error(name, num_envs, kwargs):
     with pytest.raises(PgtsError, match=rf"{name}|num_envs is {num_envs}"):
-        make_vector_env(name, num_envs, gamma=None, **kwargs)
+        EnvSource.of(name, kwargs=kwargs).make(num_envs)
 
 
 @pytest.mark.fault("no time limit and no horizon")

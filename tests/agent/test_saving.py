@@ -12,11 +12,11 @@ import torch
 
 from pgts_torch import PGTS
 from pgts_torch.agent import saving
-from pgts_torch.agent.copies import make_vector_env
 from pgts_torch.agent.policies import SoftmaxPolicy
 from pgts_torch.agent.rollout import FixedHorizon
 from pgts_torch.agent.updates import SoftmaxUpdate
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.environments import EnvSource
 from tests.agent.helpers import same_bits
 
 KINDS = {
@@ -185,7 +185,7 @@ def test_other_files_and_no_file_are_refused_by_name(tmp_path):
 @pytest.mark.parametrize(
     "env",
     [
-        lambda: make_vector_env("pgts/Ladder-v0", 4, gamma=None),
+        lambda: EnvSource.of("pgts/Ladder-v0").make(4),
         lambda: gymnasium.make("FrozenLake-v1"),
         lambda: functools.partial(gymnasium.make, "FrozenLake-v1", is_slippery=False),
     ],

@@ -14,12 +14,12 @@ from torch import Tensor
 from pgts_torch import PGTS
 from pgts_torch.agent import make_world as worlds
 from pgts_torch.agent.build import make_policy
-from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.rollout import FixedHorizon, rollout
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel, with_torques
 from pgts_torch.seeding import draw_keys, seed_sequence, stream
+from tests.agent import cells
 from tests.agent.helpers import same_bits
 
 KEYWORDS = {"num_envs": 3, "gamma": None, "observation_key": None, "plain": False, "device": "cpu"}
@@ -73,10 +73,10 @@ def copies_of(make: Callable[[], gymnasium.Env], num_envs: int = 3) -> SyncVecto
     return SyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
 
 
-def world_of(env: str | VectorEnv, **options) -> ModelWorld:
+def world_of(env: object, **options) -> ModelWorld:
     if env == "Pendulum-v1":
-        options = {"wrappers": [with_torques]} | options
-    return make_world(env, **KEYWORDS | options)
+        env = lambda: with_torques(gymnasium.make("Pendulum-v1", max_episode_steps=-1))  # noqa: E731
+    return cells.world_of(env, **KEYWORDS | options)
 
 
 WORLDS = {
@@ -169,7 +169,9 @@ def test_changed_constants_are_honoured_and_must_be_the_same_in_all_copies():
     copies = world_of("CartPole-v1").env
     copies.envs[1].unwrapped.gravity = 1.6
     observation, _ = copies.reset(seed=0)
-    with pytest.raises(PgtsError, match=r"copy 1 of CartPole-v1 has gravity = 1\.6, where another instance has 9\.8"):
+    with pytest.raises(
+        PgtsError, match=r"environment 1 of CartPole-v1 has gravity = 1\.6, where another instance has 9\.8"
+    ):
         numbered(world_of(copies), observation)
 
 
@@ -199,7 +201,7 @@ def test_actions_are_those_of_the_copies_also_in_a_simulator():
         (lambda: world_of(3), "the environment is 3; it must be a Gymnasium id, an environment, a function"),
         (lambda: world_of(Cart()), "has no spec to make another instance from: give a function that makes one"),
         (lambda: world_of(SyncVectorEnv([Cart])), "the environment resets by"),
-        (lambda: make_world("Pendulum-v1", **KEYWORDS), "the actions of Pendulum-v1 are continuous, Box"),
+        (lambda: cells.world_of("Pendulum-v1"), "the actions of Pendulum-v1 are continuous, Box"),
         (lambda: world_of("CartPole-v1", num_envs=0), "num_envs is 0"),
         (lambda: world_of("NoSuch-v0"), "NoSuch-v0 cannot be made"),
     ],
@@ -212,7 +214,7 @@ def test_what_does_not_make_a_world_is_refused_by_name(make, message):
 def test_an_environment_that_cannot_be_restored_needs_a_model():
     with pytest.raises(MissingModel, match="give Unknown the methods get_state"):
         world_of(copies_of(Unknown))
-    with pytest.raises(MissingModel, match="a simulator needs a SyncVectorEnv of them"):
+    with pytest.raises(MissingModel, match="a simulator needs a SyncVectorEnv"):
         world_of(Together())
 
 
@@ -385,7 +387,7 @@ def test_cartpole_is_learned_with_a_lookahead_of_two_steps_and_not_without_train
 
     def mean_length() -> float:
         made = rollout(
-            model.world.of(model.make_copies(24)),
+            model.world.of(model.source.make(24)),
             model.policy,
             FixedHorizon(200),
             seed=1,
@@ -402,26 +404,26 @@ def test_cartpole_is_learned_with_a_lookahead_of_two_steps_and_not_without_train
 
 def test_rewards_that_a_wrapper_transforms_are_those_of_the_model():
     doubled = functools.partial(gymnasium.wrappers.TransformReward, func=lambda reward: 2 * reward)
-    cliff, usual = (make_world("CliffWalking-v1", **KEYWORDS, wrappers=given) for given in ([doubled], []))
+    cliff, usual = (world_of(make) for make in (lambda: doubled(gymnasium.make("CliffWalking-v1")), "CliffWalking-v1"))
     assert torch.equal(cliff.mdp.outcomes.reward_NA, 2 * usual.mdp.outcomes.reward_NA)
-    cart = make_world("CartPole-v1", **KEYWORDS, wrappers=[doubled])
+    cart = world_of(lambda: doubled(gymnasium.make("CartPole-v1")))
     observation, _ = cart.env.reset(seed=0)
     assert (cart.model.outcomes(numbered(cart, observation)).reward_NA == 2).all()
-    plain = make_world("CartPole-v1", **KEYWORDS | {"plain": True}, wrappers=[doubled])
+    plain = world_of(lambda: doubled(gymnasium.make("CartPole-v1")), plain=True)
     assert not isinstance(plain, ModelWorld)
 
 
 def test_a_model_is_refused_where_a_wrapper_repeats_actions_at_random():
     sticky = functools.partial(gymnasium.wrappers.StickyAction, repeat_action_probability=0.5)
     with pytest.raises(MissingModel, match="CartPole-v1 is wrapped in StickyAction"):
-        make_world("CartPole-v1", **KEYWORDS, wrappers=[sticky])
+        world_of(lambda: sticky(gymnasium.make("CartPole-v1")))
 
 
 @pytest.mark.parametrize("wrapper", [gymnasium.wrappers.NormalizeObservation, gymnasium.wrappers.NormalizeReward])
 def test_statistics_that_no_evaluation_would_share_are_refused(wrapper):
     mistake = f"CartPole-v1 is wrapped in {wrapper.__name__}, whose running statistics no evaluation shares"
     with pytest.raises(PgtsError, match=mistake):
-        make_world("CartPole-v1", **KEYWORDS | {"plain": True}, wrappers=[wrapper])
+        world_of(lambda: wrapper(gymnasium.make("CartPole-v1")), plain=True)
 
 
 def test_images_of_a_minigrid_are_learned_from_with_a_lookahead():

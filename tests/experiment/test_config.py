@@ -19,7 +19,6 @@ from torch import nn
 
 import pgts_torch  # noqa: F401  (registers the environments)
 from pgts_torch.agent import build
-from pgts_torch.agent.copies import make_vector_env
 from pgts_torch.agent.critics import TDLambda
 from pgts_torch.agent.networks import CNN, MLP
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
@@ -35,7 +34,7 @@ from pgts_torch.experiment.sections import (
     SearchConfig,
     TabularCriticConfig,
 )
-from pgts_torch.models.environments import make_env
+from pgts_torch.models.environments import EnvSource
 from pgts_torch.tabular import ladder
 from tests import reliability
 
@@ -410,7 +409,7 @@ def test_a_shipped_configuration_is_valid_and_says_what_it_shows(path: Path) -> 
     assert config.name == path.stem
     if config.env.id.startswith("MiniGrid-"):
         pytest.importorskip("minigrid", exc_type=ImportError)
-    made = make_env(config.env.id, **config.env.kwargs)
+    made = EnvSource.of(config.env.id, kwargs=config.env.kwargs).make_one()
     assert made.spec is not None
     assert made.spec.id == config.env.id
     made.close()
@@ -592,7 +591,7 @@ def _leaves(data: dict[str, Any], prefix: str = "") -> list[str]:
     return leaves
 
 
-NUMBERED = TabularWorld(make_vector_env("pgts/Ladder-v0", 1, gamma=None), ladder())
+NUMBERED = TabularWorld(EnvSource.of("pgts/Ladder-v0").make(1), ladder())
 PICTURED = SimpleNamespace(
     observation_space=spaces.Box(0, 255, (7, 7, 3), np.uint8), num_actions=2, device=torch.device("cpu")
 )

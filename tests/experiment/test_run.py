@@ -18,6 +18,7 @@ from pgts_torch.experiment.evaluate import last_checkpoint
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
+from pgts_torch.models.environments import EnvSource
 from pgts_torch.tabular import exact, stationary
 from pgts_torch.tabular.ascent import mirror_step
 
@@ -58,7 +59,7 @@ def few_iterations(folder: Path, *arguments: str, config: Path = ROOT / "configs
 @pytest.mark.usefixtures("unchecked_shapes")  # other tests check them; here they cost half the time
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
 def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(config, tmp_path, monkeypatch):
-    monkeypatch.setattr(PGTS, "time_limit", 15)
+    monkeypatch.setattr(EnvSource, "time_limit", 15)
     summary = run.train(few_iterations(tmp_path, config=config))
     folder = tmp_path / "run"
     lines = read_metrics(folder)

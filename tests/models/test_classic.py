@@ -12,8 +12,8 @@ from torch import Tensor
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import TensorModel
+from pgts_torch.models.actions import with_torques
 from pgts_torch.models.classic import CLASSIC, Acrobot, CartPole, MountainCar, Pendulum, dynamics_of
-from pgts_torch.models.environments import with_torques
 from pgts_torch.search import expectimax
 from pgts_torch.seeding import numpy_stream
 

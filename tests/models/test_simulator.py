@@ -14,7 +14,8 @@ from torch import Tensor
 
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel, TabularModel
-from pgts_torch.models.environments import all_actions, grid_actions, make_env, sampled_actions
+from pgts_torch.models.actions import all_actions, grid_actions, sampled_actions
+from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.snapshots import generator_state
 from pgts_torch.search import Topology, expectimax, sampled
 from pgts_torch.seeding import draw_keys, stream
@@ -120,7 +121,7 @@ def test_a_plan_over_sampled_outcomes_is_not_clairvoyant_while_one_outcome_each_
 def test_truncation_keeps_the_discount_and_termination_ends_it():
     pytest.importorskip("minigrid")
     model = SimulatorModel("MiniGrid-Empty-5x5-v0", gamma=0.9)
-    env = make_env("MiniGrid-Empty-5x5-v0")
+    env = EnvSource.of("MiniGrid-Empty-5x5-v0").make_one()
     env.reset(seed=0)
     env.unwrapped.step_count = env.unwrapped.max_steps - 1
     late = model.outcomes(model.roots([env]))
@@ -207,7 +208,7 @@ def test_observations_that_are_made_late_are_those_that_steps_give(id):
     pytest.importorskip("minigrid", exc_type=ImportError)
     model, env = (
         SimulatorModel(id, gamma=0.9, observe=lambda seen: np.append(seen["image"], seen["direction"])),
-        make_env(id),
+        EnvSource.of(id).make_one(),
     )
     observation, _ = env.reset(seed=3)
     base: Any = env.unwrapped
@@ -378,7 +379,7 @@ def test_what_a_state_showed_stays_when_the_environment_writes_into_it(make):
 def test_observe_decides_what_is_remembered():
     pytest.importorskip("minigrid")
     model = SimulatorModel("MiniGrid-Empty-5x5-v0", gamma=0.9, observe=lambda seen: seen["image"])
-    env = make_env("MiniGrid-Empty-5x5-v0")
+    env = EnvSource.of("MiniGrid-Empty-5x5-v0").make_one()
     observation, _ = env.reset(seed=0)
     model.outcomes(model.roots([env], [observation]))
     assert model.observations(torch.arange(3)).shape == (3, 7, 7, 3)
@@ -469,7 +470,7 @@ REFUSALS = {
     "per_dimension is 1": lambda: grid_actions(spaces.Box(0, 1, (2,)), 1),
     "per_dimension is 3; .* at most 10,000 actions in 9 dimensions": lambda: grid_actions(spaces.Box(0, 1, (9,)), 3),
     "count is 0": lambda: sampled_actions(spaces.Box(0, 1, (2,)), 0, seed=0),
-    "Nope-v0 cannot be made: Environment `Nope` doesn't exist": lambda: make_env("Nope-v0"),
+    "Nope-v0 cannot be made: Environment `Nope` doesn't exist": lambda: EnvSource.of("Nope-v0").make_one(),
     "CartPole-v1 is not the environment that the model was made from .FrozenLake-v1.": (
         lambda: slippery().root(reset(gymnasium.make("CartPole-v1"), 0))
     ),

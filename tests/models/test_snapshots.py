@@ -11,8 +11,9 @@ import pytest
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
 from pgts_torch.errors import MissingModel
+from pgts_torch.models.actions import all_actions, sampled_actions
 from pgts_torch.models.adapters import OwnState, ToyText, adapter_for
-from pgts_torch.models.environments import all_actions, make_env, sampled_actions
+from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.snapshots import SnapshotAdapter, generator_state, reseed
 from pgts_torch.seeding import numpy_stream
 from tests.models.corridors import Bare, Corridor, Forgetful, InBytes
@@ -50,7 +51,7 @@ KWARGS: dict[str, dict[str, Any]] = {
 def made(id: str) -> gymnasium.Env:
     if id in EXTRAS:
         pytest.importorskip(EXTRAS[id], exc_type=ImportError)
-    return make_env(id, **KWARGS.get(id, {}))
+    return EnvSource.of(id, kwargs=KWARGS.get(id, {})).make_one()
 
 
 def actions_of(env: gymnasium.Env) -> list[Any]:
@@ -212,7 +213,7 @@ def test_an_environment_without_an_adapter_is_told_what_to_implement():
 def test_an_emulator_whose_actions_stick_is_refused_with_the_remedy():
     pytest.importorskip("ale_py", exc_type=ImportError)
     with pytest.raises(MissingModel, match=r"stick with probability 0\.25.*repeat_action_probability=0$"):
-        adapter_for(make_env("ALE/Breakout-v5"))
+        adapter_for(EnvSource.of("ALE/Breakout-v5").make_one())
 
 
 def test_positions_and_velocities_alone_do_not_restore_ant():

@@ -9,12 +9,11 @@ from gymnasium.wrappers import TimeLimit
 
 from pgts_torch import PGTS
 from pgts_torch.agent.callbacks import EvalCallback
-from pgts_torch.agent.copies import make_vector_env
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import check_model
-from pgts_torch.models.environments import make_env
+from pgts_torch.models.environments import EnvSource
 from tests.agent.helpers import same_bits
 from tests.models.corridors import Corridor
 
@@ -99,7 +98,7 @@ def test_an_id_an_instance_a_spec_and_a_function_are_the_same_environment(env, k
     models = [PGTS(form, **SHORT) for form in forms]
     assert all(isinstance(model.world, kind) for model in models)
     first, *others = [model.iterate().experience for model in models]
-    if env != "pgts/Ladder-v0":  # its many copies draw their starts together
+    if env != "pgts/Ladder-v0":  # those that step together draw their starts together
         assert all(same_bits(first, other) for other in others)
     assert all(same_bits(others[0], other) for other in others)
     assert evaluate(models[1], episodes=2) == evaluate(models[2], episodes=2)
@@ -115,7 +114,9 @@ def test_the_instance_itself_is_not_acted_in():
 
 
 def test_an_id_that_names_its_module_is_imported_from_there(tmp_path, monkeypatch):
-    source = "import gymnasium\nfrom tests.agent.test_copies import Field\ngymnasium.register('Field-v0', Field)\n"
+    source = (
+        "import gymnasium\nfrom tests.agent import test_environments as own\ngymnasium.register('Field-v0', own.Field)"
+    )
     (tmp_path / "fields_of_mine.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
     model = PGTS("fields_of_mine:Field-v0", **SHORT, actions_per_dimension=2)
@@ -183,11 +184,11 @@ def test_more_combinations_than_a_policy_can_list_are_refused():
         PGTS(Panel, **SHORT)
 
 
-def test_copies_that_were_made_take_their_own_actions():
-    copies = make_vector_env("Pendulum-v1", 2, gamma=None, actions_per_dimension=3)
-    assert PGTS(copies, **SHORT).iterate().look.q_BA.shape[-1] == 3
+def test_environments_that_were_made_take_their_own_actions():
+    envs = EnvSource.of("Pendulum-v1", actions_per_dimension=3).make(2)
+    assert PGTS(envs, **SHORT).iterate().look.q_BA.shape[-1] == 3
     with pytest.raises(PgtsError, match="actions_per_dimension is 3; a VectorEnv takes its own actions"):
-        PGTS(copies, **SHORT, actions_per_dimension=3)
+        PGTS(envs, **SHORT, actions_per_dimension=3)
 
 
 class Unbuilt(Field):
@@ -202,7 +203,7 @@ def test_an_environment_that_raises_while_it_is_made_is_named():
         PGTS(Unbuilt, **SHORT)
     gymnasium.register("Unbuilt-v0", Unbuilt)
     try:
-        for make in (lambda: PGTS("Unbuilt-v0", **SHORT), lambda: check_model(lambda: make_env("Unbuilt-v0"))):
+        for make in (lambda: PGTS("Unbuilt-v0", **SHORT), lambda: check_model("Unbuilt-v0")):
             with pytest.raises(PgtsError, match=r"^Unbuilt-v0 cannot be made: RuntimeError: no licence"):
                 make()
     finally:
@@ -211,6 +212,6 @@ def test_an_environment_that_raises_while_it_is_made_is_named():
 
 def test_a_time_limit_around_an_environment_of_ones_own_is_that_of_its_evaluation():
     model = PGTS(lambda: TimeLimit(Field(), 1200), **SHORT, actions_per_dimension=2)
-    assert model.time_limit == 1200
+    assert model.source.time_limit == 1200
     assert evaluate(model, episodes=1).episodic_length.mean == 1200
-    assert PGTS(Field, **SHORT, actions_per_dimension=2).time_limit is None
+    assert PGTS(Field, **SHORT, actions_per_dimension=2).source.time_limit is None
