@@ -3,9 +3,11 @@
 An environment of your own comes first: see the head of `pgts_torch.models.snapshots`.
 """
 
+import inspect
 import pickle
 import struct
 import sys
+from collections.abc import Callable
 from typing import Any, Protocol, final, runtime_checkable
 
 import gymnasium
@@ -181,7 +183,7 @@ def adapter_for(env: gymnasium.Env) -> SnapshotAdapter:
         MissingModel: it has neither; the message says what to implement.
     """
     base = env.unwrapped
-    if isinstance(base, Restorable):
+    if isinstance(base, Restorable) and _takes_one(base.set_state):
         return OwnState()
     for (module, name), make in ADAPTERS.items():
         if module in sys.modules and isinstance(base, getattr(sys.modules[module], name)):
@@ -194,7 +196,20 @@ def adapter_for(env: gymnasium.Env) -> SnapshotAdapter:
 
 def methods_for(base: Any) -> str:
     """What to write, in the words of a refusal."""
-    return (
+    words = (
         f"give {type(base).__name__} the methods get_state(self), which returns all that step reads or changes except "
         "self.np_random (bytes, or what pickles), and set_state(self, state), which puts it back"
     )
+    present = getattr(base, "set_state", None)
+    if callable(present) and not _takes_one(present):
+        words += f"; calls of the present set_state{inspect.signature(present)} must go on to super()"
+    return words
+
+
+def _takes_one(method: Callable[..., Any]) -> bool:
+    """Whether a method can be called with one argument; `set_state` of MuJoCo's environments takes two."""
+    try:
+        inspect.signature(method).bind(None)
+    except TypeError:
+        return False
+    return True

@@ -190,10 +190,12 @@ _LEFT_BEHIND = (
 @final
 class Mujoco(SnapshotAdapter):
     """MuJoCo: its integration state, which decides what the physics does next, and what the last step left behind,
-    from which environments read where the bodies were."""
+    from which environments read where the bodies were.
+
+    Reacher and Pusher keep beside it what their reset drew, which the positions hold too."""
 
     name = "MuJoCo"
-    restored = frozenset({"model", "data", "mujoco_renderer"})
+    restored = frozenset({"data", "mujoco_renderer", "goal", "goal_pos", "cylinder_pos", "init_qpos"})
 
     def get_state(self, env: Any) -> Snapshot:
         import mujoco

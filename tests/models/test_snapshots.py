@@ -38,6 +38,8 @@ EXTRAS = {
     "ALE/Breakout-v5": "ale_py",
     "ALE/Pong-v5": "ale_py",
     "InvertedPendulum-v5": "mujoco",
+    "Reacher-v5": "mujoco",
+    "Pusher-v5": "mujoco",
     "Ant-v5": "mujoco",
     "Humanoid-v5": "mujoco",
 }
