@@ -69,17 +69,19 @@ def row(task: Task, form: str, outcomes: list[Outcome]) -> str:
     )
 
 
-def lines(seeds: list[int], *, short: bool) -> Iterator[str]:
+def lines(seeds: list[int], *, short: bool, only: list[str]) -> Iterator[str]:
     yield "| environment | default | learned | steps: median (range) | greedy return: median (range) |"
     yield "|---|---|---|---|---|"
     most = 2 * EVERY if short else MOST_STEPS
     for form, options in FORMS.items():
         made = seeds[:BEFORE_SEEDS] if form == "before" else seeds
         for task in TASKS:
+            if only and not task.env_id.startswith(tuple(only)):
+                continue
             yield row(task, form, [trained(task, options, seed, most) for seed in made])
 
 
-def table(seeds: list[int], *, short: bool) -> None:
-    """Print the table, a line as soon as it is known. Short: two seeds, few steps."""
-    for line in lines(seeds, short=short):
+def table(seeds: list[int], *, short: bool, only: list[str]) -> None:
+    """Print the table, a line as soon as it is known. Short: two seeds, few steps. Only: see `defaults_tables`."""
+    for line in lines(seeds, short=short, only=only):
         print(line, flush=True)

@@ -6,7 +6,7 @@ were, a softmax gradient step of 0.1 weighted by the occupancy, episodes of 50 s
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from pgts_torch import PGTS
@@ -26,16 +26,19 @@ BEFORE_SEEDS = 3
 
 @dataclass(frozen=True)
 class Task:
-    """An environment, and how many steps it gets."""
+    """An environment, how many steps it gets, at which depths, and what is searched by."""
 
     name: str
     id: str
     kwargs: dict[str, Any]
     steps: int = 50_000
+    depths: tuple[int | Literal["adaptive"], ...] = DEPTHS
+    search: dict[str, Any] | Literal["auto"] = "auto"
 
 
 TASKS = (
     Task("FrozenLake 4x4", "FrozenLake-v1", {}),
+    Task("FrozenLake 4x4, 4 samples", "FrozenLake-v1", {}, depths=(4, 16), search={"type": "sampled", "samples": 4}),
     Task("FrozenLake 8x8", "FrozenLake8x8-v1", {}),
     Task("CliffWalking", "CliffWalking-v1", {}),
     Task("CliffWalking, slippery", "CliffWalking-v1", {"is_slippery": True}),
@@ -49,7 +52,7 @@ TASKS = (
 
 def share(task: Task, depth: int | Literal["adaptive"], seed: int, options: dict[str, Any]) -> float:
     """(J - J_uniform) / (J* - J_uniform) after training."""
-    model = PGTS(task.id, depth=depth, gamma=GAMMA, seed=seed, env_kwargs=task.kwargs, **options)
+    model = PGTS(task.id, depth=depth, gamma=GAMMA, seed=seed, env_kwargs=task.kwargs, search=task.search, **options)
     uniform = exact.evaluate(model.mdp, model.policy_table()).J
     model.learn(task.steps)
     return (exact.evaluate(model.mdp, model.policy_table()).J - uniform) / (exact.optimal(model.mdp).J - uniform)
@@ -61,14 +64,20 @@ def shown(shares: Sequence[float]) -> str:
     return f"{enough} of {len(shares)} ({statistics.median(shares):.3f}, {min(shares):.3f})"
 
 
-def table(seeds: Sequence[int], *, short: bool = False) -> None:
-    """Print the table in Markdown, row by row; short: two problems at depth 16, and a fifth of the steps."""
+def table(seeds: Sequence[int], *, short: bool, only: Sequence[str]) -> None:
+    """Print the table in Markdown, row by row.
+
+    Args:
+        short: two problems at depth 16, and a fifth of the steps.
+        only: those problems whose names begin so.
+    """
     print(f"At least {ENOUGH:.0%} of the way from the uniform policy to J*: in how many seeds (median, least).\n")
     print("| problem | steps | depth | defaults before | defaults |")
     print("|---|---|---|---|---|", flush=True)
-    for task in (TASKS[0], TASKS[2]) if short else TASKS:
-        for depth in DEPTHS[:1] if short else DEPTHS:
-            made = Task(task.name, task.id, task.kwargs, task.steps // 5) if short else task
+    named = [task for task in TASKS if not only or task.name.startswith(tuple(only))]
+    for task in named[:3] if short else named:
+        for depth in task.depths[:1] if short else task.depths:
+            made = replace(task, steps=task.steps // 5) if short else task
             before = [share(made, depth, seed, BEFORE) for seed in seeds[:BEFORE_SEEDS]]
             now = [share(made, depth, seed, {}) for seed in seeds]
             print(f"| {made.name} | {made.steps:,} | {depth} | {shown(before)} | {shown(now)} |", flush=True)

@@ -9,6 +9,7 @@ from pgts_torch import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import TabularModel
 from pgts_torch.search import mcts
+from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact
 
 LEFT = {"type": "softmax", "init": {"type": "biased", "action": 0, "probability": 0.99}}
@@ -104,6 +105,21 @@ def test_samples_prove_nothing_but_a_narrow_search_does():
     missing = exact.optimal(mdp).J - exact.evaluate(mdp, PGTS("pgts/Ladder-v0", policy=LEFT).policy.table()).J
     assert missing <= full <= narrow < math.inf
     assert certificate("sampled") == math.inf
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("share", ["level", "search"])
+def test_training_knows_how_noisy_a_sampled_lookahead_is(share):
+    model = PGTS("FrozenLake-v1", depth=2, search={"type": "sampled", "samples": 4, "share": share}, seed=5)
+    assert model.iterate().noise > 0
+    v_S = torch.linspace(0, 1, 16, dtype=torch.float64)
+    looks = [
+        model.search(torch.arange(16), depth=2, v_leaf=lambda s: v_S[s], generator=stream(n, "noise"))
+        for n in range(200)
+    ]
+    spread = float(torch.stack([look.q_BA for look in looks]).var(0).mean().sqrt())
+    # Rather too large than too small, because what a level inherits varies with the samples and with what follows them.
+    assert 0.9 * spread < sum(look.noise for look in looks) / len(looks) < 1.5 * spread
 
 
 @pytest.mark.parametrize(
