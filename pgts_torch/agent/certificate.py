@@ -164,10 +164,11 @@ class Certificates:
         if self._search.topology is None:
             return Bound(math.inf, math.inf)
         visited_N, v_of_visited_N, occupancy_N = visited
+        both_N = torch.cat([state_N, visited_N])
 
         def tightened(upper: UpperBound) -> Tensor:
             upper.tighten(expansions)
-            return torch.cat([upper.at(state_N), upper.at(visited_N)])
+            return upper.at(both_N)
 
         upper_N, upper_of_visited_N = self._together(tightened).split([len(state_N), len(visited_N)])
         missing = float(occupancy_N.double() @ (upper_of_visited_N - v_of_visited_N.double()).abs())

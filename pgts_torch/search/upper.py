@@ -165,7 +165,8 @@ class UpperBound:
 
     def _grown(self, value_S: Float[Tensor, "S"]) -> Float[Tensor, "more"]:
         """With w for the states that the model has numbered since."""
-        return torch.nn.functional.pad(value_S, (0, self.topology.model.num_states - len(value_S)), value=self.w)
+        new = self.topology.model.num_states - len(value_S)
+        return torch.nn.functional.pad(value_S, (0, new), value=self.w) if new else value_S
 
 
 def _without_ends(state_X: Int[Tensor, "X"], outcomes: Outcomes) -> tuple[Int[Tensor, "kept"], Outcomes]:
