@@ -1,6 +1,6 @@
 """How many transitions a second do many copies of an environment make, against Gymnasium's loop over single ones?
 
-    python benchmarks/envs.py [--json PATH]
+    python benchmarks/envs.py [--json PATH] [--quick]
 
 One thread. Every figure is the median of several repeats; all forms take turns within each repeat, and the ratio is the
 median of theirs, so that a busy machine slows both sides alike. Uniformly random actions are drawn beforehand; copies
@@ -25,7 +25,7 @@ import pgts_torch
 NAMES = ("Ladder", "Tightrope", "Random", "Grid", "DeepSea")
 COPIES = (1, 64, 1024, 4096)
 SYNC_COPIES = 64
-REPEATS = 9
+REPEATS, QUICK_REPEATS = 9, 3
 SECONDS = 0.1
 """How long one repeat lasts, about."""
 
@@ -50,7 +50,7 @@ class Runner:
         return self.envs.num_envs * self.steps / (time.perf_counter() - begin)
 
 
-def measure(name: str) -> dict[str, Any]:
+def measure(name: str, repeats: int) -> dict[str, Any]:
     """Transitions a second of one environment: the fast form at each number of copies, Gymnasium's loop at one."""
     id, mode = f"pgts/{name}-v0", AutoresetMode.SAME_STEP
     fast = {copies: Runner(gymnasium.make_vec(id, num_envs=copies, autoreset_mode=mode)) for copies in COPIES}
@@ -59,7 +59,7 @@ def measure(name: str) -> dict[str, Any]:
     )
     rounds = [
         ({copies: runner.transitions_per_second() for copies, runner in fast.items()}, sync.transitions_per_second())
-        for _ in range(REPEATS)
+        for _ in range(repeats)
     ]
     return {
         "environment": id,
@@ -74,14 +74,16 @@ def measure(name: str) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="where to write the figures")
+    parser.add_argument("--quick", action="store_true", help="two environments, fewer repeats")
     args = parser.parse_args()
+    names, repeats = (NAMES[:2], QUICK_REPEATS) if args.quick else (NAMES, REPEATS)
     torch.set_num_threads(1)
     columns = [f"{copies} copies" for copies in COPIES]
     print(f"{'transitions / s':<18}" + "".join(f"{column:>14}" for column in columns), end="")
     print(f"{f'sync, {SYNC_COPIES}':>14}{f'ratio at {SYNC_COPIES}':>14}")
     results = []
-    for name in NAMES:
-        result = measure(name)
+    for name in names:
+        result = measure(name, repeats)
         results.append(result)
         rates = [*result["transitions_per_second"].values(), result["sync_transitions_per_second"]]
         print(f"{result['environment']:<18}" + "".join(f"{rate:>14,.0f}" for rate in rates), end="")
@@ -89,7 +91,7 @@ def main() -> None:
     if args.json:
         versions = {"python": platform.python_version(), "numpy": np.__version__, "gymnasium": gymnasium.__version__}
         versions["pgts_torch"] = pgts_torch.__version__
-        report = {"threads": 1, "repeats": REPEATS, "versions": versions, "results": results}
+        report = {"threads": 1, "repeats": repeats, "versions": versions, "results": results}
         args.json.write_text(json.dumps(report, indent=2) + "\n")
 
 
