@@ -15,6 +15,7 @@ from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import ModelWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.search.engine import Search
+from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.search.upper import UpperBound
 
 Trust = Literal["proved", "critic", "drawn starts"]
@@ -37,11 +38,12 @@ class Bound(NamedTuple):
 
 
 class _Starts(NamedTuple):
-    """Start states, the share of each, and v there; None: v is unknown at some of them."""
+    """Start states, the share of each, v there (None: v is unknown at some of them), and the episodes they are of."""
 
     state_N: Int[Tensor, "N"]
     share_N: Float[Tensor, "N"]
     v_N: Float[Tensor, "N"] | None
+    num_episodes: int
 
 
 @final
@@ -127,28 +129,26 @@ class Certificates:
             experience: whose starts count where no others are known.
             state_N, v_N: the visited states, ascending, and v there by the lookahead of depth 0.
         """
-        start_S = self._world.start_S
+        start_S, num_episodes = self._world.start_S, experience.num_episodes
         if start_S is None:
             starts, count_N = experience.state_TB[0].unique(return_counts=True)
             v_of_starts = v_N[torch.searchsorted(state_N, starts)]
-            return _Starts(starts, count_N.double() / experience.num_episodes, v_of_starts.double())
+            return _Starts(starts, count_N.double() / num_episodes, v_of_starts.double(), num_episodes)
         starts = torch.nonzero(start_S).flatten()
         if not self._critic.draws_when_asked:
             v_of_starts = self._critic.v(self._world.observe(starts))
         elif bool(torch.isin(starts, state_N).all()):
             v_of_starts = v_N[torch.searchsorted(state_N, starts)]
         else:
-            return _Starts(starts, start_S[starts], None)
-        return _Starts(starts, start_S[starts], v_of_starts.double())
+            return _Starts(starts, start_S[starts], None, num_episodes)
+        return _Starts(starts, start_S[starts], v_of_starts.double(), num_episodes)
 
     def bound(
         self,
         starts: _Starts,
         visited: tuple[Int[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N"]],
-        *,
-        expansions: int,
-        complete: bool,
-        experience: Rollout,
+        look: Lookahead,
+        depth: int,
         number: int,
     ) -> Bound:
         """What is missing at most, after a lookahead.
@@ -156,13 +156,14 @@ class Certificates:
         Args:
             starts: see `starts`.
             visited: the visited states, v there, and their occupancy.
-            expansions: n, how many levels it has expanded.
-            complete: whether it has left out no node of them.
+            look: the lookahead.
+            depth: m, of which it is; so n is m, or m + 1 where the critic learns v.
             number: of the iteration, from 1.
         """
-        state_N, share_N, v_N = starts
+        state_N, share_N, v_N, num_episodes = starts
         if self._search.topology is None:
             return Bound(math.inf, math.inf)
+        expansions = depth + (self._critic.target == "v")
         visited_N, v_of_visited_N, occupancy_N = visited
         both_N = torch.cat([state_N, visited_N])
 
@@ -178,8 +179,9 @@ class Certificates:
             return Bound(self._over_all(share_N, upper_N, v_N), missing)
         estimate = float(share_N @ (upper_N - v_N).abs())
         span = self._search.model.highest_value - self._search.model.lowest_value
-        width = self.width(experience.num_episodes, number)
-        if not (complete and estimate + width < span):  # T^n w is no smaller than v_hat
+        width = self.width(num_episodes, number)
+        is_complete = float(look.pruned_BA.max()) == 0
+        if not (is_complete and estimate + width < span):  # T^n w is no smaller than v_hat
             return Bound(math.inf, missing)
         swept_N = self._together(lambda upper: upper.swept(state_N, expansions))
         certificate = float(share_N @ (swept_N - v_N).abs()) + width

@@ -26,6 +26,7 @@ class PolicyBatch:
         proof only if the start distribution is known, the critic exact and the model the environment; else it holds as
         far as the critic is right at the start states, and with 95 % where these are drawn. Infinite where nothing can
         be said: no largest value is known, the search is a sampled one, or too few starts were drawn.
+    is_enough: whether the certificate is at most `stop_at`: then pi_k stays as it is, and the training ends.
     noise: root mean square of the standard errors of a sampled lookahead, in reward units; 0 where nothing was sampled
         or nothing is known of it.
     """
@@ -39,6 +40,7 @@ class PolicyBatch:
     look: Lookahead | None
     gap_N: Float[Tensor, "N"]
     certificate: float
+    is_enough: bool
     noise: float
 
 

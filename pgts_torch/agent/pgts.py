@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self, final
+from typing import Any, Literal, Self, final
 
 import numpy as np
 import torch
@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from tqdm import tqdm
 
-from pgts_torch.agent import saving
-from pgts_torch.agent.advantages import LookaheadAdvantages, SampledAdvantages, score_function
+from pgts_torch.agent import saved, saving
+from pgts_torch.agent.advantages import SampledAdvantages
 from pgts_torch.agent.build import (
     DEFAULT_TOLERANCE,
     Description,
@@ -31,38 +31,28 @@ from pgts_torch.agent.build import (
 )
 from pgts_torch.agent.certificate import Certificates
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.iteration import Iteration, PolicyBatch
+from pgts_torch.agent.depth import DepthChoice
+from pgts_torch.agent.estimators import Estimator, LookaheadEstimator, SampledEstimator
+from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.model_check import Mode, ModelCheck
 from pgts_torch.agent.policies import Policy, listed
-from pgts_torch.agent.ranks import checksum, present_ranks
-from pgts_torch.agent.rollout import Horizon, Rollout, rollout
-from pgts_torch.agent.sharing import whole_lookahead, whole_rollout
-from pgts_torch.agent.states import NO_STATE, check_keys, take_over
+from pgts_torch.agent.policy_lookahead import PolicyLookahead
+from pgts_torch.agent.ranks import present_ranks
+from pgts_torch.agent.rollout import Horizon
 from pgts_torch.agent.updates import Update
+from pgts_torch.agent.visit import visit
 from pgts_torch.agent.world import ModelWorld
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.search.engine import Search
-from pgts_torch.search.lookahead import Leaf, Lookahead, check_finite
+from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.seeding import SharedGenerators, stream
-from pgts_torch.tabular.ascent import centred
 from pgts_torch.tabular.mdp import TabularMDP
-from pgts_torch.trust import check_imports
 
 Callback = Callable[["PGTS", Iteration], bool | None]
 """Called after each iteration; returning False ends the training. `agent.callbacks` has some."""
-
-_ROUNDINGS = 16
-"""So many roundings of the largest lookahead value make a difference that means nothing."""
-
-
-class _Draws(NamedTuple):
-    """What an iteration draws from: for its own part of the work, and for what all processes do alike."""
-
-    own: torch.Generator
-    common: torch.Generator
 
 
 @final
@@ -151,14 +141,12 @@ class PGTS:
         self._arguments = {
             name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()
         }
-        self.depths = make_depths(depth, max_depth, tolerance)
-        self.tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
+        depths = make_depths(depth, max_depth, tolerance)
         if stop_at is not None and not 0 <= stop_at < math.inf:
             raise PgtsError(f"stop_at is {stop_at}; it must be finite and at least 0")
-        self.stop_at = stop_at
         self.seed = seed
         self.device = make_device(device)
-        self.estimator = make_estimator(estimator)
+        chosen = make_estimator(estimator)
         self.ranks = present_ranks()
         num_envs = self._arguments["num_envs"]
         check_count("num_envs", num_envs)
@@ -171,7 +159,7 @@ class PGTS:
                 num_envs=self.ranks.count(num_envs),
                 gamma=gamma,
                 observation_key=observation_key,
-                plain=isinstance(self.estimator, SampledAdvantages),
+                plain=isinstance(chosen, SampledAdvantages),
                 action_repeat=action_repeat,
                 device=device,
             )
@@ -181,28 +169,34 @@ class PGTS:
         if not isinstance(policy, Policy):
             policy = make_policy(policy, self.world, seed=seed)
         if not isinstance(critic, Critic):
-            critic = make_critic(critic, self.world, policy, self.estimator, seed=seed)
+            critic = make_critic(critic, self.world, policy, chosen, seed=seed)
         if not isinstance(update, Update):
-            update = make_update(update, policy, self.estimator)
+            update = make_update(update, policy, chosen)
         if not isinstance(horizon, Horizon):
             horizon = make_horizon(horizon)
         self.policy, self.critic, self.update, self.horizon = policy, critic, update, horizon
         self.search: Search | None = None
-        if isinstance(self.estimator, LookaheadAdvantages):
-            self.search = make_search(search, self.world)
         self.certificates: Certificates | None = None
-        if self.search is not None:
+        self.depth_choice: DepthChoice | None = None
+        if isinstance(chosen, SampledAdvantages):
+            self.estimator: Estimator = SampledEstimator(policy, critic, chosen.lambda_, update.state_weight)
+        else:
             assert isinstance(self.world, ModelWorld)
-            self.certificates = Certificates(
-                self.world, self.search, self.critic, num_depths=len(self.depths), ranks=self.ranks
-            )
+            self.search = make_search(search, self.world)
+            self.certificates = Certificates(self.world, self.search, critic, num_depths=len(depths), ranks=self.ranks)
             if stop_at is not None:
                 self.certificates.check(f"stop_at is {stop_at}")
             if depth == "adaptive":
                 self.certificates.check("depth is adaptive")
+            look = PolicyLookahead(self.world, policy, critic, self.search, self.ranks)
+            tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
+            self.depth_choice = DepthChoice(
+                look, self.certificates, depths=depths, tolerance=tolerance, stop_at=stop_at
+            )
+            self.estimator = LookaheadEstimator(look, self.depth_choice, update.state_weight)
         is_asked = self.search is not None
         self.model_check = ModelCheck(self.world, mode=model_check, is_asked=is_asked, seed=seed, ranks=self.ranks)
-        check_parts(self._arguments, self.world, self.policy, self.critic, self.update, self.estimator)
+        check_parts(self._arguments, self.world, policy, critic, update, chosen)
         self._own_actions = self.source.own_actions(self.world.env)
         self._predicting = stream(seed, "predict", device=self.device)
         self.num_iterations = 0
@@ -213,108 +207,44 @@ class PGTS:
     @torch.enable_grad()
     def iterate(self) -> Iteration:
         """One pass through the loop: visit states, estimate Q^pi, look m steps ahead, move pi.        [PGTS Alg. 1]"""
-        draws = self._draws()
+        draws = self.ranks.draws(self.seed, self.num_iterations, self.device)
         calls_before = self._model_calls()
 
-        # Visit states with pi_k and estimate Q^{pi_k} (line 2).
-        numbers_anew = isinstance(self.world, ModelWorld) and self.world.forget()
-        experience = whole_rollout(self.ranks, self.world, lambda: self._visit(draws.own))
-        if numbers_anew and self.search is not None:
-            self.search.reset()
-        taken = self._taken(experience)
+        # Visit states with pi_k.
+        experience = visit(self.world, self.policy, self.horizon, draws, self.ranks)
+
+        # The advantages of actions taken, if these are wanted, stand on the critic before it learns from them.
+        batch = self.estimator(experience, draws) if self.estimator.comes_first else None
+
+        # Evaluate pi_k: estimate Q^{pi_k} (line 2).
         fitting = draws.own if self.critic.draws_when_asked else draws.common
         losses = self.critic.fit(self.policy, experience, generator=fitting)
 
         # Look m steps ahead from the states with d(s) > 0.
-        seen = taken or self._look(experience)
+        batch = batch or self.estimator(experience, draws)
 
-        # What happened is held to what the model says, before pi learns from either.
+        # Hold what happened to what the model says, before pi learns from either.
         self.model_check(experience, self.num_iterations)
 
-        # pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is good enough.
-        if not self._is_enough(seen.certificate):
+        # Update: pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is good enough.
+        if not batch.is_enough:
             losses |= self.update(
                 self.policy,
-                seen.observation_N,
-                seen.advantage_NA,
-                seen.weight_N,
+                batch.observation_N,
+                batch.advantage_NA,
+                batch.weight_N,
                 generator=draws.common,
-                noise=seen.noise,
+                noise=batch.noise,
             )
 
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
-        model_calls = self._agreed(self._model_calls() - calls_before)
+        model_calls = self.ranks.total(self._model_calls() - calls_before, self.policy.state_dict())
         self.num_model_calls += model_calls
-        return Iteration(**vars(seen), experience=experience, losses=losses, model_calls=model_calls)
-
-    def _visit(self, generator: torch.Generator) -> Rollout:
-        """The episodes of this process."""
-        names = ("iteration", self.num_iterations, *self.ranks.names)
-        return rollout(self.world, self.policy, self.horizon, seed=self.seed, names=names, generator=generator)
-
-    def _draws(self) -> _Draws:
-        """One stream where this process is alone."""
-        own = self._stream(*self.ranks.names)
-        return _Draws(own, own if self.ranks.size == 1 else self._stream("common"))
-
-    def _agreed(self, model_calls: int) -> int:
-        """The model calls of all processes; PgtsError if these hold different policies."""
-        if self.ranks.size == 1:
-            return model_calls
-        told = self.ranks.gather("policies", lambda: (model_calls, checksum(self.policy.state_dict())))
-        if len({policy for _, policy in told}) > 1:
-            raise PgtsError("the ranks hold different policies: do they run on different hardware or versions?")
-        return sum(calls for calls, _ in told)
+        return Iteration(**vars(batch), experience=experience, losses=losses, model_calls=model_calls)
 
     def _model_calls(self) -> int:
         return (0 if self.search is None else self.search.model_calls) + self.critic.model_calls
-
-    def _look(self, experience: Rollout) -> PolicyBatch:
-        """The lookahead from the visited states, at the given depth or at the first that sees enough."""
-        states, weight_N = experience.visits(self.update.state_weight)
-        observation_N = experience.first_observation_N
-        pi_NA = self.policy.probs(observation_N)
-        shallow = self._look_together(states, 0)
-        v_N = (pi_NA * shallow.q_BA).sum(-1)
-        check_finite("value", "the policy's value", v_N, states)
-        _, occupancy_N = experience.visits("occupancy")
-        assert self.certificates is not None
-        starts = self.certificates.starts(experience, states, v_N)
-        for depth in self.depths:
-            look = self._look_together(states, depth) if depth else shallow
-            gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
-            bound, missing = self.certificates.bound(
-                starts,
-                (states, v_N, occupancy_N),
-                expansions=depth + (self.critic.target == "v"),
-                complete=float(look.pruned_BA.max()) == 0,
-                experience=experience,
-                number=self.num_iterations + 1,
-            )
-            if float(gap_N @ occupancy_N) > self.tolerance * missing or self._is_enough(bound):
-                break
-        advantage_NA = centred(look.q_BA, pi_NA, rounding=self._rounding(look))
-        return PolicyBatch(observation_N, states, weight_N, pi_NA, advantage_NA, depth, look, gap_N, bound, look.noise)
-
-    def _rounding(self, look: Lookahead) -> float:
-        """Differences of lookahead values that rounding explains, in reward units."""
-        eps = max(torch.finfo(dtype).eps for dtype in (look.q_BA.dtype, self.critic.dtype))
-        return _ROUNDINGS * eps * float(look.q_BA[look.q_BA.isfinite()].abs().amax())
-
-    def _taken(self, experience: Rollout) -> PolicyBatch | None:
-        """The advantages of the actions taken, by the critic as it was when they were; None where a lookahead is
-        asked for all actions instead."""
-        if not isinstance(self.estimator, SampledAdvantages):
-            return None
-        alive_TB = experience.alive_TB
-        observation_N = experience.observation_V
-        pi_NA = self.policy.probs(observation_N)
-        advantage_TB = self.estimator(experience, self.critic)
-        advantage_NA = score_function(experience.action_TB[alive_TB], advantage_TB[alive_TB], pi_NA)
-        weight_N = experience.visit_weight(self.update.state_weight)
-        unknown_N = torch.full_like(weight_N, torch.nan)
-        return PolicyBatch(observation_N, None, weight_N, pi_NA, advantage_NA, 0, None, unknown_N, math.inf, 0.0)
 
     @property
     def gamma(self) -> float:
@@ -339,35 +269,11 @@ class PGTS:
         Args:
             depth: m; default the depth of the training, or its largest if it is adaptive.
         """
-        if self.search is None:
+        choice = self.depth_choice
+        if choice is None:
             raise PgtsError("with sampled advantages there is no lookahead")
-        assert isinstance(self.world, ModelWorld)
-        observe, critic = self.world.observe, self.critic
-        leaf: Leaf = lambda s: critic.v(observe(s)) if critic.target == "v" else critic.q(observe(s))  # noqa: E731
-        depth = self.depths[-1] if depth is None else depth
-        return self.search(
-            state_N,
-            depth=depth,
-            prior=lambda s: self.policy.probs(observe(s)),
-            generator=self._search_stream(),
-            **{f"{critic.target}_leaf": leaf},
-        )
-
-    def _look_together(self, state_N: Tensor, depth: int) -> Lookahead:
-        """`lookahead`, in which each process has its part."""
-        return whole_lookahead(self.ranks, state_N, lambda mine: self.lookahead(mine, depth=depth))
-
-    def _stream(self, *names: str | int) -> torch.Generator:
-        """A stream of this iteration."""
-        return stream(self.seed, "iteration", self.num_iterations, *names, device=self.device)
-
-    def _search_stream(self) -> torch.Generator:
-        """All searches of an iteration see the same samples, so that their differences are not noise."""
-        return self._stream("search")
-
-    def _is_enough(self, bound: float) -> bool:
-        """Whether the certificate lets training end."""
-        return self.stop_at is not None and bound <= self.stop_at
+        draws = self.ranks.draws(self.seed, self.num_iterations, self.device)
+        return choice.look(state_N, choice.depths[-1] if depth is None else depth, draws.search())
 
     def learn(self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool = False) -> Self:
         """Iterate until `total_steps` environment steps have been made in all, counting those before this call.
@@ -390,7 +296,7 @@ class PGTS:
                 bar.update(iteration.experience.num_steps)
                 answers = [call(self, iteration) for call in callbacks]
                 going = self.ranks.gather("whether to go on", lambda: False not in answers)  # noqa: B023
-                if not all(going) or self._is_enough(iteration.certificate):
+                if not all(going) or iteration.is_enough:
                     break
         return self
 
@@ -455,98 +361,20 @@ class PGTS:
             PgtsError: no such file, damaged, or not ours; or it names a module that is not trusted; or an environment
                 is needed, or is not.
         """
-        content = saving.read(path)
-        if content.keys() != {"arguments", "state"}:
-            raise PgtsError(f"{path} holds {sorted(map(str, content))}, not a model")
-        arguments = content["arguments"]
-        check_keys(f"{path}: arguments", arguments, {"env"}, others=set(signature(cls).parameters))
-        saved_env = arguments["env"]
-        if (env is None) == (saved_env is None):
-            raise PgtsError(
-                f"{path} names no environment, for it was given as an object: load it with env=..."
-                if env is None
-                else f"env is {env!r}; {path} has its own, {saved_env}"
-            )
-        if not trust_imports:
-            check_imports(path, saved_env, arguments.get("env_kwargs"))
-        arguments |= {"env": saved_env if env is None else env}
-        try:
-            model = cls(**arguments | ({} if device is None else {"device": str(device)}))
-        except NO_STATE as error:
-            if isinstance(error, PgtsError):
-                raise
-            raise PgtsError(f"{path}: its arguments make no model: {type(error).__name__}: {error}") from error
-        try:
-            model.load_state_dict(content["state"])
-        except PgtsError as error:
-            raise PgtsError(f"{path}: {error}") from error
-        return model
+        parameters, device = set(signature(cls).parameters), None if device is None else str(device)
+        return saved.load_training(
+            path, cls, parameters=parameters, env=env, device=device, trust_imports=trust_imports
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Policy, critic, update, what the search of each rank remembers, and counters: tensors on the CPU and plain
         values. Of several processes all must ask for it."""
-        searches = self.ranks.gather("searches", self._search_state)
-        return {
-            "searches": dict(enumerate(searches)),
-            "policy": self.policy.state_dict(),
-            "critic": self.critic.state_dict(),
-            "update": self.update.state_dict(),
-            "num_iterations": self.num_iterations,
-            "num_env_steps": self.num_env_steps,
-            "num_model_calls": self.num_model_calls,
-            "model_check": self.model_check.state_dict(),
-        }
+        return saved.state_of(self)
 
-    def _search_state(self) -> dict[str, Any]:
-        """What the search of this rank remembers, and its bounds."""
-        if self.search is None or self.certificates is None:
-            return {}
-        with_states = self.world.mdp is not None
-        upper = self.certificates.state_dict(with_states=with_states)
-        return {**self.search.state_dict(with_states=with_states), "upper": upper}
-
-    @torch.inference_mode(False)
-    @torch.enable_grad()
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` gave; or nothing of it, where it is no state of such a model.
 
         Raises:
             PgtsError: the part of it that does not fit is named.
         """
-        counters = ("num_iterations", "num_env_steps", "num_model_calls")
-        parts: dict[str, Policy | Critic | Update] = {
-            "policy": self.policy,
-            "critic": self.critic,
-            "update": self.update,
-        }
-        check_keys("the saved state", state, {"searches", "model_check", *parts, *counters})
-        for name in counters:
-            check_count(name, state[name], least=0)
-        before = {name: part.state_dict() for name, part in parts.items()}
-        try:
-            for name, part in parts.items():
-                take_over(name, state[name], part.load_state_dict, part.state_dict)
-            self.update.check(self.policy)
-            self._load_search(state["searches"])
-            check = self.model_check
-            take_over("model_check", state["model_check"], check.load_state_dict, check.state_dict, is_all=False)
-        except PgtsError:
-            for name, part in parts.items():
-                part.load_state_dict(before[name])
-            raise
-        for name in counters:
-            setattr(self, name, state[name])
-
-    def _load_search(self, searches: Any) -> None:
-        """Take over what the search of this rank remembered."""
-        if not isinstance(searches, Mapping) or set(searches) != set(range(len(searches))) or not searches:
-            raise PgtsError("the saved state of searches is not one of each rank")
-        rank, search, certificates = self.ranks.rank % len(searches), self.search, self.certificates
-        if search is None or certificates is None:
-            return
-
-        def load(state: dict[str, Any]) -> None:
-            search.load_state_dict(state)
-            certificates.load_state_dict(state["upper"])
-
-        take_over(f"searches.{rank}", searches[rank], load, self._search_state, has_bounds=True)
+        saved.restore(self, state)

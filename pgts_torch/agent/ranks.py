@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, distributed
 
 from pgts_torch.errors import PgtsError, RankLost
+from pgts_torch.seeding import stream
 
 T = TypeVar("T")
 
@@ -45,6 +46,13 @@ class Ranks:
     def part(self, x_N: Tensor) -> Tensor:
         """Its part of rows that all have: neighbours, because their searches meet. It may be empty."""
         return x_N.tensor_split(self.size)[self.rank]
+
+    def draws(self, seed: int, number: int, device: torch.device) -> "Draws":
+        """What iteration `number` draws from."""
+        names = ("iteration", number)
+        own = stream(seed, *names, *self.names, device=device)
+        common = own if self.size == 1 else stream(seed, *names, "common", device=device)
+        return Draws(seed, number, (*names, *self.names), own, common)
 
     def gather(self, what: str, make: Callable[[], T]) -> list[T]:
         """What `make` gives in each process, in the order of ranks. All processes must ask for the same.
@@ -82,6 +90,15 @@ class Ranks:
             answers.append(answer)
         return answers
 
+    def total(self, count: int, policy: Mapping[str, Any]) -> int:
+        """The sum of what all ranks have counted; PgtsError if they hold different policies."""
+        if self.size == 1:
+            return count
+        told = self.gather("policies", lambda: (count, checksum(policy)))
+        if len({each for _, each in told}) > 1:
+            raise PgtsError("the ranks hold different policies: do they run on different hardware or versions?")
+        return sum(each for each, _ in told)
+
     def together(self, what: str, make: Callable[[], T]) -> T:
         """What `make` gives in this process, if it fails in none; otherwise as `gather`. It need not pickle."""
         made: list[T] = []
@@ -92,6 +109,27 @@ class Ranks:
         """What `make` gives in rank 0, which alone calls it; otherwise as `gather`."""
         answers: list[Any] = self.gather(what, lambda: make() if self.leads else None)
         return answers[0]
+
+
+@final
+@dataclass(frozen=True)
+class Draws:
+    """What an iteration draws from: generators of streams that are named by (seed, "iteration", number).
+
+    names: the streams of this process for its part of the work begin so.
+    own: for its part of the work.
+    common: for what all processes do alike; of one alone it is `own`.
+    """
+
+    seed: int
+    number: int
+    names: tuple[str | int, ...]
+    own: torch.Generator
+    common: torch.Generator
+
+    def search(self) -> torch.Generator:
+        """For a search, the same for all of an iteration."""
+        return stream(self.seed, "iteration", self.number, "search", device=self.own.device)
 
 
 def present_ranks() -> Ranks:

@@ -106,9 +106,11 @@ class ModelWorld(World, ABC):
     """Environments whose states a model knows, by number: a lookahead may start wherever they are.
 
     model: what the lookahead asks.
+    keeps_numbers: whether a state keeps its number from one iteration to the next.
     """
 
     model: Model
+    keeps_numbers: bool = False
 
     @abstractmethod
     def read(self, observation: Any) -> Shaped[Tensor, "B ..."]:
@@ -132,12 +134,12 @@ class ModelWorld(World, ABC):
 
     @abstractmethod
     def adopt(self, exported: Any) -> Int[Tensor, "N"]:
-        """The numbers of states that another process has exported. Where a world numbers anew, the numbers are the same
-        in all processes that adopt the same states in the same order."""
+        """The numbers of states that another process has exported. After `reset_numbers` they are the same in all
+        processes that adopt the same states in the same order."""
 
     @abstractmethod
-    def forget(self) -> bool:
-        """Begin to number anew where numbers only serve one iteration; whether it was so."""
+    def reset_numbers(self) -> None:
+        """Number states from 0 on, as those of a new iteration, unless they keep their numbers."""
 
 
 @final
@@ -150,6 +152,8 @@ class TabularWorld(ModelWorld):
         starts_known: whether the start distribution of the table is that of the environment; False: it was
             estimated from resets.
     """
+
+    keeps_numbers = True
 
     def __init__(
         self, env: VectorEnv, mdp: TabularMDP, *, starts_known: bool = True, device: torch.device | str = "cpu"
@@ -184,9 +188,8 @@ class TabularWorld(ModelWorld):
         """These."""
         return exported.to(self.device)
 
-    def forget(self) -> bool:
-        """Nothing: a state keeps its number."""
-        return False
+    def reset_numbers(self) -> None:
+        """A state keeps its number."""
 
 
 @final
@@ -233,10 +236,9 @@ class SimulatedWorld(ModelWorld):
         known, index_N = exported
         return self.model.adopt(known).to(self.device)[index_N.to(self.device)]
 
-    def forget(self) -> bool:
-        """All snapshots: their number grows with every search, and few of them return."""
+    def reset_numbers(self) -> None:
+        """All snapshots are dropped: there are more with every search, and few of them return."""
         self.model.clear()
-        return True
 
 
 @final
@@ -278,7 +280,6 @@ class DynamicsWorld(ModelWorld):
         """New numbers, or those of equal vectors."""
         return self.numbers(exported.to(self.device))
 
-    def forget(self) -> bool:
-        """All states: hardly one of them returns."""
+    def reset_numbers(self) -> None:
+        """All states are dropped: hardly one of them returns."""
         self.model.clear()
-        return True

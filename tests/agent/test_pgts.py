@@ -227,9 +227,14 @@ def test_a_whole_training_asks_the_model_at_most_once_for_each_state_and_action(
 @pytest.mark.parametrize(("depth", "looks"), [(0, [0]), (3, [0, 3])])
 def test_an_iteration_looks_once_at_depth_0_and_once_at_its_own(depth, looks, monkeypatch):
     model, made = make(depth=depth), []
-    look = model.lookahead
-    monkeypatch.setattr(model, "lookahead", lambda states, *, depth: made.append(depth) or look(states, depth=depth))
+    look_ahead = model.search.look_ahead
+    monkeypatch.setattr(
+        model.search,
+        "look_ahead",
+        lambda leaves, *rest: made.append(leaves.expansions - 1) or look_ahead(leaves, *rest),
+    )
     model.iterate()
+    assert model.critic.target == "v"  # so it expands one level more
     assert made == looks
 
 

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from torch import distributed
 
 from pgts_torch import PGTS
-from pgts_torch.agent import pgts
+from pgts_torch.agent import visit
 from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.ranks import Ranks, checksum, joined_ranks, present_ranks
 from pgts_torch.agent.rollout import Rollout
@@ -98,11 +98,11 @@ def replayed(
             state_UB = None if states is None else world.adopt(states).view(columns["observation_UB"].shape[:2])
             return Rollout(**columns, state_UB=state_UB)
 
-        monkeypatch.setattr(pgts, "rollout", given)
-        if len(chooser.depths) > 1:
+        monkeypatch.setattr(visit, "rollout", given)
+        if chooser.depth_choice is not None and len(chooser.depth_choice.depths) > 1:
             chooser.load_state_dict(model.state_dict())
             assert chooser.iterate().depth <= each["depth"]
-            model.depths = [each["depth"]]
+            model.depth_choice.depths = [each["depth"]]
         iteration = model.iterate()
         assert iteration.depth == each["depth"]
         assert float(iteration.gap_N.sum()) == pytest.approx(each["gap"], **within, nan_ok=True)

@@ -78,7 +78,8 @@ def test_a_model_is_loaded_with_everything_that_it_was_made_with(tmp_path):
     made.save(path)
     loaded = PGTS.load(path, device="cpu")
     assert torch.equal(loaded.policy.table(), made.policy.table())
-    for name in ("depths", "seed", "gamma", "update", "horizon", "device"):
+    assert loaded.depth_choice.depths == made.depth_choice.depths
+    for name in ("seed", "gamma", "update", "horizon", "device"):
         assert getattr(loaded, name) == getattr(made, name)
     assert loaded.search.max_nodes == 5000
     assert loaded.world.env.num_envs == 3

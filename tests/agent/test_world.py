@@ -235,11 +235,11 @@ def test_a_numbered_state_is_observed_as_the_copies_showed_it(kind):
 
 
 @pytest.mark.parametrize("kind", WORLDS)
-def test_after_forgetting_numbers_begin_anew_except_where_a_state_is_its_number(kind):
+def test_numbers_are_reset_except_where_a_state_is_its_number(kind):
     world = WORLDS[kind]()
     _, first = walked(world, 3)
-    forgot = world.forget()
-    assert forgot == (not isinstance(world, TabularWorld))
+    world.reset_numbers()
+    assert world.keeps_numbers == isinstance(world, TabularWorld)
     seen, second = walked(world, 3)
     assert all(torch.equal(*pair) for pair in zip(first, second, strict=True))
     assert torch.equal(world.observe(second[1]), seen[1]) or kind == "Acrobot-v1"

@@ -1,0 +1,90 @@
+"""The lookahead of a policy: a search with its critic at the leaves, which processes can make in parts."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import zip_longest
+from typing import Any, final
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.ranks import Ranks
+from pgts_torch.agent.world import ModelWorld
+from pgts_torch.search.engine import Search
+from pgts_torch.search.lookahead import Lookahead
+
+_VALUES = ("q_BA", "stderr_BA", "pruned_BA", "bias_BA")
+
+
+@final
+class PolicyLookahead:
+    """(T^m Q)(s, .) at states of a model, with the critic's estimate of Q^pi or v^pi at the leaves.
+
+    Args:
+        world: says what policy and critic see of a state.
+        policy: whose probabilities a tree search may start from.
+        critic: of this policy.
+        search: how the lookahead is made.
+        ranks: the processes that can make it together.
+    """
+
+    def __init__(self, world: ModelWorld, policy: Policy, critic: Critic, search: Search, ranks: Ranks) -> None:
+        self.world, self.policy, self.critic, self.search, self._ranks = world, policy, critic, search, ranks
+        self._leaves = {f"{critic.target}_leaf": self._leaf, "prior": self._prior}
+
+    def __call__(self, state_N: Int[Tensor, "N"], depth: int, generator: torch.Generator) -> Lookahead:
+        """From all these states, in this process alone."""
+        return self.search(state_N, depth=depth, generator=generator, **self._leaves)
+
+    def in_parts(self, state_N: Int[Tensor, "N"], depth: int, generator: torch.Generator) -> Lookahead:
+        """From states that all ranks have, each of which looks from its part of them.
+
+        Raises:
+            PgtsError, RankLost: as `Ranks.gather`.
+        """
+        if self._ranks.size == 1:
+            return self.search(state_N, depth=depth, generator=generator, **self._leaves)
+        mine = self._ranks.part(state_N)
+        parts = self._ranks.gather(
+            "lookahead", lambda: _moved(self(mine, depth, generator), "cpu") if len(mine) else None
+        )
+        return _moved(_joined([part for part in parts if part is not None]), state_N.device)
+
+    def restart(self) -> None:
+        """Forget what was learned of states that have lost their numbers since."""
+        if not self.world.keeps_numbers:
+            self.search.reset()
+
+    def _leaf(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        observation_N = self.world.observe(state_N)
+        return self.critic.v(observation_N) if self.critic.target == "v" else self.critic.q(observation_N)
+
+    def _prior(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        return self.policy.probs(self.world.observe(state_N))
+
+
+def _moved(look: Lookahead, device: torch.device | str) -> Lookahead:
+    moved: dict[str, Any] = {name: getattr(look, name) for name in _VALUES}
+    for name, value_BA in moved.items():
+        moved[name] = None if value_BA is None else value_BA.to(device)
+    return replace(look, **moved)
+
+
+def _joined(parts: Sequence[Lookahead]) -> Lookahead:
+    """One lookahead from the roots of all."""
+
+    def rows(name: str) -> Any:
+        columns = [getattr(part, name) for part in parts]
+        return None if any(column is None for column in columns) else torch.cat(columns)
+
+    return Lookahead(
+        **{name: rows(name) for name in _VALUES},
+        model_calls=sum(part.model_calls for part in parts),
+        critic_calls=sum(part.critic_calls for part in parts),
+        samples=parts[0].samples,
+        value_range=parts[0].value_range,
+        nodes_per_level=tuple(map(sum, zip_longest(*(part.nodes_per_level for part in parts), fillvalue=0))),
+    )
