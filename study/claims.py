@@ -102,7 +102,6 @@ def _spell_cube(names: Sequence[str], cube: Sequence[frozenset[Any]], tried: Seq
     return ", ".join(named)
 
 
-def judge(text: str, place: str, findings: Iterable[Finding | tuple[Reading, str, bool]]) -> Claim:
-    """A claim from its findings, given as such or as plain tuples."""
-    made = (finding if isinstance(finding, Finding) else Finding(*finding) for finding in findings)
-    return Claim(text, place, tuple(made))
+def judge(text: str, place: str, findings: Iterable[Finding]) -> Claim:
+    """The claim with all that was found."""
+    return Claim(text, place, tuple(findings))

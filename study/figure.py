@@ -1,5 +1,6 @@
 """One figure of the paper: what it shows, computed exactly and from samples, and the readings it can be held to."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, dataclass, field
@@ -13,7 +14,7 @@ from pgts_torch.tabular.ascent import projected_step, softmax_step
 from pgts_torch.tabular.mdp import TabularMDP
 from study.claims import Claim, Finding, Reading
 from study.curves import Trace, Watch, initial_policy, trace
-from study.sampled import Job, arguments, band, returns
+from study.sampled import Job, band, returns
 
 STARTS: dict[str, int | None] = {"s0": 0, "uniform": None}
 STEPS = {"projected": projected_step, "softmax": softmax_step}
@@ -128,27 +129,30 @@ def _panel(figure: Figure, update: str, start: str) -> dict[str, Any]:
 
 def _jobs(figure: Figure, effort: Effort) -> list[tuple[tuple[str, str, int], Job]]:
     """All sampled runs, each with the (update, start, depth) that it belongs to."""
+    depths = figure.quick_depths if effort.quick else figure.sampled_depths
     jobs = []
-    for update, move in figure.moves.items():
-        for start in STARTS:
-            for depth in figure.quick_depths if effort.quick else figure.sampled_depths:
-                given = arguments(
-                    depth=depth,
-                    update=update,
-                    step_size=move.step_size,
-                    init=move.init,
-                    critic=figure.critic,
-                    horizon=figure.horizon,
-                    num_envs=figure.num_envs,
-                    gamma=figure.gamma,
-                    env_kwargs={"start": STARTS[start]},
-                )
-                for seed in range(effort.seeds):
-                    name = (figure.name, update, start, depth, seed)
-                    iterations = figure.sampled_iterations[start] // (2 if effort.quick else 1)
-                    job = Job(name, figure.env_id, iterations, given)
-                    jobs.append(((update, start, depth), job))
+    for update, start, depth in itertools.product(figure.moves, STARTS, depths):
+        iterations = figure.sampled_iterations[start] // (2 if effort.quick else 1)
+        given = sampled_arguments(figure, update, start, depth)
+        for seed in range(effort.seeds):
+            job = Job((figure.name, update, start, depth, seed), figure.env_id, iterations, given)
+            jobs.append(((update, start, depth), job))
     return jobs
+
+
+def sampled_arguments(figure: Figure, update: str, start: str, depth: int) -> dict[str, Any]:
+    """Arguments of PGTS for the paper's projected update of a simplex policy, or the softmax one."""
+    move = figure.moves[update]
+    return {
+        "depth": depth,
+        "policy": {"type": {"projected": "simplex", "softmax": "softmax"}[update], "init": move.init},
+        "update": {"type": update, "step_size": move.step_size, "state_weight": "occupancy"},
+        "critic": figure.critic,
+        "horizon": figure.horizon,
+        "num_envs": figure.num_envs,
+        "gamma": figure.gamma,
+        "env_kwargs": {"start": STARTS[start]},
+    }
 
 
 def _add_bands(panels: list[dict[str, Any]], keys: list[tuple[str, str, int]], results: list[list[float]]) -> None:

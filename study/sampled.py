@@ -11,7 +11,6 @@ import scipy.stats
 import torch
 from jaxtyping import Float
 
-from pgts_torch.agent.build import Description
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.seeding import numpy_stream, seed_sequence
 from pgts_torch.tabular import exact
@@ -88,28 +87,3 @@ def band(J_NK: Float[np.ndarray, "N K"], *names: str | int) -> Band:
 def interquartile_mean(values: np.ndarray, axis: int) -> np.ndarray:
     """The mean without the lowest and the highest quarter."""
     return scipy.stats.trim_mean(values, 0.25, axis=axis)
-
-
-def arguments(
-    *,
-    depth: int,
-    update: str,
-    step_size: float,
-    init: Description,
-    critic: Description,
-    horizon: Description,
-    num_envs: int,
-    gamma: float,
-    env_kwargs: Mapping[str, Any],
-) -> dict[str, Any]:
-    """Arguments of PGTS for the paper's projected update of a simplex policy, or the softmax one."""
-    return {
-        "depth": depth,
-        "policy": {"type": {"projected": "simplex", "softmax": "softmax"}[update], "init": init},
-        "update": {"type": update, "step_size": step_size, "state_weight": "occupancy"},
-        "critic": critic,
-        "horizon": horizon,
-        "num_envs": num_envs,
-        "gamma": gamma,
-        "env_kwargs": dict(env_kwargs),
-    }

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from study import figure
-from study.claims import Claim, judge
+from study.claims import Claim, Finding, judge
 from study.curves import Trace
 from study.figure import Run
 from tests.support import zoo
@@ -31,7 +31,11 @@ def smallest(shown: figure.Figure) -> figure.Figure:
 
     def claims(quick: bool) -> list[Claim]:
         return [
-            judge(f"A statement about {shown.name}", "Sec. 3", [({"m": 1}, "1.25 a", True), ({"m": 2}, "2.5 b", False)])
+            judge(
+                f"A statement about {shown.name}",
+                "Sec. 3",
+                [Finding({"m": 1}, "1.25 a", True), Finding({"m": 2}, "2.5 b", False)],
+            )
         ]
 
     few = {"s0": 2, "uniform": 2}

@@ -72,17 +72,7 @@ def test_a_band_is_the_interquartile_mean_inside_its_interval():
 
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_runs_draw_independently_and_the_number_of_workers_changes_nothing():
-    given = sampled.arguments(
-        depth=1,
-        update="projected",
-        step_size=0.3,
-        init={"type": "uniform"},
-        critic={"type": "tabular"},
-        horizon={"type": "fixed", "length": 5},
-        num_envs=4,
-        gamma=0.9,
-        env_kwargs={"start": None},
-    )
+    given = figure.sampled_arguments(smallest(random_mdp.FIGURE), "projected", "uniform", 1)
     jobs = [sampled.Job(("test", seed), "pgts/Random-v0", 2, given) for seed in range(2)]
     with sampled.executor(0) as here, sampled.executor(1) as elsewhere:
         found = [[one.submit(sampled.returns, job).result() for job in jobs] for one in (here, elsewhere)]
