@@ -138,14 +138,17 @@ def make_critic(
 ) -> Critic:
     """A critic: exact(target), tabular(target, method, step_size), rollout(samples, target, horizon) or
     network(network, target, method, ...), whose network may be "shared" with the policy's. Default: tabular where the
-    environment is, else a network like the policy's, whose learning rate is 1e-3 with a lookahead and 3e-4 with sampled
-    advantages."""
+    environment is, else a network like the policy's. With a lookahead its learning rate is 1e-3 and, unless its target
+    network lags, its targets are fresh; with sampled advantages they are not, and the rate is 3e-4."""
     if description is None:
         description = "tabular" if isinstance(world, TabularWorld) else "network"
     kind, options = _parts("critic", _CRITICS, description)
     nested: dict[str, _Choices] = {"method": _METHODS, "horizon": _HORIZONS}
     if kind == "network":
-        options.setdefault("learning_rate", 3e-4 if isinstance(estimator, SampledAdvantages) else 1e-3)
+        sampled = isinstance(estimator, SampledAdvantages)
+        lags = (options.get("polyak", 1), options.get("target_period", 1)) != (1, 1)
+        options.setdefault("learning_rate", 3e-4 if sampled else 1e-3)
+        options.setdefault("fresh_targets", not sampled and not lags)
         if options.get("network") == "shared":
             if not isinstance(policy, NetworkPolicy):
                 raise PgtsError(f"critic.network is 'shared'; a {type(policy).__name__} has no network to share")

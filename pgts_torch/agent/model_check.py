@@ -250,5 +250,6 @@ class _Told:
 def _steps(experience: Rollout, *, follows: str) -> Happened:
     """The steps that were made, without padding; `follows` names the column that says whether the episode went on."""
     alive_V = experience.alive_TB.cpu().numpy().reshape(-1)
-    at = slice(None) if alive_V.all() else np.flatnonzero(alive_V)
-    return Happened(*(getattr(experience, name).cpu().numpy().reshape(-1)[at] for name in (*_COLUMNS, follows)))
+    columns = [getattr(experience, name).cpu().numpy().reshape(-1) for name in (*_COLUMNS, follows)]
+    at = np.flatnonzero(alive_V)
+    return Happened(*(columns if len(at) == len(alive_V) else [column_V[at] for column_V in columns]))

@@ -87,7 +87,9 @@ class NetworkCritic(Critic):
         target: learn "v", or "q" at the actions taken.
         method: how targets are made.
         learning_rate, max_grad_norm: of Adam; `max_grad_norm=None` clips nothing.
-        num_epochs, minibatch_size: passes over the visits in each fit, and visits in each gradient step.
+        num_epochs, minibatch_size: passes over the visits of an iteration, and visits in each gradient step.
+        fresh_targets: each of these passes is a fit to targets of its own, of the critic as it is by then. One fit per
+            iteration leaves gamma (1 - lambda) / (1 - gamma lambda) of what is missing to v^pi, often 0.83.
         normalize_returns: False keeps mean 0 and scale 1.
         polyak, target_period: after every `target_period` fits the target network moves by the share `polyak` toward
             the network. 1 and 1: the network as the last fit left it.
@@ -108,6 +110,7 @@ class NetworkCritic(Critic):
         max_grad_norm: float | None = 0.5,
         num_epochs: int = 10,
         minibatch_size: int = 64,
+        fresh_targets: bool = False,
         normalize_returns: bool = True,
         polyak: float = 1.0,
         target_period: int = 1,
@@ -122,12 +125,17 @@ class NetworkCritic(Critic):
         self.target = check_target(target)
         self.num_actions, self.method = num_actions, method
         self.num_epochs, self.minibatch_size, self.normalize_returns = num_epochs, minibatch_size, normalize_returns
-        self.polyak, self.target_period = polyak, target_period
+        self.polyak, self.target_period, self.fresh_targets = polyak, target_period, fresh_targets
         generator = stream(seed, "critic")
         trunk = network if isinstance(network, Trunk) else network.trunk(observation_space, generator=generator)
         outputs = 1 if target == "v" else num_actions
         self.network = Network(trunk, outputs, gain=1.0, generator=generator).to(device)
         self._lags = polyak < 1 or target_period > 1
+        if fresh_targets and self._lags:
+            raise PgtsError(
+                "fresh_targets is True, but the network that makes targets lags behind: polyak is "
+                f"{polyak} and target_period {target_period}; take the one or the other"
+            )
         self._target_network = copy.deepcopy(self.network) if self._lags else self.network
         self._optimiser = Optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
         self._policy: Policy | None = None
@@ -139,7 +147,7 @@ class NetworkCritic(Critic):
 
         Returns:
             value: the mean squared error in squared reward units, and explained_variance: 1 less its share of the
-            variance of the targets; both before the fit. value_grad_norm: mean over the gradient steps.
+            variance of the targets; both before anything moves. value_grad_norm: mean over the gradient steps.
 
         Raises:
             PgtsError: a target, a loss or a gradient is not finite.
@@ -151,7 +159,6 @@ class NetworkCritic(Critic):
         observation_V, action_V = rollout.observation_V, rollout.action_TB[alive_TB]
         v_TB, target_TB = self._targets(rollout)
         target_V = target_TB[alive_TB]
-        check_targets(target_V)
         if self._lags or self.target == "q":
             error_V = target_V - self._taken(self._values(self.network, observation_V), action_V)
         else:
@@ -160,23 +167,39 @@ class NetworkCritic(Critic):
         encoder = self.network.trunk.encoder
         if encoder.fresh or not _share(policy, self.network):
             encoder.absorb(observation_V)
-        if self.normalize_returns:
-            self._rescale(target_V)
-        y_V = (target_V - self._mean) / self._scale if self._scale else torch.zeros_like(target_V)
-        columns = (self.network.encode(observation_V), action_V, y_V.float())
-        norms = []
-        for _ in range(self.num_epochs):
-            for input_N, action_N, y_N in minibatches(columns, self.minibatch_size, generator=generator):
-                loss = (y_N - self._taken(self.network(input_N), action_N)).square().mean()
-                norms.append(self._optimiser.step(self.network.weights, loss, "value"))
-        self._num_fits += 1
-        self._move_target_network()
+        input_V = self.network.encode(observation_V)
+        fits, passes = (self.num_epochs, 1) if self.fresh_targets else (1, self.num_epochs)
+        norms = self._fit(input_V, action_V, target_V, passes, generator)
+        for _ in range(fits - 1):
+            norms += self._fit(input_V, action_V, self._targets(rollout)[1][alive_TB], passes, generator)
         spread, unexplained = float(target_V.var(correction=0)), float(error_V.var(correction=0))
         return {
             "value": float(error_V.square().mean()),
             "explained_variance": 1 - unexplained / spread if spread else 0.0,
             "value_grad_norm": sum(norms) / len(norms),
         }
+
+    def _fit(
+        self,
+        input_V: Float[Tensor, "V ..."],
+        action_V: Int[Tensor, "V"],
+        target_V: Float[Tensor, "V"],
+        num_passes: int,
+        generator: torch.Generator,
+    ) -> list[float]:
+        """Move the network toward given targets; the norms of its gradients."""
+        check_targets(target_V)
+        if self.normalize_returns:
+            self._rescale(target_V)
+        y_V = (target_V - self._mean) / self._scale if self._scale else torch.zeros_like(target_V)
+        columns, norms = (input_V, action_V, y_V.float()), []
+        for _ in range(num_passes):
+            for input_N, action_N, y_N in minibatches(columns, self.minibatch_size, generator=generator):
+                loss = (y_N - self._taken(self.network(input_N), action_N)).square().mean()
+                norms.append(self._optimiser.step(self.network.weights, loss, "value"))
+        self._num_fits += 1
+        self._move_target_network()
+        return norms
 
     def v(self, observation_N: Tensor) -> Float[Tensor, "N"]:
         """The network's value, or sum_a pi(a|o) Q(o, a) of it."""

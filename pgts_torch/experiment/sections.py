@@ -299,6 +299,9 @@ class NetworkCriticConfig(Section):
     minibatch_size: Count = 64
     """Visits in each step."""
 
+    fresh_targets: bool | None = None
+    """Make new targets for each pass; null: with a lookahead, unless the network that they are made with lags."""
+
     normalize_returns: bool = True
     """Fit what the targets are above their running mean, in units of their running deviation."""
 

@@ -95,9 +95,10 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
 
     def hold(self, happened: Happened, *, ask_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
         """The outcome that looks like each step, bit for bit; a reward may also be one that was rounded to float32."""
-        looks_N = _looks(happened.next_state_N, happened.discount_N, happened.reward_N)
-        same_NK = self._looks_RK.take(self.rows(happened), 0) == looks_N[:, None]
-        if not same_NK.any(-1).all():
+        looks_N, row_N = _looks(happened.next_state_N, happened.discount_N, happened.reward_N), self.rows(happened)
+        same_NK = self._looks_RK.take(row_N, 0) == looks_N[:, None]
+        first_N = same_NK.argmax(-1)
+        if not (self._looks_RK.take(row_N * self._looks_RK.shape[1] + first_N) == looks_N).all():
             at = happened.state_N, happened.action_N
             outcomes, discount_NK = self._mdp.outcomes, self._mdp.outcomes.discount_NAK.numpy()[at]
             with np.errstate(over="ignore"):
@@ -107,7 +108,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
             rounded_NK &= (discount_NK == 0) | (outcomes.child_NAK.numpy()[at] == happened.next_state_N[:, None])
             same_NK |= rounded_NK
             return np.where(same_NK.any(-1), same_NK.argmax(-1), DENIED)
-        return same_NK.argmax(-1)
+        return first_N
 
     def shown(self, state: int) -> str:
         """Its number."""

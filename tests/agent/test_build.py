@@ -2,8 +2,10 @@
 
 import pytest
 
+from pgts_torch.agent.advantages import LookaheadAdvantages, SampledAdvantages
 from pgts_torch.agent.build import make_critic, make_horizon, make_policy, make_update
 from pgts_torch.agent.critics import ExactCritic, MonteCarlo, RolloutCritic, TabularCritic, TDLambda
+from pgts_torch.agent.neural import NetworkCritic
 from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate
@@ -52,6 +54,21 @@ def test_options_reach_their_part():
     made = critic({"type": "rollout", "samples": 3, "horizon": {"type": "fixed", "length": 2}})
     assert isinstance(made, RolloutCritic)
     assert (made.samples, made.horizon) == (3, FixedHorizon(2))
+
+
+def test_a_network_critic_has_fresh_targets_with_a_lookahead_unless_its_target_network_lags():
+    def fresh(estimator=LookaheadAdvantages(), **options) -> bool:  # noqa: B008 - frozen
+        made = make_critic({"type": "network", **options}, WORLD, policy("softmax"), estimator, seed=0)
+        assert isinstance(made, NetworkCritic)
+        return made.fresh_targets
+
+    assert fresh()
+    assert fresh(polyak=1.0, target_period=1)
+    assert fresh(SampledAdvantages(), fresh_targets=True)
+    assert not fresh(SampledAdvantages())
+    assert not fresh(polyak=0.5)
+    assert not fresh(target_period=2)
+    assert not fresh(fresh_targets=False)
 
 
 def test_a_description_is_not_changed_by_being_built():

@@ -121,6 +121,25 @@ def test_a_critic_converges_to_the_values_of_a_policy_that_stands_still(target, 
     assert (truth.q_SA - truth.v_S[:, None]).abs().max() > 0.25
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_fresh_targets_bring_the_values_of_a_policy_in_two_fits_and_stale_ones_do_not(target):
+    # Of what is missing each stale fit leaves gamma (1 - lambda) / (1 - gamma lambda) = 0.905: 0.82 after two.
+    mdp = random_mdp(6, 2, gamma=0.95, start=None)
+    pi_SA = random_policy(mdp, seed=1)
+    made = [experience(mdp, pi_SA, FixedHorizon(20), episodes=500, seed=seed) for seed in range(2)]
+    missing = {}
+    for fresh in (False, True):
+        options = {"target": target, "method": TDLambda(0.5), "learning_rate": 0.03, "fresh_targets": fresh}
+        critic = NetworkCritic(STATES, 2, network=MLP(hidden=()), num_epochs=40, minibatch_size=1000, **options)
+        for each in made:
+            critic.fit(following(pi_SA), each, generator=stream(0, "critic"))
+        v_S = exact.evaluate(mdp, pi_SA).v_S
+        missing[fresh] = float(((v_S - critic.v(torch.arange(6))) / v_S).mean())
+    assert 0.8 < missing[False] < 0.84
+    assert abs(missing[True]) < 0.05
+
+
 @pytest.mark.parametrize(
     ("method", "expected"),
     [
@@ -310,6 +329,8 @@ def test_targets_that_are_not_finite_teach_nothing(value):
         ({"target_period": 0}, "target_period is 0"),
         ({"num_epochs": 0}, "num_epochs is 0"),
         ({"minibatch_size": 0}, "minibatch_size is 0"),
+        ({"fresh_targets": True, "polyak": 0.5}, "fresh_targets is True, but .* lags behind"),
+        ({"fresh_targets": True, "target_period": 2}, "fresh_targets is True, but .* lags behind"),
         ({"learning_rate": -1.0}, "learning_rate is -1.0"),
         ({"max_grad_norm": 0.0}, "max_grad_norm is 0.0"),
     ],
