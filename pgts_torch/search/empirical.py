@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
-from pgts_torch.search.topology import check_answer, counting
+from pgts_torch.search.outcome_table import check_outcomes, has_weight
 from pgts_torch.seeding import mix
 
 Share = Literal["none", "level", "search"]
@@ -97,13 +97,13 @@ class Empirical(EnumeratingModel):
             assert isinstance(self._model, SamplingModel)
             answer, reward_NAC = drawn_outcomes(self._model, states, key_N, C)
         self.model_calls += len(states) * self.num_actions * (1 if C is None else C)
-        check_answer(self._model, states, answer)
+        check_outcomes(self._model, states, answer)
         unfilled = self._most_samples - reward_NAC.shape[-1]
         self._rewards.append(torch.nn.functional.pad(reward_NAC.to(self.dtype), (0, unfilled)))
-        counts_NAK = counting(answer)
+        weighs_NAK = has_weight(answer)
         child_NAK = torch.zeros_like(answer.child_NAK)
         edge_NAK = edge_keys(key_N, self.num_actions, answer.num_outcomes)
-        child_NAK[counts_NAK] = self._met(answer.child_NAK[counts_NAK], edge_NAK[counts_NAK])
+        child_NAK[weighs_NAK] = self._met(answer.child_NAK[weighs_NAK], edge_NAK[weighs_NAK])
         return Outcomes(answer.reward_NA, answer.prob_NAK, answer.discount_NAK, child_NAK, self.num_states)
 
     def _state_keys(self, state_N: Tensor) -> Tensor:

@@ -149,13 +149,13 @@ def grow(
         selection = Selection(rule, 1.25 if exploration is None else exploration)
         room = len(state_B) * simulations
         tree = Tree(known, leaves.expansions, selection, backup=backup, merge=merge, max_nodes=max_nodes, room=room)
-        node_B = tree.plant(state_B)
+        node_B = tree.nodes.add_roots(state_B)
         if root == "rule":
             _by_rule(tree, node_B, simulations - 1, wave)
         else:
             _halve(tree, node_B, simulations - 1, wave, _preference(known, state_B, generator))
-        pruned_NA = tree.settle(node_B)
-        q_NA = tree.q_NA[node_B]
+        pruned_NA = tree.backup_all(node_B)
+        q_NA = tree.nodes.q_NA[node_B]
     q_BA = q_NA[row_B]
     return Lookahead(
         q_BA,
@@ -163,7 +163,7 @@ def grow(
         pruned_BA=pruned_NA[row_B],
         model_calls=topology.model_calls - calls_before,
         critic_calls=leaves.calls,
-        nodes_per_level=tree.nodes_per_level(),
+        nodes_per_level=tree.nodes.nodes_per_level(),
     )
 
 
@@ -228,7 +228,7 @@ def _rounds(actions: int, simulations: int, wave: int | None) -> Iterator[tuple[
 
 def _order(tree: Tree, node_B: Tensor, preference_BA: Tensor, alive_BA: Tensor) -> Int[Tensor, "B A"]:
     """The actions of each root, best first: survivors before the others, complete ones last."""
-    score_BA = preference_BA + sigma(tree.q_NA[node_B], tree.visits_NA[node_B])
+    score_BA = preference_BA + sigma(tree.nodes.q_NA[node_B], tree.nodes.visits_NA[node_B])
     by_score_BA = score_BA.argsort(dim=1, descending=True, stable=True)
     rank_BA = torch.where(tree.open(node_B), torch.where(alive_BA, 0, 1), 2).gather(1, by_score_BA)
     return by_score_BA.gather(1, rank_BA.argsort(dim=1, stable=True))

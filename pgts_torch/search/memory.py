@@ -33,13 +33,13 @@ class Sizes:
     def known(self) -> int:
         """The row of `KnownStates`."""
         s, A, E = self._parts
-        return 2 * s + 8 + A * (4 * s + 8) + E * (4 * s + 16)
+        return 2 * s + 16 + A * (4 * s + 8) + E * 2 * s
 
     @property
     def node(self) -> int:
-        """The row of a `Tree`."""
+        """The row of `Nodes`."""
         s, A, E = self._parts
-        return 2 * s + 16 + A * (2 * s + 8) + E * (2 * s + 16)
+        return 2 * s + 24 + A * (2 * s + 8) + E * (2 * s + 16)
 
     @property
     def _parts(self) -> tuple[int, int, int]:

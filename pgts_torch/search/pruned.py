@@ -10,7 +10,8 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes, backup
 from pgts_torch.errors import NodeBudgetExceeded, check_count
 from pgts_torch.search.lookahead import Leaves, Lookahead, check_states, check_vector
-from pgts_torch.search.topology import Topology, counting
+from pgts_torch.search.outcome_table import has_weight
+from pgts_torch.search.topology import Topology
 
 
 @torch.no_grad()
@@ -145,7 +146,7 @@ class _Plan:
         self._average(regret_MA[regret_MA.isfinite()])
         scale = self._mean_regret.clamp(min=torch.finfo(regret_MA.dtype).tiny)
         flow_MA = torch.softmax(-regret_MA / scale, -1) * self.reach_N[level.kept_M].unsqueeze(-1)
-        weight_MAK = (step.prob_NAK * step.discount_NAK).masked_fill(~counting(step), 0.0)
+        weight_MAK = (step.prob_NAK * step.discount_NAK).masked_fill(~has_weight(step), 0.0)
         self.reach_N = torch.zeros_like(v_C).scatter_add_(
             0, step.child_NAK.flatten(), (flow_MA.unsqueeze(-1) * weight_MAK).flatten()
         )

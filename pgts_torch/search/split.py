@@ -46,17 +46,17 @@ class Selection:
         q_NA: Float[Tensor, "N A"],
         visits_NA: Float[Tensor, "N A"],
         prior_NA: Float[Tensor, "N A"],
-        shut_NA: Float[Tensor, "N A"],
+        exhausted_NA: Float[Tensor, "N A"],
         most_NA: Float[Tensor, "N A"] | None,
     ) -> Float[Tensor, "N A"]:
-        """How many of the simulations of a node each action gets: none where it is shut (-inf), at most `most_NA`."""
+        """How many of the simulations of a node each action gets: none where it is exhausted, at most `most_NA`."""
         if self.rule == "gumbel":
             policy_NA = prior_NA.double() * sigma(q_NA, visits_NA).exp_()
             policy_NA /= policy_NA.sum(1, keepdim=True).clamp_min_(torch.finfo(torch.float64).tiny)
             total_N1 = visits_NA.sum(1).add_(budget_N).unsqueeze(1)
-            return apportion(policy_NA.mul_(total_N1).sub_(visits_NA).add_(shut_NA), budget_N, most_NA)
+            return apportion(policy_NA.mul_(total_N1).sub_(visits_NA).add_(exhausted_NA), budget_N, most_NA)
         limit_NA = None if most_NA is None else visits_NA + most_NA
-        q_NA, given_NA = scaled(q_NA).add_(shut_NA), visits_NA.clone()
+        q_NA, given_NA = scaled(q_NA).add_(exhausted_NA), visits_NA.clone()
         for given in range(math.ceil(budget_N.amax())):
             total_N1, next_NA = given_NA.sum(1, keepdim=True), given_NA + 1
             if self.rule == "puct":

@@ -1,8 +1,8 @@
-"""Which states a lookahead meets at which level. Transitions do not depend on the policy: this outlives a call."""
+"""Which states a lookahead meets at which level. Transitions do not depend on the policy, so this outlives a search."""
 
 import math
 from collections import OrderedDict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import final
 
 import torch
@@ -10,27 +10,25 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import NodeBudgetExceeded, NotFinite, PgtsError
-from pgts_torch.models.base import EnumeratingModel, Model
+from pgts_torch.errors import NodeBudgetExceeded, PgtsError
+from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.search.lookahead import MAX_BYTES, check_states, check_vector
-from pgts_torch.search.memory import GROWTH, Sizes, check_memory, search_bytes
+from pgts_torch.search.memory import Sizes, check_memory, search_bytes
+from pgts_torch.search.outcome_table import OutcomeTable, check_outcomes, has_weight
 
 _REMEMBERED_ROOTS = 8
 """How many different batches of roots keep their levels."""
 
-_TOLERANCE = 1e-4
-"""By how much the probabilities of a model may miss 1: enough for many of them in float32."""
-
 
 @dataclass(eq=False)
 class Levels:
-    """The frontiers that a batch of roots unfolds into, as far as anyone has asked.
+    """The levels below a batch of roots, as far as a search has expanded them.
 
     frontiers: the distinct states at level 0, 1, ...
-    outcomes: outcomes[k] leads from frontier k to positions in frontier k + 1, or, in the last place once the search is
-        closed, to positions in the closed set.
-    closed: outcomes of the closed set in itself, once a level brings no new state; else None.
-    closed_states: every state met so far, in the order of `closed`; complete once the search is closed.
+    outcomes: outcomes[k] leads from frontier k to positions in frontier k + 1; the last one, where there is a closed
+        set, to positions in that.
+    closed: outcomes of the closed set, with positions in it as children; None until a level brings no new state.
+    closed_states: every state met so far, in the order of `closed`; all there are once there is a closed set.
     root_row_B: the position of each root in frontier 0.
     """
 
@@ -65,75 +63,24 @@ class Levels:
         return (*frontiers, *[len(self.closed_states)] * (expansions + 1 - len(frontiers)))
 
     def nodes(self, expansions: int) -> int:
-        """How many nodes the levels 0 .. expansions hold together, without listing them."""
+        """How many nodes the levels 0 .. expansions hold together; in constant time for any depth of a closed set."""
         frontiers = [len(frontier) for frontier in self.frontiers[: expansions + 1]]
         return sum(frontiers) + len(self.closed_states) * (expansions + 1 - len(frontiers))
 
 
-class _Rows:
-    """Outcomes to which rows are added. Room doubles when it is full: a row costs the same however many there are."""
-
-    def __init__(self) -> None:
-        self._table: Outcomes | None = None
-        self.count = 0
-
-    @property
-    def num_outcomes(self) -> int:
-        """The largest K so far; 1 where nothing was added."""
-        return 1 if self._table is None else self._table.num_outcomes
-
-    def rows(self, row_N: Int[Tensor, "N"]) -> Outcomes:
-        """Some of the rows that were added, in the order asked for."""
-        assert self._table is not None
-        return self._table.rows(row_N)
-
-    def all(self) -> Outcomes:
-        """All rows, in the memory where they lie."""
-        assert self._table is not None
-        table, n = self._table, self.count
-        return Outcomes(
-            table.reward_NA[:n], table.prob_NAK[:n], table.discount_NAK[:n], table.child_NAK[:n], table.num_children
-        )
-
-    def append(self, more: Outcomes) -> Int[Tensor, "N"]:
-        """Add copies of these rows, padded to the largest K so far, and say where they are."""
-        first, last = self.count, self.count + more.num_states
-        row_N = torch.arange(first, last, device=more.device)
-        columns = [*_tensors(self._table or more.rows(row_N[:0]))]
-        room, K = len(columns[0]), max(columns[1].shape[-1], more.num_outcomes)
-        room = room if last <= room else max(last, int(GROWTH * room))
-        self._table = None
-        for i, given in enumerate(_tensors(more)):  # one after the other, so that only one is there twice
-            columns[i] = _padded(columns[i], room, K)
-            columns[i][first:last, ..., : given.shape[-1]] = given
-        reward_NA, prob_NAK, discount_NAK, child_NAK = columns
-        self._table = Outcomes(reward_NA, prob_NAK, discount_NAK, child_NAK, more.num_children)
-        self.count = last
-        return row_N
-
-
-def _padded(x: Tensor, N: int, K: int) -> Tensor:
-    """The same column with room for N states, and for K outcomes if it is one of outcomes."""
-    by_outcome = x.ndim == 3
-    if len(x) == N and (not by_outcome or x.shape[-1] == K):
-        return x
-    more = (0, K - x.shape[-1], 0, 0, 0, N - len(x)) if by_outcome else (0, 0, 0, N - len(x))
-    return torch.nn.functional.pad(x, more)
-
-
-def _tensors(outcomes: Outcomes) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return outcomes.reward_NA, outcomes.prob_NAK, outcomes.discount_NAK, outcomes.child_NAK
-
-
 @final
 class Topology:
-    """What has been asked of a model so far: each (state, action) is asked once, in however many searches it occurs.
+    """What a model has answered so far: it is queried once for a (state, action), in however many searches that occurs.
 
-    Keep one beside a model and hand it to every search: a search over known states asks the model nothing, and a search
-    over the same roots finds its levels ready, to any depth.
+    Keep one beside a model and hand it to every search: a search over known states makes no model calls, and a search
+    from the same roots finds its levels ready, to any depth.
+
+    table: the outcomes, in the order of the queries.
+    row_S: the row of a state in `table`; -1 where the model was not queried. It may be longer than there are states.
+    model_calls: for how many (state, action) the model was queried.
 
     Args:
-        model: the model that answers.
+        model: enumerates outcomes.
         max_bytes: the most memory that a search may take, with all that is remembered here (`memory.search_bytes`).
     """
 
@@ -141,10 +88,10 @@ class Topology:
         self.model, self.max_bytes = model, max_bytes
         self.model_calls = 0
         self._generation = model.generation
-        self._known = _Rows()
-        self._row_S = torch.empty(0, dtype=torch.int64, device=model.device)
-        self._scratch_S = torch.empty(0, dtype=torch.int64, device=model.device)
-        self._levels: OrderedDict[bytes, Levels] = OrderedDict()
+        self.table = OutcomeTable(model)
+        self.row_S = torch.empty(0, dtype=torch.int64, device=model.device)
+        self._scratch_S = torch.empty(0, dtype=torch.int64, device=model.device)  # see `_position` and `_distinct`
+        self._levels: OrderedDict[bytes, Levels] = OrderedDict()  # by the bytes of the roots, least recently used first
 
     def levels(self, root_B: Int[Tensor, "B"], expansions: int, *, max_nodes: int) -> Levels:
         """The levels below `root_B`, at least `expansions` of them or a closed set.
@@ -155,9 +102,9 @@ class Topology:
             max_nodes: the most nodes, summed over levels 0 .. expansions.
 
         Raises:
-            PgtsError: no roots, or one that is not a state of the model; the model has forgotten its states since.
+            PgtsError: no roots, or one that is not a state of the model; the model has been reset since.
             NodeBudgetExceeded: the levels hold more nodes than that, or what follows them would take more memory than
-                `max_bytes`; the model has not been asked about them.
+                `max_bytes`; the model has not been queried for them.
         """
         self._check_generation()
         check_vector(root_B)
@@ -175,13 +122,13 @@ class Topology:
         self._check_nodes(levels, expansions, expansions, max_nodes)
         return levels
 
-    # What these make outlives the call: it must be ordinary tensors even if the caller is in inference mode.
+    # Methods whose tensors outlive the call leave inference mode: they must be ordinary ones for any later caller.
     @torch.inference_mode(False)
     @torch.no_grad()
-    def step(self, state_N: Int[Tensor, "N"], *, kept: int = 0, beside: int = 0) -> tuple[Outcomes, Int[Tensor, "C"]]:
-        """What follows these states, in terms of positions among their distinct children; and these, ascending.
+    def step(self, state_N: Int[Tensor, "N"], *, kept: int = 0) -> tuple[Outcomes, Int[Tensor, "C"]]:
+        """The outcomes of these states, with positions among their distinct children; and these children, ascending.
 
-        Nothing but the answers of the model is remembered. Where every outcome ends there are no children, and the
+        Only the answers of the model are remembered. Where every outcome is terminal there are no children, and the
         outcomes cannot be backed up.
 
         Args:
@@ -194,9 +141,9 @@ class Topology:
         self._grow_tables()
         self._afford(state_N, None, "one level", kept=kept)
         outcomes = self._outcomes(state_N)
-        counts_NAK = counting(outcomes)
-        children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
-        return self._renumbered(outcomes, counts_NAK, children), children
+        weighs_NAK = has_weight(outcomes)
+        children = self._distinct(outcomes.child_NAK.masked_select(weighs_NAK))
+        return self._with_positions(outcomes, weighs_NAK, children), children
 
     def fresh(self) -> "Topology":
         """An empty one of the same model and limits."""
@@ -205,31 +152,30 @@ class Topology:
     @property
     def num_outcomes(self) -> int:
         """K, as far as it is known by now."""
-        return max(self.model.num_outcomes or 1, self._known.num_outcomes)
+        return max(self.model.num_outcomes or 1, self.table.num_outcomes)
 
     @property
     def queried(self) -> Int[Tensor, "N"]:
-        """The states that the model has been asked about, ascending."""
-        return torch.nonzero(self._row_S >= 0).flatten()
+        """The states that the model was queried for, ascending."""
+        return torch.nonzero(self.row_S >= 0).flatten()
 
     @property
     def num_expanded(self) -> int:
         """How many states these are."""
-        return self._known.count
+        return self.table.count
 
     def expanded(self) -> tuple[Int[Tensor, "X"], Outcomes]:
-        """The states that the model has been asked about, in the order of asking, and what follows them, in terms of
-        states and in the memory where it lies."""
+        """The states that the model was queried for, in that order, and their outcomes, with states as children and in
+        the memory of the table."""
         queried = self.queried
         state_X = torch.empty_like(queried)
-        state_X[self._row_S[queried]] = queried
-        return state_X, replace(self._known.all(), num_children=self.model.num_states)
+        state_X[self.row_S[queried]] = queried
+        return state_X, self.table.all(self.model.num_states)
 
     @torch.inference_mode(False)
     @torch.no_grad()
     def preload(self, state_N: Int[Tensor, "N"]) -> None:
-        """Have the outcomes of these states ready, as if they had been asked about before; `model_calls` does not
-        count them."""
+        """Have the outcomes of these states ready, as after an earlier query; `model_calls` does not count them."""
         self._grow_tables()
         calls_before = self.model_calls
         if len(state_N):
@@ -249,14 +195,14 @@ class Topology:
     @torch.inference_mode(False)
     @torch.no_grad()
     def _expand(self, levels: Levels) -> None:
-        """One more level: ask about the states of the last frontier that are new, and find their children."""
+        """One more level: query the model for the states of the last frontier that are new, and find their children."""
         frontier = levels.frontiers[-1]
         outcomes = self._outcomes(frontier)
-        counts_NAK = counting(outcomes)
-        children = self._distinct(outcomes.child_NAK.masked_select(counts_NAK))
+        weighs_NAK = has_weight(outcomes)
+        children = self._distinct(outcomes.child_NAK.masked_select(weighs_NAK))
         new = self._missing(children, levels.closed_states)
-        step = self._renumbered(outcomes, counts_NAK, children if len(new) else levels.closed_states)
-        # Nothing is changed before the last thing that may fail for want of memory.
+        step = self._with_positions(outcomes, weighs_NAK, children if len(new) else levels.closed_states)
+        # `levels` changes only after the last thing that may fail for want of memory.
         if len(new):
             levels.closed_states = torch.cat([levels.closed_states, new])
             levels.frontiers.append(children)
@@ -265,40 +211,43 @@ class Topology:
         else:
             self._afford(levels.closed_states, levels, "the closed set")
             inside = self._outcomes(levels.closed_states)
-            levels.closed = self._renumbered(inside, counting(inside), levels.closed_states)
+            levels.closed = self._with_positions(inside, has_weight(inside), levels.closed_states)
         levels.outcomes.append(step)
 
     def _outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
-        """Outcomes in terms of states; the model is asked about those only that it has never been asked about."""
-        missing = state_N[self._row_S[state_N] < 0]
+        """Outcomes with states as children; the model is queried for new states only."""
+        missing = state_N[self.row_S[state_N] < 0]
         if len(missing):
             answer = self.model.outcomes(missing)
             self.model_calls += len(missing) * self.model.num_actions
             self._grow_tables()
-            check_answer(self.model, missing, answer)
-            self._row_S[missing] = self._known.append(answer)
-        return self._known.rows(self._row_S[state_N])
+            check_outcomes(self.model, missing, answer)
+            self.row_S[missing] = self.table.append(answer)
+        return self.table.rows(self.row_S[state_N], self.model.num_states)
 
-    def _renumbered(self, outcomes: Outcomes, counts_NAK: Bool[Tensor, "N A K"], states: Int[Tensor, "C"]) -> Outcomes:
-        """The same outcomes with children given by their position among `states`; those that do not count get 0."""
+    def _with_positions(
+        self, outcomes: Outcomes, weighs_NAK: Bool[Tensor, "N A K"], states: Int[Tensor, "C"]
+    ) -> Outcomes:
+        """The same outcomes with children given by their position among `states`; those without weight get 0."""
         position_NAK = self._position(states)[outcomes.child_NAK]
         return Outcomes(
             outcomes.reward_NA,
             outcomes.prob_NAK,
             outcomes.discount_NAK,
-            torch.where(counts_NAK, position_NAK, 0),
+            torch.where(weighs_NAK, position_NAK, 0),
             len(states),
         )
 
     def _distinct(self, state_N: Int[Tensor, "N"]) -> Int[Tensor, "distinct"]:
         """The states without repetition, ascending: one write and one read a state instead of sorting them all."""
+        # Every state's entry says where it occurs, in the end at one place only: that occurrence stays.
         order_N = torch.arange(len(state_N), device=self.model.device)
         self._scratch_S[state_N] = order_N
         return state_N[self._scratch_S[state_N] == order_N].sort().values
 
     def _missing(self, state_N: Int[Tensor, "N"], among: Int[Tensor, "C"]) -> Int[Tensor, "missing"]:
         """Those of the states that are not `among` others."""
-        self._scratch_S[state_N] = -1
+        self._scratch_S[state_N] = -1  # stays so where `among` has no position
         return state_N[self._position(among)[state_N] < 0]
 
     def _position(self, states: Int[Tensor, "N"]) -> Int[Tensor, "S"]:
@@ -308,8 +257,11 @@ class Topology:
         return self._scratch_S
 
     def _check_nodes(self, levels: Levels, level: int, expansions: int, max_nodes: int) -> int:
-        """How many nodes there are on levels 0 to `level`; NodeBudgetExceeded, saying how many there may be on all of
-        them, if these are more than `max_nodes`."""
+        """How many nodes there are on levels 0 to `level`.
+
+        Raises:
+            NodeBudgetExceeded: more than `max_nodes`; the message says how many there may be on all levels.
+        """
         nodes = levels.nodes(level)
         if nodes <= max_nodes:
             return nodes
@@ -321,8 +273,15 @@ class Topology:
         raise NodeBudgetExceeded(f"{size}: {_SMALLER}")
 
     def _afford(self, state_N: Int[Tensor, "N"], levels: Levels | None, which: str, *, kept: int = 0) -> None:
-        """NodeBudgetExceeded if what follows these states would not fit. Levels of other roots make room before."""
-        missing = int((self._row_S[state_N] < 0).sum())
+        """Make room for the outcomes of these states by dropping levels of other roots.
+
+        Args:
+            levels: those of the search under way, which stay.
+
+        Raises:
+            NodeBudgetExceeded: they would not fit all the same.
+        """
+        missing = int((self.row_S[state_N] < 0).sum())
         own = 0 if levels is None else levels.rows
 
         def needed() -> int:
@@ -331,24 +290,24 @@ class Topology:
 
         while needed() > self.max_bytes and any(each is not levels for each in self._levels.values()):
             self._levels.pop(next(key for key, each in self._levels.items() if each is not levels))
-        check_memory(needed(), self.max_bytes, self._told(which, len(state_N)))
-        if missing > 1 and self._known.count == 0 and self.model.num_outcomes is None:
-            self._probe(state_N[:1])  # one alone, to learn K
-            check_memory(needed(), self.max_bytes, self._told(which, len(state_N)))
+        check_memory(needed(), self.max_bytes, self._described(which, len(state_N)))
+        if missing > 1 and self.table.count == 0 and self.model.num_outcomes is None:
+            self._probe(state_N[:1])  # only the answer of the model tells K
+            check_memory(needed(), self.max_bytes, self._described(which, len(state_N)))
 
     @torch.inference_mode(False)
     @torch.no_grad()
     def _probe(self, state_N: Int[Tensor, "1"]) -> None:
         self._outcomes(state_N)
 
-    def _told(self, which: str, states: int) -> str:
+    def _described(self, which: str, states: int) -> str:
         A, K = self.model.num_actions, self.num_outcomes
         return f"the outcomes of {which} of the lookahead ({states} nodes, {A} actions, {K} outcomes of each)"
 
     def bytes(self, new: int, *, asked: int = 0, kept: int = 0, **counts: int) -> int:
-        """`search_bytes` of a search that asks about so many new states and looks up so many."""
+        """`search_bytes` of a search that queries the model for so many new states and looks up so many."""
         sizes = Sizes(self.model.num_actions, self.num_outcomes, self.model.dtype)
-        numbered, answered = max(self.model.num_states, len(self._row_S)), self._known.count + new
+        numbered, answered = max(self.model.num_states, len(self.row_S)), self.table.count + new
         if self.model.draws:
             rows = [step.num_states for each in self._levels.values() for step in each.outcomes]
             counts |= {"drawn": answered, "drawing": new, "resampled": max([asked, *rows])}
@@ -356,15 +315,15 @@ class Topology:
 
     def _check_generation(self) -> None:
         if self.model.generation != self._generation:
-            raise PgtsError("the model has forgotten its states since this topology was made: make a new topology")
+            raise PgtsError("the model has been reset since this topology was made: make a new topology")
 
     def _grow_tables(self) -> None:
-        """Room for the states that the model has numbered since, and for as many again: growing is rare."""
-        room = len(self._row_S)
+        """Room for the states that the model has met since, and for as many again: growing is rare."""
+        room = len(self.row_S)
         if self.model.num_states > room:
             missing = max(self.model.num_states, 2 * room) - room
             unknown = torch.full((missing,), -1, dtype=torch.int64, device=self.model.device)
-            self._row_S = torch.cat([self._row_S, unknown])
+            self.row_S = torch.cat([self.row_S, unknown])
             self._scratch_S = torch.cat([self._scratch_S, unknown])
 
 
@@ -374,56 +333,6 @@ def topology_of(model: EnumeratingModel, topology: Topology | None) -> Topology:
     if topology.model is not model:
         raise PgtsError("the topology belongs to another model")
     return topology
-
-
-def counting(outcomes: Outcomes) -> Bool[Tensor, "N A K"]:
-    """Where an outcome has weight. A terminal outcome, an action that is not allowed and padding have none, and what
-    follows them needs no node."""
-    allowed_NA1 = outcomes.reward_NA.unsqueeze(-1) > -torch.inf
-    return (outcomes.prob_NAK > 0) & (outcomes.discount_NAK > 0) & allowed_NA1
-
-
-def check_answer(model: Model, state_N: Int[Tensor, "N"], answer: Outcomes) -> None:
-    """PgtsError, naming the state, unless these may be the outcomes of so many states of the model."""
-    asked, given = (len(state_N), model.num_actions), tuple(answer.reward_NA.shape)
-    if given != asked:
-        raise PgtsError(f"the model answered for {given} states and actions; it was asked for {asked}")
-    for name, x in (("reward", answer.reward_NA), ("prob", answer.prob_NAK), ("discount", answer.discount_NAK)):
-        if x.dtype != model.dtype:
-            raise PgtsError(f"the model's {name} is {x.dtype}; its dtype is {model.dtype}")
-    best_N = answer.reward_NA.amax(-1)
-    if not bool(best_N.isfinite().all()):
-        n = int(torch.nonzero(~best_N.isfinite())[0, 0])
-        raise NotFinite(
-            f"the model's rewards in state {int(state_N[n])} are {answer.reward_NA[n].tolist()}; they must be "
-            "numbers, or -inf where an action is not allowed, and one action must be",
-            what="reward",
-        )
-    total_NA = torch.where(answer.reward_NA > -torch.inf, answer.prob_NAK.sum(-1), 1.0)
-    fair_NA = (total_NA - 1).abs() <= _TOLERANCE
-    if not bool(fair_NA.all()):
-        n, a = torch.nonzero(~fair_NA)[0].tolist()
-        raise PgtsError(
-            f"the model's probabilities of what follows state {int(state_N[n])} and action {a} sum to "
-            f"{float(total_NA[n, a])}"
-        )
-    most = 1 + _TOLERANCE
-    for name, x_NAK, highest in (("probability", answer.prob_NAK, most), ("discount", answer.discount_NAK, 1.0)):
-        off_NAK = ~((x_NAK >= 0) & (x_NAK <= highest))
-        if bool(off_NAK.any()):
-            n, a, k = torch.nonzero(off_NAK)[0].tolist()
-            raise PgtsError(
-                f"the model's {name} of outcome {k} of state {int(state_N[n])} and action {a} is "
-                f"{float(x_NAK[n, a, k])}; it must be in [0, 1]"
-            )
-    child_NAK = answer.child_NAK
-    off_NAK = (child_NAK < 0) | (child_NAK >= model.num_states)
-    if off_NAK.any():
-        n, a, k = torch.nonzero(off_NAK)[0].tolist()
-        raise PgtsError(
-            f"the model leads from state {int(state_N[n])} by action {a} to {int(child_NAK[n, a, k])}; "
-            f"states are 0 to {model.num_states - 1}"
-        )
 
 
 _SMALLER = "set a smaller depth or max_width, fewer environments, or the search sampled with fewer samples"

@@ -1,4 +1,4 @@
-"""Many search trees in one table of nodes. Simulations go down in waves, level by level, each level a few tensors.
+"""Many search trees at once. Simulations go down in waves, level by level, each level a few operations on tensors.
 
 A wave sends b simulations below a root at once: b is split among the actions, an action's share among its outcomes, an
 outcome's share goes to the node that it leads to, and so on; a node that is not expanded takes one simulation for that.
@@ -14,16 +14,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import NodeBudgetExceeded
-from pgts_torch.search.known import KnownStates, longer, widened
-from pgts_torch.search.memory import GROWTH, Sizes
+from pgts_torch.search.known import KnownStates
+from pgts_torch.search.nodes import Nodes
 from pgts_torch.search.split import Selection, apportion
 
 Backup = Literal["max", "mean"]
-
-_ROOM = 2**22
-"""The most edges for which there is room before they are needed."""
-
 
 _DUST = 1e-6
 """Shares of simulations below this are rounding and go nowhere."""
@@ -31,37 +26,47 @@ _DUST = 1e-6
 
 @dataclass(eq=False)
 class _Step:
-    """What a wave does on one level: it passes F nodes by M of their actions ("arms") and those by L outcomes.
+    """What a wave does on one level: it passes F nodes by M of their actions ("arms") and these by L outcomes
+    ("edges"), which lead to C children. G of the children pass simulations on.
 
-    An arm is a number node * A + action: K may grow during a wave, this stays.
+    An arm is a number node * A + action, an edge a number arm * K + k; K may grow during a wave, arms stay.
     """
 
-    node_F: Tensor
-    parent_M: Tensor  # position in F
-    arm_M: Tensor
-    known_arm_M: Tensor  # the same in the tables of `known`
-    row_L: Tensor  # position in M
-    outcome_L: Tensor
-    budget_L: Tensor
     level: int
-    child_C: Tensor = field(init=False)  # C distinct children; in a tree C = L
-    budget_C: Tensor = field(init=False)
-    used_C: Tensor = field(init=False)  # 1 where the child is new
-    on_G: Tensor = field(init=False)  # position in C of the G children that more simulations pass
-    at_L: Tensor | None = None  # in a graph: position in C
+    node_F: Tensor
+    parent_M: Tensor  # position of the arm's node in F
+    arm_M: Tensor
+    table_arm_M: Tensor  # the same (state, action) in the table of outcomes: row * A + action
+    row_L: Tensor  # position of the edge's arm in M
+    outcome_L: Tensor  # k
+    budget_L: Tensor  # simulations
+    child_C: Tensor = field(init=False)  # nodes, distinct in a graph; in trees C = L
+    budget_C: Tensor = field(init=False)  # simulations that arrive
+    used_C: Tensor = field(init=False)  # those that are used: 1 where the child is new, then what was used below it
+    on_G: Tensor = field(init=False)  # position in C
+    at_L: Tensor | None = None  # in a graph: position of the edge's child in C
+    edges: tuple[int, Tensor] = (0, torch.empty(0))  # what `edge` has made last, and K
 
-    def edge(self, arm_M: Tensor, K: int) -> Tensor:
-        """The outcomes, numbered arm * K + k."""
-        return torch.add(self.outcome_L, arm_M.index_select(0, self.row_L), alpha=K)
+    def edge(self, K: int) -> Tensor:
+        """The L edges. Made once, and again where K has grown."""
+        if self.edges[0] != K:
+            self.edges = K, torch.add(self.outcome_L, self.arm_M.index_select(0, self.row_L), alpha=K)
+        return self.edges[1]
+
+    def table_edge(self, K: int) -> Tensor:
+        """The same outcomes in the table: table_arm * K + k."""
+        return torch.add(self.outcome_L, self.table_arm_M.index_select(0, self.row_L), alpha=K)
 
 
 @final
 class Tree:
-    """Nodes that have been expanded, of all roots. Node 0 is none: an edge leads there before its child is expanded.
+    """Selects, expands and backs up nodes.
 
     Args:
         known: what is known of states.
         bottom: nodes at this level are never expanded.
+        selection: how actions are selected.
+        backup: maxima, or averages of returns.
         merge: a node is a (level, state), whatever the path that led to it: Czech et al. 2021.
         max_nodes: the most nodes, see `Lookahead.nodes_per_level`.
         room: for how many nodes there is room at first.
@@ -78,153 +83,84 @@ class Tree:
         max_nodes: int,
         room: int,
     ) -> None:
-        self.known, self.bottom, self.selection = known, bottom, selection
-        self.merge, self.mean, self.max_nodes = merge, backup == "mean", max_nodes
-        self.A, self.K, self.count = known.num_actions, known.num_outcomes, 1
-        self.arms = 0
-        known.check_memory(0, places=bottom + 1 + 2 * len(known.row_S) + (2 * self._places() if merge else 0))
-        self.valued = [0] * (bottom + 1)
-        self._full_T = dict[tuple[int, int], Tensor]()
-        most = known.max_bytes // (2 * Sizes(self.A, self.K, known.dtype).node)
-        room = min(room, most, _ROOM // (self.A * self.K)) + 1
-
-        def table(*shape: int, dtype: torch.dtype = known.dtype) -> Tensor:
-            return torch.zeros(shape, dtype=dtype, device=known.device)
-
-        A, E = self.A, self.A * self.K
-        self.state_N, self.level_N = table(room, dtype=torch.int64), table(room, dtype=torch.int64)  # rows of `known`
-        self.visits_NA, self.visits_NE = table(room, A, dtype=torch.float64), table(room, E, dtype=torch.float64)
-        self.q_NA, self.v_N, self.value_NE = table(room, A), table(room), table(room, E)
-        self.shut_action_NA, self.shut_N, self.shut_outcome_NE = table(room, A), table(room), table(room, E)
-        self.below_NE = table(room, E, dtype=torch.int64)
-        self.node_at = table(self._places() if merge else 0, dtype=torch.int64)  # in a graph, by (state, level)
-
-    # What a search does
-
-    def plant(self, root_B: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
-        """A node for each of these distinct states; it is expanded."""
-        self.valued[0] = len(root_B)
-        node_B = self._add(root_B, 0)
-        if self.merge:
-            self.node_at[self._place(root_B, 0)] = node_B
-        return node_B
-
-    def open(self, node_B: Int[Tensor, "B"]) -> Bool[Tensor, "B A"]:
-        """Actions of roots below which there is something to expand."""
-        return torch.isfinite(self.shut_action_NA.index_select(0, node_B))
-
-    def split(self, node_F: Int[Tensor, "F"], budget_F: Float[Tensor, "F"], level: int = 0) -> Float[Tensor, "F A"]:
-        """How many of the simulations that pass a node take each action."""
-        state_F, most_FA = self.state_N.index_select(0, node_F), None
-        visits_FA = self.visits_NA.index_select(0, node_F)
-        if not self.mean and int(budget_F.amax()) > 1:
-            most_FA = self.known.width_TA.index_select(0, state_F) * self._full(state_F, level).unsqueeze(1)
-            most_FA.sub_(visits_FA).clamp_min_(1)
-        return self.selection.split(
-            budget_F,
-            q_NA=self.q_NA.index_select(0, node_F),
-            visits_NA=visits_FA,
-            prior_NA=self.known.prior_TA.index_select(0, state_F),
-            shut_NA=self.shut_action_NA.index_select(0, node_F),
-            most_NA=most_FA,
-        )
+        self.known, self.bottom, self.selection, self.mean = known, bottom, selection, backup == "mean"
+        self.nodes = Nodes(known, bottom, merge=merge, revisits=self.mean, max_nodes=max_nodes, room=room)
+        self.merge, self.A = merge, known.num_actions
+        self._full_T = dict[tuple[int, int], Tensor]()  # see `_full`
 
     def wave(self, node_B: Int[Tensor, "B"], budget_BA: Float[Tensor, "B A"]) -> Float[Tensor, "B"]:
         """So many simulations below each action of these distinct roots; how many of each root could be used."""
         steps, node_F, budget_FA = list[_Step](), node_B, budget_BA
         for level in range(self.bottom):
-            step, budget_F = self._descend(node_F, budget_FA, level)
+            step = self._select(node_F, budget_FA, level)
+            left_G = self._expand(step)
             steps.append(step)
-            if len(budget_F) == 0:
+            if len(left_G) == 0:
                 break
             node_F = step.child_C.index_select(0, step.on_G)
-            budget_FA = self.split(node_F, budget_F, level + 1)
-        used_F, return_F = budget_F, budget_F
+            budget_FA = self.split(node_F, left_G, level + 1)
+        used_F, return_F = left_G, left_G  # there are none: no simulation passes the nodes at the last level
         for step in reversed(steps):
-            used_F, return_F = self._ascend(step, used_F, return_F)
+            used_F, return_F = self._backward(step, used_F, return_F)
         return used_F
 
-    def settle(self, node_B: Int[Tensor, "B"]) -> Float[Tensor, "B A"]:
-        """Back up a whole graph once from the bottom, for what the waves could not reach.
+    # Select
 
-        Returns:
-            `Lookahead.pruned_BA`: the most discounted probability that a plan after each action of the roots puts on
-            nodes that could be expanded; inf for averages, which have no bound and are as the waves left them.
-        """
-        if self.mean:
-            return torch.full_like(self.q_NA[node_B], torch.inf)
-        known, A, K = self.known, self.A, self.K
-        leaf_T = known.weight_TE.view(-1, A, K).sum(2).amax(1)
-        mass_N = leaf_T.index_select(0, self.state_N[: self.count])
-        mass_N.masked_fill_(self.level_N[: self.count] + 1 >= self.bottom, 0)
-        mass_N[0] = 1
-        inner_N = (self.visits_NA[: self.count].sum(1) > 0) | self.merge
-        inner_N[node_B], inner_N[0] = True, False
-        for level in range(self.bottom - 1, -1, -1):
-            node_F = (inner_N & (self.level_N[: self.count] == level)).nonzero().squeeze(1)
-            if self.merge:
-                self._meet(node_F, level)
-            if level + 1 < self.bottom:
-                weight_FE = known.weight_TE.index_select(0, self.state_N.index_select(0, node_F))
-                below_FE = self.below_NE.index_select(0, node_F)
-                mass_FE = weight_FE * mass_N.index_select(0, below_FE.view(-1)).view_as(weight_FE)
-                mass_FA = mass_FE.view(-1, A, K).sum(2)
-                mass_N[node_F] = mass_FA.amax(1)
-        if self.bottom == 1:
-            return torch.zeros_like(self.q_NA[node_B])
-        return mass_FA  # of the roots: level 0 has no other nodes
+    def open(self, node_B: Int[Tensor, "B"]) -> Bool[Tensor, "B A"]:
+        """Actions of roots below which there is something to expand."""
+        return torch.isfinite(self.nodes.exhausted_action_NA.index_select(0, node_B))
 
-    def nodes_per_level(self) -> tuple[int, ...]:
-        """How many nodes have been valued at each level, by the critic or by a look below."""
-        if self.merge:
-            for level in range(self.bottom):
-                state_F = self.state_N[1 : self.count][self.level_N[1 : self.count] == level]
-                seen_FE = torch.isfinite(self.known.shut_outcome_TE[state_F])
-                self.valued[level + 1] = len(self.known.child_TE[state_F][seen_FE].unique())
-        return tuple(self.valued)
+    def split(self, node_F: Int[Tensor, "F"], budget_F: Float[Tensor, "F"], level: int = 0) -> Float[Tensor, "F A"]:
+        """How many of the simulations that pass a node take each action."""
+        nodes, most_FA = self.nodes, None
+        known_F = nodes.known_N.index_select(0, node_F)
+        visits_FA = nodes.visits_NA.index_select(0, node_F)
+        if not self.mean and int(budget_F.amax()) > 1:
+            # No more than can be of use below the action, as far as that is known; but one, in case it is not.
+            most_FA = self.known.width_TA.index_select(0, known_F) * self._full(known_F, level).unsqueeze(1)
+            most_FA.sub_(visits_FA).clamp_min_(1)
+        return self.selection.split(
+            budget_F,
+            q_NA=nodes.q_NA.index_select(0, node_F),
+            visits_NA=visits_FA,
+            prior_NA=self.known.prior_TA.index_select(0, known_F),
+            exhausted_NA=nodes.exhausted_action_NA.index_select(0, node_F),
+            most_NA=most_FA,
+        )
 
-    # Down
-
-    def _descend(self, node_F: Tensor, budget_FA: Tensor, level: int) -> tuple[_Step, Tensor]:
-        """Share simulations among outcomes and expand what they meet; how many are left, where they can go on."""
-        known, A, K = self.known, self.A, self.K
+    def _select(self, node_F: Tensor, budget_FA: Tensor, level: int) -> _Step:
+        """Split the simulations of each action among its outcomes."""
+        nodes, A, K = self.nodes, self.A, self.nodes.K
+        # M of the F * A actions have simulations; `at_M` is parent * A + action, so that node * A + action, the arm,
+        # is at_M + (node - parent) * A.
         at_M = budget_FA.view(-1).nonzero().squeeze(1)
-        self.arms = max(self.arms, len(at_M))
+        nodes.most_arms = max(nodes.most_arms, len(at_M))
         budget_M = budget_FA.view(-1).index_select(0, at_M)
         parent_M = at_M.div(A, rounding_mode="trunc")
         node_M = node_F.index_select(0, parent_M)
         arm_M = torch.add(at_M, node_M - parent_M, alpha=A)
-        state_M = self.state_N.index_select(0, node_M)
-        known_arm_M = torch.add(arm_M, state_M - node_M, alpha=A)
-        lack_MK = known.prob_TE.view(-1, K).index_select(0, known_arm_M)
-        lack_MK.mul_((self.visits_NA.view(-1).index_select(0, arm_M) + budget_M).unsqueeze(1))
-        visits_MK, most_MK = self.visits_NE.view(-1, K).index_select(0, arm_M), None
+        table_row_M = nodes.table_row_N.index_select(0, node_M)
+        table_arm_M = torch.add(arm_M, table_row_M - node_M, alpha=A)
+        # What each outcome lacks of the simulations due to it, p_k (N_a + b) - N_k: chance is enumerated evenly.
+        lack_MK = self.known.topology.table.prob_RAK.view(-1, K).index_select(0, table_arm_M).double()
+        lack_MK.mul_((nodes.visits_NA.view(-1).index_select(0, arm_M) + budget_M).unsqueeze(1))
+        visits_MK, most_MK = nodes.visits_NE.view(-1, K).index_select(0, arm_M), None
         lack_MK.sub_(visits_MK)
-        lack_MK.add_(self.shut_outcome_NE.view(-1, K).index_select(0, arm_M))
+        lack_MK.add_(nodes.exhausted_outcome_NE.view(-1, K).index_select(0, arm_M))
         if not self.mean and int(budget_M.amax()) > 1:
-            most_MK = (self._full(state_M, level).unsqueeze(1) - visits_MK).clamp_min_(1)
+            known_M = nodes.known_N.index_select(0, node_M)
+            most_MK = (self._full(known_M, level).unsqueeze(1) - visits_MK).clamp_min_(1)
         split = apportion(lack_MK, budget_M, most_MK).view(-1)
+        # L of the M * K outcomes get simulations.
         at_L = split.nonzero().squeeze(1)
-        budget_L = split.index_select(0, at_L)
         row_L = at_L.div(K, rounding_mode="trunc")
         outcome_L = torch.sub(at_L, row_L, alpha=K)
-        step = _Step(node_F, parent_M, arm_M, known_arm_M, row_L, outcome_L, budget_L, level)
-        if level + 1 == self.bottom:  # averages alone get here
-            step.budget_C = step.used_C = budget_L
-            step.child_C, step.on_G = torch.zeros_like(at_L), at_L[:0]
-            return step, budget_L[:0]
-        state_L = known.child_TE.view(-1).index_select(0, step.edge(known_arm_M, K))
-        if self.merge:
-            self._expand_graph(step, state_L)
-        else:
-            self._expand_tree(step, state_L)
-        rest_C = step.budget_C - step.used_C
-        can_C = (rest_C > _DUST) & (self.shut_N.index_select(0, step.child_C) == 0)
-        step.on_G = can_C.nonzero().squeeze(1)
-        return step, rest_C.index_select(0, step.on_G)
+        budget_L = split.index_select(0, at_L)
+        return _Step(level, node_F, parent_M, arm_M, table_arm_M, row_L, outcome_L, budget_L)
 
-    def _full(self, state_F: Tensor, level: int) -> Tensor:
-        """What a subtree below each outcome can use, if all states in it have as many outcomes as its root's parent.
+    def _full(self, known_F: Tensor, level: int) -> Tensor:
+        """How many simulations a subtree below each outcome can use, if all states in it have as many outcomes as the
+        state that the outcome belongs to.
 
         An estimate, in order that simulations do not crowd where there is little to expand: 1 + e + e^2 + ...
         """
@@ -235,154 +171,177 @@ class Tree:
             for _ in range(self.bottom - 1 - level):
                 full_T.mul_(outcomes_T).add_(1)
             self._full_T[key] = full_T
-        return self._full_T[key].index_select(0, state_F)
+        return self._full_T[key].index_select(0, known_F)
+
+    # Expand
+
+    def _expand(self, step: _Step) -> Tensor:
+        """Expand new children, which takes one simulation each; how many are left where they can go on."""
+        if step.level + 1 == self.bottom:  # only averages pass edges to the last level, to see its values again
+            step.budget_C = step.used_C = step.budget_L
+            step.child_C, step.on_G = torch.zeros_like(step.row_L), step.row_L[:0]
+            return step.budget_L[:0]
+        child = self.known.topology.table.child_RAK.view(-1)
+        state_L = child.index_select(0, step.table_edge(self.nodes.K))
+        if self.merge:
+            self._expand_graph(step, state_L)
+        else:
+            self._expand_tree(step, state_L)
+        left_C = step.budget_C - step.used_C
+        can_C = (left_C > _DUST) & (self.nodes.exhausted_N.index_select(0, step.child_C) == 0)
+        step.on_G = can_C.nonzero().squeeze(1)
+        return left_C.index_select(0, step.on_G)
 
     def _expand_tree(self, step: _Step, state_L: Tensor) -> None:
-        child_L = self.below_NE.view(-1).index_select(0, step.edge(step.arm_M, self.K))
+        nodes = self.nodes
+        child_L = nodes.below_NE.view(-1).index_select(0, step.edge(nodes.K))
         new = (child_L == 0).nonzero().squeeze(1)
         step.budget_C, step.used_C, step.child_C = step.budget_L, torch.zeros_like(step.budget_L), child_L
         if len(new):
-            node = self._add(state_L.index_select(0, new), step.level + 1)
+            node = nodes.add(state_L.index_select(0, new), step.level + 1)
             child_L.scatter_(0, new, node)
             step.used_C.index_fill_(0, new, 1)
-            self.below_NE.view(-1).scatter_(0, step.edge(step.arm_M, self.K).index_select(0, new), node)
+            nodes.below_NE.view(-1).scatter_(0, step.edge(nodes.K).index_select(0, new), node)
 
     def _expand_graph(self, step: _Step, state_L: Tensor) -> None:
-        """As in a tree; all that meet in a node put their simulations together, and it hears what others found."""
-        new_C = state_L[self.node_at.index_select(0, self._place(state_L, step.level + 1)) == 0].unique()
-        first = self.count
+        """As in trees, but the simulations of all edges that lead to a node arrive there together, and nodes that other
+        paths have expanded are backed up first, so that what was found below them counts."""
+        nodes, level = self.nodes, step.level + 1
+        new_C = state_L[nodes.node_at.index_select(0, nodes.place(state_L, level)) == 0].unique()
+        first = nodes.count
         if len(new_C):
-            node_C = self._add(new_C, step.level + 1)
-            self.node_at[self._place(new_C, step.level + 1)] = node_C
-        child_L = self.node_at[self._place(state_L, step.level + 1)]
+            node_C = nodes.add(new_C, level)
+            nodes.node_at[nodes.place(new_C, level)] = node_C
+        child_L = nodes.node_at[nodes.place(state_L, level)]
         step.child_C, step.at_L = child_L.unique(return_inverse=True)
         step.budget_C = step.budget_L.new_zeros(len(step.child_C)).index_add_(0, step.at_L, step.budget_L)
         step.used_C = (step.child_C >= first).to(step.budget_L.dtype)
-        self._meet(step.child_C[step.child_C < first], step.level + 1)
+        self._back_up_whole(step.child_C[step.child_C < first], level)
 
-    def _add(self, state_N: Tensor, level: int) -> Tensor:
-        """Nodes for these states; nothing leads to them yet.
+    # Backward
 
-        Raises:
-            NodeBudgetExceeded: they would not fit into memory, and the model has not been asked about them; or they are
-                too many.
+    def _backward(self, step: _Step, used_G: Tensor, return_G: Tensor) -> tuple[Tensor, Tensor]:
+        """Back up the nodes of a level; how many simulations each used, and, for averages, the sum of their returns.
+
+        Args:
+            used_G, return_G: the same of the children that more simulations passed.
         """
-        known, N = self.known, len(state_N)
-        state_N = known.rows(state_N, **self._counts(N))
-        self._reserve(N)
-        new = slice(self.count, self.count + N)
-        self.count += N
-        self.state_N[new], self.level_N[new] = state_N, level
-        for name in ("q", "shut_action"):
-            torch.index_select(getattr(known, f"{name}_TA"), 0, state_N, out=getattr(self, f"{name}_NA")[new])
-        for name in ("value", "shut_outcome"):
-            torch.index_select(getattr(known, f"{name}_TE"), 0, state_N, out=getattr(self, f"{name}_NE")[new])
-        for name in ("v", "shut"):
-            torch.index_select(getattr(known, f"{name}_T"), 0, state_N, out=getattr(self, f"{name}_N")[new])
-        if level + 1 == self.bottom and (level == 0 or not self.mean):
-            self.shut_N[new], self.shut_action_NA[new] = -torch.inf, -torch.inf
-        self.valued[level + 1] += int(known.outcomes_T.index_select(0, state_N).sum())
-        nodes = sum(self.valued)
-        if nodes > self.max_nodes and (nodes := sum(self.nodes_per_level())) > self.max_nodes:
-            raise NodeBudgetExceeded(
-                f"the search has {nodes} nodes; max_nodes is {self.max_nodes}: "
-                "lower the simulations, ask for fewer roots or raise the budget"
-            )
-        return torch.arange(new.start, new.stop, device=known.device)
-
-    def _reserve(self, rows: int) -> None:
-        """Room for so many more nodes, and for what has become known since."""
-        if (K := self.known.num_outcomes) > self.K:
-            for name in ("visits_NE", "value_NE", "shut_outcome_NE", "below_NE"):
-                fill = -torch.inf if name.startswith("shut") else 0
-                setattr(self, name, widened(getattr(self, name), self.K, K, fill))
-            self.K = K
-        if self.merge and self._places() > len(self.node_at):
-            self.node_at = longer(self.node_at, self._places())
-        if self.count + rows > len(self.state_N):
-            for name, table in vars(self).items():
-                if name.endswith(("_N", "_NA", "_NE")):
-                    setattr(self, name, longer(table, max(self.count + rows, int(GROWTH * len(table)))))
-
-    def _counts(self, rows: int) -> dict[str, int]:
-        """What `search_bytes` counts once there are so many more nodes."""
-        nodes = max(self.count + rows, int(len(self.state_N) / GROWTH) if self.count > 1 else 0)
-        places = self.bottom + 1 + 2 * len(self.known.row_S) + (2 * self._places() if self.merge else 0)
-        return {"nodes": nodes, "places": places, "arms": self.arms}
-
-    def _places(self) -> int:
-        return len(self.known.row_S) * (self.bottom + 1)
-
-    def _place(self, state_N: Tensor, level: int) -> Tensor:
-        """In a graph: where in `node_at` the nodes of these states stand."""
-        return state_N * (self.bottom + 1) + level
-
-    # Up
-
-    def _ascend(self, step: _Step, used_G: Tensor, return_G: Tensor) -> tuple[Tensor, Tensor]:
-        """Back up the nodes of a level; how many simulations each used, and, for averages, the sum of their returns."""
-        edge_L = step.edge(step.arm_M, self.K)
+        nodes = self.nodes
+        edge_L = step.edge(nodes.K)
         used_C = step.used_C.index_add(0, step.on_G, used_G)
+        # In a graph the edges that lead to a node share what it used, as they have shared in what arrived there.
         used_L = used_C if step.at_L is None else step.budget_L * (used_C / step.budget_C)[step.at_L]
-        if self.mean:
+        if self.mean:  # a return can be averaged however little was expanded
             used_L = step.budget_L
         used_M = used_G.new_zeros(len(step.arm_M)).index_add_(0, step.row_L, used_L)
-        F, visits_M = len(step.node_F), self.visits_NA.view(-1).index_select(0, step.arm_M)
         if self.mean:
-            return_G = self._average(step, edge_L, return_G, visits_M, used_M)
+            return_G = self._average(step, edge_L, return_G, used_M)
         elif self.merge:
-            self._meet(step.node_F, step.level)
+            self._back_up_whole(step.node_F, step.level)
         else:
-            for name in ("value", "shut_outcome"):
-                of_child_N = self.v_N if name == "value" else self.shut_N
-                getattr(self, f"{name}_NE").view(-1).scatter_(0, edge_L, of_child_N.index_select(0, step.child_C))
-            self._back_up(step.node_F, step.arm_M, step.known_arm_M)
-        self.visits_NA.view(-1).scatter_(0, step.arm_M, visits_M + used_M)
-        self.visits_NE.view(-1).scatter_add_(0, edge_L, used_L)
-        return used_M.new_zeros(F).index_add_(0, step.parent_M, used_M), return_G
+            nodes.value_NE.view(-1).scatter_(0, edge_L, nodes.v_N.index_select(0, step.child_C))
+            nodes.exhausted_outcome_NE.view(-1).scatter_(0, edge_L, nodes.exhausted_N.index_select(0, step.child_C))
+            self._back_up(step.node_F, step.arm_M, step.table_arm_M)
+        nodes.visits_NA.view(-1).scatter_add_(0, step.arm_M, used_M)
+        nodes.visits_NE.view(-1).scatter_add_(0, edge_L, used_L)
+        return used_M.new_zeros(len(step.node_F)).index_add_(0, step.parent_M, used_M), return_G
 
-    def _back_up(self, node_F: Tensor, arm_M: Tensor, known_arm_M: Tensor) -> None:
-        """q of these actions and v of these nodes, and whether they are shut."""
-        known, K = self.known, self.K
-        q_MK = self.value_NE.view(-1, K).index_select(0, arm_M)
-        q_MK *= known.weight_TE.view(-1, K).index_select(0, known_arm_M)
-        q_M = q_MK.sum(1).add_(known.reward_TA.view(-1).index_select(0, known_arm_M))
-        self.q_NA.view(-1).scatter_(0, arm_M, q_M)
-        shut_M = self.shut_outcome_NE.view(-1, K).index_select(0, arm_M).amax(1)
-        self.shut_action_NA.view(-1).scatter_(0, arm_M, shut_M)
-        self.v_N.scatter_(0, node_F, self.q_NA.index_select(0, node_F).amax(1))
-        self.shut_N.scatter_(0, node_F, self.shut_action_NA.index_select(0, node_F).amax(1))
+    def _back_up(self, node_F: Tensor, arm_M: Tensor, table_arm_M: Tensor) -> None:
+        """q of these actions and v of these nodes, and whether they are exhausted."""
+        nodes, table, K = self.nodes, self.known.topology.table, self.nodes.K
+        q_MK = table.prob_RAK.view(-1, K).index_select(0, table_arm_M)
+        q_MK *= table.discount_RAK.view(-1, K).index_select(0, table_arm_M)
+        q_MK *= nodes.value_NE.view(-1, K).index_select(0, arm_M)
+        q_M = q_MK.sum(1).add_(table.reward_RA.view(-1).index_select(0, table_arm_M))
+        nodes.q_NA.view(-1).scatter_(0, arm_M, q_M)
+        exhausted_M = nodes.exhausted_outcome_NE.view(-1, K).index_select(0, arm_M).amax(1)
+        nodes.exhausted_action_NA.view(-1).scatter_(0, arm_M, exhausted_M)
+        nodes.v_N.scatter_(0, node_F, nodes.q_NA.index_select(0, node_F).amax(1))
+        nodes.exhausted_N.scatter_(0, node_F, nodes.exhausted_action_NA.index_select(0, node_F).amax(1))
 
-    def _meet(self, node_F: Tensor, level: int) -> None:
-        """In a graph: back up nodes from all children that there are now, whoever expanded them."""
-        known, state_F = self.known, self.state_N[node_F]
-        below_FE = self.node_at[self._place(known.child_TE[state_F], level + 1)]
-        self.below_NE[node_F] = below_FE
-        self.value_NE[node_F] = torch.where(below_FE > 0, self.v_N[below_FE], known.value_TE[state_F])
+    def _back_up_whole(self, node_F: Tensor, level: int) -> None:
+        """In a graph: back up all actions of nodes from the children that there are now, whoever expanded them."""
+        nodes, known, A = self.nodes, self.known, self.A
+        known_F, table_row_F = nodes.known_N.index_select(0, node_F), nodes.table_row_N.index_select(0, node_F)
+        child_FE = known.topology.table.child_RAK.flatten(1).index_select(0, table_row_F)
+        below_FE = nodes.node_at.take(nodes.place(child_FE, level + 1))
+        nodes.below_NE.index_copy_(0, node_F, below_FE)
+        of_critic_FE = known.value_TE.index_select(0, known_F)
+        nodes.value_NE.index_copy_(0, node_F, torch.where(below_FE > 0, nodes.v_N.take(below_FE), of_critic_FE))
         if level + 1 < self.bottom:
-            self.shut_outcome_NE[node_F] = known.shut_outcome_TE[state_F] + self.shut_N[below_FE]
+            # Node 0, which stands for a child that is not expanded, is not exhausted.
+            exhausted_FE = known.exhausted_outcome_TE.index_select(0, known_F)
+            nodes.exhausted_outcome_NE.index_copy_(0, node_F, exhausted_FE.add_(nodes.exhausted_N.take(below_FE)))
         else:
-            self.shut_outcome_NE[node_F] = -torch.inf
-        action_A = torch.arange(self.A, device=known.device)
-        arm_FA, known_arm_FA = (x_F.unsqueeze(1) * self.A + action_A for x_F in (node_F, state_F))
-        self._back_up(node_F, arm_FA.view(-1), known_arm_FA.view(-1))
+            nodes.exhausted_outcome_NE.index_fill_(0, node_F, -torch.inf)
+        action_A = torch.arange(A, device=known.device)
+        arm_FA, table_arm_FA = (x_F.unsqueeze(1) * A + action_A for x_F in (node_F, table_row_F))
+        self._back_up(node_F, arm_FA.view(-1), table_arm_FA.view(-1))
 
-    def _average(
-        self, step: _Step, edge_L: Tensor, return_G: Tensor, visits_M: Tensor, used_M: Tensor
-    ) -> Float[Tensor, "F"]:
-        """q = (q_0 + sum of returns) / (1 + N). A return is a critic's value, backed up along the path."""
-        known, ended_L = self.known, step.budget_L.clone()
+    def _average(self, step: _Step, edge_L: Tensor, return_G: Tensor, used_M: Tensor) -> Float[Tensor, "F"]:
+        """q = (q_0 + sum of returns) / (1 + N). A return is a critic's value, backed up along the path.
+
+        Returns:
+            The sum of the returns that pass each node.
+        """
+        nodes, table = self.nodes, self.known.topology.table
+        # Simulations that end here see the child's value, the others bring a return from below.
+        ended_L = step.budget_L.clone()
         if len(step.on_G):
             ended_L[step.on_G] = step.used_C[step.on_G]
         if step.level + 1 == self.bottom:
-            value_L = self.value_NE.view(-1).index_select(0, edge_L)
+            value_L = nodes.value_NE.view(-1).index_select(0, edge_L)
         else:
-            value_L = self.v_N.index_select(0, step.child_C)
+            value_L = nodes.v_N.index_select(0, step.child_C)
         return_L = (ended_L * value_L).index_add_(0, step.on_G, return_G)
-        return_L *= known.carry_TE.view(-1).index_select(0, step.edge(step.known_arm_M, self.K))
-        return_M = used_M * known.reward_TA.view(-1).index_select(0, step.known_arm_M)
+        # Only outcomes that have weight are drawn: gamma_k, times the probability that one has.
+        node_M = step.node_F.index_select(0, step.parent_M)
+        known_arm_M = torch.add(step.arm_M, nodes.known_N.index_select(0, node_M) - node_M, alpha=self.A)
+        weighed_M = self.known.weighed_TA.view(-1).index_select(0, known_arm_M)
+        carry_L = table.discount_RAK.view(-1).index_select(0, step.table_edge(nodes.K))
+        return_L *= carry_L.mul_(weighed_M.index_select(0, step.row_L))
+        return_M = used_M * table.reward_RA.view(-1).index_select(0, step.table_arm_M)
         return_M.index_add_(0, step.row_L, return_L)
-        before_M = self.q_NA.view(-1).index_select(0, step.arm_M)
+        visits_M = nodes.visits_NA.view(-1).index_select(0, step.arm_M)
+        before_M = nodes.q_NA.view(-1).index_select(0, step.arm_M)
         q_M = (before_M * (1 + visits_M) + return_M) / (1 + visits_M + used_M)
-        self.q_NA.view(-1).scatter_(0, step.arm_M, q_M.to(before_M.dtype))
+        nodes.q_NA.view(-1).scatter_(0, step.arm_M, q_M.to(before_M.dtype))
         return used_M.new_zeros(len(step.node_F)).index_add_(0, step.parent_M, return_M)
+
+    def backup_all(self, node_B: Int[Tensor, "B"]) -> Float[Tensor, "B A"]:
+        """Back up a whole graph once from the bottom, for what the waves could not reach.
+
+        Args:
+            node_B: the roots.
+
+        Returns:
+            `Lookahead.pruned_BA`: the most discounted probability that a plan after each action of the roots puts on
+            nodes that could be expanded; inf for averages, which have no bound and are as the waves left them.
+        """
+        nodes = self.nodes
+        if self.mean:
+            return torch.full_like(nodes.q_NA[node_B], torch.inf)
+        known, A, K, count = self.known, self.A, nodes.K, nodes.count
+        # mass_N: the same after each node. Above the last level all edges of a node lead to nodes that could be
+        # expanded; node 0 is one of these.
+        all_T = torch.arange(known.count, device=known.device)
+        leaf_T = known.weight_NE(all_T).view(-1, A, K).sum(2).amax(1)
+        mass_N = leaf_T.index_select(0, nodes.known_N[:count])
+        mass_N.masked_fill_(nodes.level_N[:count] + 1 >= self.bottom, 0)
+        mass_N[0] = 1
+        # Trees are backed up already; there only the mass of nodes that a wave has passed is still to be found.
+        inner_N = (nodes.visits_NA[:count].sum(1) > 0) | self.merge
+        inner_N[node_B], inner_N[0] = True, False
+        for level in range(self.bottom - 1, -1, -1):
+            node_F = (inner_N & (nodes.level_N[:count] == level)).nonzero().squeeze(1)
+            if self.merge:
+                self._back_up_whole(node_F, level)
+            if level + 1 < self.bottom:
+                weight_FE = known.weight_NE(nodes.known_N.index_select(0, node_F))
+                below_FE = nodes.below_NE.index_select(0, node_F)
+                mass_FE = weight_FE * mass_N.index_select(0, below_FE.view(-1)).view_as(weight_FE)
+                mass_FA = mass_FE.view(-1, A, K).sum(2)
+                mass_N[node_F] = mass_FA.amax(1)
+        if self.bottom == 1:
+            return torch.zeros_like(nodes.q_NA[node_B])
+        return mass_FA  # of the roots: level 0 has no other nodes

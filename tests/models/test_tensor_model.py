@@ -285,7 +285,7 @@ def test_after_clear_numbers_begin_anew_and_an_old_topology_refuses_to_go_on():
     assert model.num_states == 0
     model.number(torch.arange(1_000, dtype=torch.float64).view(-1, 2))  # more than there were: counting would not tell
     for _ in range(2):
-        with pytest.raises(PgtsError, match=r"has forgotten its states .*make a new topology"):
+        with pytest.raises(PgtsError, match=r"has been reset .*make a new topology"):
             look(topology)
     assert torch.equal(look(Topology(model)), before)
 

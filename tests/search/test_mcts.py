@@ -503,7 +503,7 @@ def test_rules_with_exploration_hand_out_the_whole_budget_and_no_more_also_where
     """In a graph it may: paths that meet share what was used below."""
     budget_N, zero_NA = torch.tensor([0.25, 3.5, 2.0], dtype=torch.float64), torch.zeros(3, 2, dtype=torch.float64)
     given_NA = Selection(rule, 1.25).split(
-        budget_N, q_NA=zero_NA, visits_NA=zero_NA, prior_NA=zero_NA + 0.5, shut_NA=zero_NA, most_NA=None
+        budget_N, q_NA=zero_NA, visits_NA=zero_NA, prior_NA=zero_NA + 0.5, exhausted_NA=zero_NA, most_NA=None
     )
     torch.testing.assert_close(given_NA.sum(1), budget_N)
 
@@ -514,11 +514,11 @@ def test_rules_with_exploration_give_to_one_after_another_and_never_to_a_shut_or
     generator = stream(seed, "selection")
     q_A, prior_A = (torch.rand(A, dtype=torch.float64, generator=generator) for _ in range(2))
     visits_A, most_A = (torch.randint(0, 6, (A,), generator=generator).double() for _ in range(2))
-    shut_A = torch.zeros(A, dtype=torch.float64).masked_fill_(torch.rand(A, generator=generator) < 0.3, -math.inf)
+    exhausted_A = torch.zeros(A, dtype=torch.float64).masked_fill_(torch.rand(A, generator=generator) < 0.3, -math.inf)
     given_A = visits_A.clone()
     worth_A = (q_A - q_A.max()) / (q_A.max() - q_A.min()).clamp_min(1e-12)
     for _ in range(budget):
-        open_A = (shut_A == 0) & (given_A < visits_A + most_A)
+        open_A = (exhausted_A == 0) & (given_A < visits_A + most_A)
         if not open_A.any():
             break
         total = given_A.sum()
@@ -528,7 +528,7 @@ def test_rules_with_exploration_give_to_one_after_another_and_never_to_a_shut_or
             else ((1 + total).log() / (1 + given_A)).sqrt()
         )
         given_A[torch.where(open_A, worth_A + 1.25 * bonus_A, -math.inf).argmax()] += 1
-    asked = {"q_NA": q_A, "visits_NA": visits_A, "prior_NA": prior_A, "shut_NA": shut_A, "most_NA": most_A}
+    asked = {"q_NA": q_A, "visits_NA": visits_A, "prior_NA": prior_A, "exhausted_NA": exhausted_A, "most_NA": most_A}
     split_NA = Selection(rule, 1.25).split(
         torch.tensor([budget]).double(), **{name: x[None] for name, x in asked.items()}
     )

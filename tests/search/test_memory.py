@@ -129,7 +129,7 @@ def test_rows_of_tables_are_what_they_take():
     known = KnownStates(Topology(model), Leaves(model, 2, None, zeros))
     known.rows(ROOT)
     tree = Tree(known, 3, Selection("gumbel", 1.25), backup="max", merge=False, max_nodes=100, room=1)
-    assert sizes.node == bytes_of(tree, "_N", "_NA", "_NE")
+    assert sizes.node == bytes_of(tree.nodes, "_N", "_NA", "_NE")
     assert sizes.known == bytes_of(known, "_T", "_TA", "_TE")
 
 

@@ -271,7 +271,7 @@ class Liar(EnumeratingModel):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("rows", r"model answered for \(1, 2\) states and actions; it was asked for \(3, 2\)"),
+        ("rows", r"model returned outcomes of \(1, 2\) states and actions; they must be of \(3, 2\)"),
         ("far", "model leads from state 4 by action 1 to 5; states are 0 to 4"),
         ("negative", "model leads from state 4 by action 1 to -1; states are 0 to 4"),
     ],
