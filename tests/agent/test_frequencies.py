@@ -4,10 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 
 from pgts_torch.agent.frequencies import MARGINS, Frequencies
 from pgts_torch.agent.model_check import ENOUGH
+from tests import reliability
 
 LISTED = np.array([[1 / 3, 1 / 3, 1 / 3], [0.5, 0.5, 0.0], [0.1, 0.2, 0.7], [1.0, 0.0, 0.0]])
 
@@ -59,12 +61,35 @@ def test_the_evidence_is_that_of_bets_made_step_by_step_in_any_order():
     assert max(map(abs, test.log_evidence)) > 0.1
 
 
-def test_true_probabilities_are_never_called_wrong_and_e_has_a_mean_of_at_most_1():
-    runs = [followed(LISTED, seed=seed, batches=12, batch=150)[1] for seed in range(150)]
-    assert max(evidence[:, 0].max() for evidence in runs) < ENOUGH / 2
-    for margin in range(len(MARGINS)):
-        last = np.exp([evidence[-1, margin] for evidence in runs])
-        assert last.mean() <= 1 + 4 * last.std() / math.sqrt(len(last))
+@pytest.mark.parametrize(("runs", "batches"), [(150, 12), pytest.param(2_000, 43, marks=pytest.mark.long)])
+def test_true_probabilities_are_never_called_wrong_and_e_is_as_seldom_large_as_it_may_be(runs, batches):
+    """Runs of 1,800 steps, in the long form of 6,450.
+
+    If Prop. 7 holds, P(E ever reaches x) <= 1/x in a run, and each of the five counts is above its limit with a
+    probability below 1e-6: the number of runs in which that happens is at most binomial.
+    """
+    evidence_RTM = np.stack([followed(LISTED, seed=seed, batches=batches, batch=150)[1] for seed in range(runs)])
+    highest_RM = evidence_RTM.max(1)
+    assert int((highest_RM[:, 0] >= ENOUGH).sum()) == 0
+    for x in (20, 1_000):
+        counts = (highest_RM >= math.log(x)).sum(0)
+        assert counts.max() <= scipy.stats.binom.isf(1e-6, runs, 1 / x)
+    off = followed(LISTED + 0.06 * np.array([[1, -1, 0]] * 3 + [[0, 0, 0]]), seed=0, batches=60, batch=600)[1]
+    assert off.max(0).min() > math.log(1_000)
+    if runs >= 2_000:
+        reached = (highest_RM[:, 0] >= math.log(20)).sum()
+        reliability.record(
+            "sequential tests of true probabilities",
+            runs=runs,
+            stopped=0,
+            evidence_above_20=int(reached),
+            of_at_most=runs // 20,
+        )
+
+
+def test_e_has_a_mean_of_at_most_1():
+    last_RM = np.exp([followed(LISTED, seed=seed, batches=12, batch=150)[1][-1] for seed in range(150)])
+    assert (last_RM.mean(0) <= 1 + 4 * last_RM.std(0) / math.sqrt(len(last_RM))).all()
 
 
 def test_probabilities_within_the_margin_are_never_called_wrong_though_they_are_doubted():
