@@ -24,8 +24,9 @@ import gymnasium
 import torch
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 
-import pgts_torch.agent.pgts as algorithm_module
+import pgts_torch.agent.visit as visit_module
 from pgts_torch import PGTS
+from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.run import build
 
@@ -86,7 +87,7 @@ def our_training(case: Case, steps: int, seed: int) -> dict[str, float]:
         seed=seed,
     )
     asked: list[int] = []
-    with common.timed(algorithm_module, "rollout") as collecting:
+    with common.timed(visit_module, "rollout") as collecting:
         begin = time.process_time()
         model.learn(steps, callback=lambda _, iteration: asked.append(iteration.experience.alive_TB.numel()))
         seconds = time.process_time() - begin
@@ -188,7 +189,7 @@ def lookahead(config: str, changes: list[str], depth: int, device: str) -> dict[
     found: dict[str, list[float]] = {"seconds": [], "looking": [], "calls": [], "states": []}
     while len(found["seconds"]) < ITERATIONS and sum(found["seconds"]) < MOST_SECONDS:
         begin = time.process_time()
-        with common.timed(model, "lookahead") as looks:
+        with common.timed(PolicyLookahead, "in_parts") as looks:
             iteration = model.iterate()
         found["seconds"].append(time.process_time() - begin)
         found["looking"].append(sum(looks))
