@@ -67,11 +67,14 @@ class Batch:
         """What the policies are worth, and the cells after one update."""
         S = len(self._reward_SA)
         M_BSS = torch.einsum("bsa,sat->bst", cells.pi_BSA, self._weight_SAS)
+        # One factorisation of I - gamma P^pi for each setting serves two solves: v = (I - gamma P^pi)^-1 r^pi here, and
+        # below, with its transpose, d = mu^T (I - gamma P^pi)^-1.
         factors, pivots = torch.linalg.lu_factor(torch.eye(S, dtype=torch.float64) - M_BSS)
         reward_BS = (cells.pi_BSA * self._reward_SA).sum(-1)
         v_BS = torch.linalg.lu_solve(factors, pivots, reward_BS[..., None]).squeeze(-1)
         start_BS = self._start_S.expand(v_BS.shape)
         d_BS = torch.linalg.lu_solve(factors, pivots, start_BS[..., None], adjoint=True).squeeze(-1)
+        # Rounding may leave a visited state with 0 or less, and one that is not visited with more.
         visited_BS = _reached((start_BS > 0) | (d_BS > CERTAIN), M_BSS)
         d_BS = torch.where(visited_BS, d_BS.clamp(min=torch.finfo(torch.float64).tiny), 0.0)
         iterate = Iterate(cells.pi_BSA, v_BS @ self._start_S, d_BS)
@@ -88,6 +91,7 @@ class Batch:
         """T^m Q^pi, with an m for each setting."""
         q_BSA = self._backup(v_BS)
         for level in range(1, int(depth_B.max()) + 1):
+            # Settings of a smaller depth are done: only the deeper ones are backed up once more.
             deeper_N = torch.nonzero(depth_B >= level).flatten()
             q_BSA[deeper_N] = self._backup(q_BSA[deeper_N].amax(-1))
         return q_BSA
@@ -96,7 +100,8 @@ class Batch:
         return (v_BS @ self._weight_XS.T).view(-1, *self._reward_SA.shape) + self._reward_SA
 
     def _moved(self, cells: Cells, look_BSA: Tensor, d_BS: Tensor) -> Tensor:
-        # Every update takes the step size only as a factor of the weights, so each setting can have its own.
+        # Every update takes the step size only as a factor of the weights, so each setting can have its own; the states
+        # of all settings stand in one batch of N = B * S rows.
         weight_BS = cells.step_B[:, None] * d_BS
         A = look_BSA.shape[-1]
         moved_NA = self._step(cells.pi_BSA.reshape(-1, A), look_BSA.reshape(-1, A), weight_BS.reshape(-1), 1.0)

@@ -64,11 +64,11 @@ def memberships(mdp: TabularMDP, pattern: str, depths: int) -> list[Membership]:
     Raises:
         PgtsError: the MDP has not two actions, or the pattern does not fit it.
     """
-    world = _World.of(mdp)
-    _check(pattern, world)
+    exact = _Fractions.of(mdp)
+    _check(pattern, exact)
     tried = _draws(pattern)
-    verdicts = [world.stationary_depths(right_S, depths) for right_S in tried]
-    return [_membership(world, pattern, tried, [row[m] for row in verdicts], m) for m in range(depths)]
+    verdicts = [exact.stationary_depths(right_S, depths) for right_S in tried]
+    return [_membership(exact, pattern, tried, [row[m] for row in verdicts], m) for m in range(depths)]
 
 
 def policy(pattern: str, interior: float = 0.5) -> Float[Tensor, "S 2"]:
@@ -78,20 +78,20 @@ def policy(pattern: str, interior: float = 0.5) -> Float[Tensor, "S 2"]:
 
 
 def _membership(
-    world: "_World", pattern: str, tried: list[tuple[Fraction, ...]], member: list[bool], depth: int
+    exact: "_Fractions", pattern: str, tried: list[tuple[Fraction, ...]], member: list[bool], depth: int
 ) -> Membership:
     if len(set(member)) == 1:
         return Membership("all" if member[0] else "none")
-    found = [_threshold(world, tried, s, depth) for s, mark in enumerate(pattern) if mark == SOMETIMES]
+    found = [_threshold(exact, tried, s, depth) for s, mark in enumerate(pattern) if mark == SOMETIMES]
     deciding = [answer for answer in found if answer is not None]
     return deciding[0] if len(deciding) == 1 else Membership("some")
 
 
-def _threshold(world: "_World", tried: list[tuple[Fraction, ...]], state: int, depth: int) -> Membership | None:
+def _threshold(exact: "_Fractions", tried: list[tuple[Fraction, ...]], state: int, depth: int) -> Membership | None:
     """The critical probability of one state, if it is the same whatever the other states do; else None."""
 
     def member(right_S: tuple[Fraction, ...], probability: Fraction) -> bool:
-        return world.stationary_depths((*right_S[:state], probability, *right_S[state + 1 :]), depth + 1)[depth]
+        return exact.stationary_depths((*right_S[:state], probability, *right_S[state + 1 :]), depth + 1)[depth]
 
     low, high = INTERIOR[0], INTERIOR[-1]
     below = member(tried[0], low)
@@ -122,21 +122,21 @@ def _filled(pattern: str, values: tuple[Fraction, ...]) -> tuple[Fraction, ...]:
     return tuple(next(rest) if mark == SOMETIMES else Fraction(mark) for mark in pattern)
 
 
-def _check(pattern: str, world: "_World") -> None:
-    if len(pattern) != len(world.reward) or set(pattern) - {NEVER, SOMETIMES, ALWAYS}:
-        raise PgtsError(f"pattern is {pattern!r}; it must be {len(world.reward)} characters of 0, x and 1")
+def _check(pattern: str, exact: "_Fractions") -> None:
+    if len(pattern) != len(exact.reward) or set(pattern) - {NEVER, SOMETIMES, ALWAYS}:
+        raise PgtsError(f"pattern is {pattern!r}; it must be {len(exact.reward)} characters of 0, x and 1")
 
 
 @dataclass(frozen=True)
-class _World:
-    """A two-action MDP in fractions: reward[s][a], successors[s][a] as {child: weight}, and the start states."""
+class _Fractions:
+    """A two-action MDP in fractions: reward[s][a], successors[s][a] as {child: p gamma}, and the start states."""
 
     reward: list[list[Fraction]]
     successors: list[list[dict[int, Fraction]]]
     starts: list[int]
 
     @classmethod
-    def of(cls, mdp: TabularMDP) -> "_World":
+    def of(cls, mdp: TabularMDP) -> "_Fractions":
         if mdp.num_actions != 2:
             raise PgtsError(f"the MDP has {mdp.num_actions} actions; patterns are those of two")
         reward = [[_fraction(r) for r in row] for row in mdp.outcomes.reward_NA.tolist()]
@@ -177,6 +177,7 @@ class _World:
         S = len(self.reward)
         rows = [self._equation(s, right_S[s]) for s in range(S)]
         for s in range(S):
+            # Fractions do not round, so any pivot that is not 0 will do.
             pivot = next(t for t in range(s, S) if rows[t][s])
             rows[s], rows[pivot] = rows[pivot], rows[s]
             rows[s] = [x / rows[s][s] if x else x for x in rows[s]]

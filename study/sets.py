@@ -8,7 +8,7 @@ from typing import Any
 
 import scipy.stats
 
-from pgts_torch.experiment import stationary as counting
+from pgts_torch.experiment.stationary import Counts, count_policies, to_json
 from pgts_torch.tabular import ascent, grid, ladder, random_mdp, stationary, tightrope
 from study import table1
 from study.claims import Claim, Finding, judge
@@ -36,7 +36,7 @@ def compute(effort: Effort, report: Report) -> dict[str, Any]:
     found = {name: table1.members(column) for name, column in table1.PAPER.items()}
     tables = {name: table1.table(column, found[name]) for name, column in table1.PAPER.items()}
     report("stationary: enumerating policies")
-    counted = {name: counting.study(make()) for name, make in COUNTED.items()}
+    counted = {name: count_policies(make()) for name, make in COUNTED.items()}
     seeds = range(2 if effort.quick else 20)
     report(f"stationary: random families, {len(seeds)} seeds")
     rows = family_study(seeds=seeds)
@@ -46,7 +46,7 @@ def compute(effort: Effort, report: Report) -> dict[str, Any]:
         "quick": effort.quick,
         "parameters": [asdict(parameter) for parameter in _parameters(rows, len(seeds))],
         "table1": tables,
-        "counted": {name: counting.to_json(one) for name, one in counted.items()},
+        "counted": {name: to_json(one) for name, one in counted.items()},
         "family": [asdict(row) for row in rows],
         "claims": [claim.plain() for claim in _claims(found, tables, counted, rows)],
     }
@@ -55,7 +55,7 @@ def compute(effort: Effort, report: Report) -> dict[str, Any]:
 def _claims(
     found: Mapping[str, table1.Found],
     tables: Mapping[str, dict[str, Any]],
-    counted: Mapping[str, counting.Study],
+    counted: Mapping[str, Counts],
     rows: Sequence[FamilyRow],
 ) -> list[Claim]:
     return [
@@ -95,7 +95,7 @@ def _nested(name: str, found: table1.Found) -> Finding:
     return Finding({"MDP": name}, text, grown == 0)
 
 
-def _worst_return(name: str, one: counting.Study) -> Finding:
+def _worst_return(name: str, one: Counts) -> Finding:
     worst = [row.worst_return for row in one.depths]
     text = f"{name}: b^m = " + ", ".join(f"{value:.4g}" for value in worst)
     return Finding({"MDP": name}, text, all(b >= a - 1e-9 for a, b in itertools.pairwise(worst)))
@@ -108,7 +108,7 @@ def _table(table: dict[str, Any]) -> Finding:
     return Finding({}, text, not kinds)
 
 
-def _finite(counted: Mapping[str, counting.Study], rows: Sequence[FamilyRow]) -> list[Finding]:
+def _finite(counted: Mapping[str, Counts], rows: Sequence[FamilyRow]) -> list[Finding]:
     named = ", ".join(f"{one.sufficient_depth} ({name})" for name, one in counted.items())
     largest = max(row.sufficient_depth for row in rows)
     text = f"M = {named}; at most {largest} in {len(rows)} random MDPs"

@@ -236,8 +236,8 @@ def stationary(arguments: Arguments) -> None:
             parser.error(f"--{name} does not apply to {what}, which takes {', '.join(f'--{n}' for n in known)}")
     from pgts_torch.experiment import stationary as sets
 
-    study = sets.answer(what, **options)
-    print(json.dumps(sets.to_json(study)) if as_json else sets.describe(study))
+    counts = sets.answer(what, **options)
+    print(json.dumps(sets.to_json(counts)) if as_json else sets.describe(counts))
 
 
 NPZ_HELP = """\

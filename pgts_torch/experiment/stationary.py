@@ -39,8 +39,8 @@ class DepthRow:
 
 
 @dataclass(frozen=True)
-class Study:
-    """The stationary sets of one MDP.
+class Counts:
+    """How many policies are in the stationary sets of one MDP, and how bad they are.
 
     escape_depths: how many policies leave Pi^m first at each depth; `NEVER` stands for the optimal ones.
     sufficient_depth: the smallest M with Pi^M = Pi^inf.
@@ -56,14 +56,14 @@ class Study:
     depths: tuple[DepthRow, ...]
 
 
-def answer(what: str, **options: Any) -> Study:
-    """The study of the MDP that `make` builds from the same arguments, on one thread."""
+def answer(what: str, **options: Any) -> Counts:
+    """The counts of the MDP that `make` builds from the same arguments, on one thread."""
     torch.set_num_threads(1)
-    return study(make(what, **options))
+    return count_policies(make(what, **options))
 
 
 def make(what: str, **options: Any) -> TabularMDP:
-    """The MDP that `pgts stationary` was asked for.
+    """The MDP that `pgts stationary` names.
 
     Args:
         what: ladder, tightrope, random, grid, deep_sea, or the path of a file that `TabularMDP.load_npz` reads.
@@ -89,7 +89,7 @@ def make(what: str, **options: Any) -> TabularMDP:
     return _from_file(Path(what), options)
 
 
-def study(mdp: TabularMDP) -> Study:
+def count_policies(mdp: TabularMDP) -> Counts:
     """Enumerate the deterministic policies and hold the bounds beside the truth, for each depth 0 .. M.
 
     Raises:
@@ -111,21 +111,21 @@ def study(mdp: TabularMDP) -> Study:
         )
 
     rows = tuple(row(depth) for depth in range(M + 1))
-    return Study(mdp.num_states, mdp.num_actions, len(sets.J_P), sets.J_optimal, M, sets.histogram, rows)
+    return Counts(mdp.num_states, mdp.num_actions, len(sets.J_P), sets.J_optimal, M, sets.histogram, rows)
 
 
-def to_json(study: Study) -> dict[str, Any]:
-    """The study in the types of JSON: a bound that says nothing is null, the optimal policies escape at "never"."""
-    answer = asdict(study)
-    answer["escape_depths"] = {_depth_name(depth): count for depth, count in study.escape_depths.items()}
+def to_json(counts: Counts) -> dict[str, Any]:
+    """The counts in the types of JSON: a bound that says nothing is null, the optimal policies escape at "never"."""
+    answer = asdict(counts)
+    answer["escape_depths"] = {_depth_name(depth): count for depth, count in counts.escape_depths.items()}
     for row in answer["depths"]:
         row |= {name: None for name, value in row.items() if value == math.inf}
     return answer
 
 
-def describe(study: Study) -> str:
-    """The study as tables within 80 columns."""
-    return "\n".join(_lines(study))
+def describe(counts: Counts) -> str:
+    """The counts as tables within 80 columns."""
+    return "\n".join(_lines(counts))
 
 
 def _from_file(path: Path, options: dict[str, Any]) -> TabularMDP:
@@ -146,13 +146,13 @@ def _size(options: dict[str, Any], default: int, num_actions: int, num_states: C
     return n
 
 
-def _lines(study: Study) -> Iterator[str]:
-    yield f"{study.num_states} states, {study.num_actions} actions, {study.num_policies:,} deterministic policies"
-    yield f"J* = {study.J_optimal:.8g}"
-    yield f"sufficient depth M = {study.sufficient_depth}: all policies in Pi^{study.sufficient_depth} are optimal"
+def _lines(counts: Counts) -> Iterator[str]:
+    yield f"{counts.num_states} states, {counts.num_actions} actions, {counts.num_policies:,} deterministic policies"
+    yield f"J* = {counts.J_optimal:.8g}"
+    yield f"sufficient depth M = {counts.sufficient_depth}: all policies in Pi^{counts.sufficient_depth} are optimal"
     yield ""
     yield "depth     |Pi^m|        b^m   J* - b^m   by values    by reach  closed form"
-    shown = [row for row in study.depths if len(study.depths) <= ALL_ROWS or _changes(study, row.depth)]
+    shown = [row for row in counts.depths if len(counts.depths) <= ALL_ROWS or _changes(counts, row.depth)]
     for row in shown:
         bounds = (row.value_bound, row.reachable_bound, row.closed_form_bound)
         value, reach, closed = ("none" if math.isinf(bound) else f"{bound:.5g}" for bound in bounds)
@@ -160,7 +160,7 @@ def _lines(study: Study) -> Iterator[str]:
             f"{row.depth:>5}  {row.count:>9}  {row.worst_return:>9.5g}  {row.lack:>9.5g}  {value:>10}  {reach:>10}  "
             f"{closed:>11}"
         )
-    if len(shown) < len(study.depths):
+    if len(shown) < len(counts.depths):
         yield "Depths at which |Pi^m| stays the same are left out."
     yield from (
         "",
@@ -171,13 +171,13 @@ def _lines(study: Study) -> Iterator[str]:
         "",
     )
     yield f"{'escapes at':>10}  {'policies':>9}"
-    most = max(study.escape_depths.values())
-    for depth, count in sorted(study.escape_depths.items(), key=lambda item: (item[0] == NEVER, item[0])):
+    most = max(counts.escape_depths.values())
+    for depth, count in sorted(counts.escape_depths.items(), key=lambda item: (item[0] == NEVER, item[0])):
         yield f"{_depth_name(depth):>10}  {count:>9}  {'#' * math.ceil(BAR * count / most)}"
 
 
-def _changes(study: Study, depth: int) -> bool:
-    return depth == 0 or depth in study.escape_depths
+def _changes(counts: Counts, depth: int) -> bool:
+    return depth == 0 or depth in counts.escape_depths
 
 
 def _depth_name(depth: int) -> str:
