@@ -240,7 +240,7 @@ def _episodes(
         raise _failure(env, "at the start", words.tolist(), error) from error
     try:
         observations = [world.encode(episodes.observation)]
-        reads = [model_world.read(episodes.observation)] if model_world else []
+        reads = [model_world.read(episodes.observation, observations[-1])] if model_world else []
     except BaseException as error:
         raise _failure(env, "at the start", *episodes.blame(error)) from error
     # What is small stays in numpy until the end: on tensors of a few numbers, each operation costs several times more.
@@ -254,7 +254,7 @@ def _episodes(
                 world.reward_range.check(reward_B[alive_B])
             observations.append(world.encode(episodes.observation))
             if model_world:
-                reads.append(model_world.read(episodes.observation))
+                reads.append(model_world.read(episodes.observation, observations[-1]))
         except BaseException as error:
             raise _failure(env, f"in step {len(rows)}", *episodes.blame(error)) from error
         survival_B = horizon.survival(torch.from_numpy(discount_B), generator).numpy()

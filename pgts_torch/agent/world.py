@@ -113,11 +113,12 @@ class ModelWorld(World, ABC):
     keeps_numbers: bool = False
 
     @abstractmethod
-    def read(self, observation: Any) -> Shaped[Tensor, "B ..."]:
+    def read(self, observation: Any, encoded_B: Tensor) -> Shaped[Tensor, "B ..."]:
         """What the states that the environments are in now are told apart by.
 
         Args:
             observation: what they have just said.
+            encoded_B: the same, as a policy sees it.
         """
 
     @abstractmethod
@@ -168,9 +169,9 @@ class TabularWorld(ModelWorld):
         """S and A."""
         return self.model.num_states, self.num_actions
 
-    def read(self, observation: Any) -> Int[Tensor, "B"]:
-        """The states."""
-        return self.encode(observation)
+    def read(self, observation: Any, encoded_B: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
+        """The observations, which are the states."""
+        return encoded_B
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
         """The observations."""
@@ -214,7 +215,7 @@ class SimulatedWorld(ModelWorld):
         self.model: SimulatorModel = model
         self._envs = env.envs
 
-    def read(self, observation: Any) -> Int[Tensor, "B"]:
+    def read(self, observation: Any, encoded_B: Tensor) -> Int[Tensor, "B"]:
         """The number of a snapshot of each environment."""
         return self.model.roots(self._envs, iterate(self.env.observation_space, observation)).to(self.device)
 
@@ -256,7 +257,7 @@ class DynamicsWorld(ModelWorld):
         self.model: ClassicModel = model
         self._envs = env.envs
 
-    def read(self, observation: Any) -> Float[Tensor, "B D"]:
+    def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B D"]:
         """The vector of each environment."""
         return self.model.vectors(self._envs)
 

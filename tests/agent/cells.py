@@ -41,7 +41,8 @@ def vector_of(*makers: Callable[[], gymnasium.Env]) -> SyncVectorEnv:
 def reached(world: ModelWorld) -> tuple[torch.Tensor, torch.Tensor]:
     """The number of the state in which the first copy begins, and what it shows, after a reset with seed 0."""
     observation, _ = world.env.reset(seed=0)
-    return world.numbers(world.read(observation))[:1], world.encode(observation)[:1]
+    encoded = world.encode(observation)
+    return world.numbers(world.read(observation, encoded))[:1], encoded[:1]
 
 
 def agrees(world: ModelWorld, actions: Sequence[int]) -> bool:

@@ -90,7 +90,7 @@ WORLDS = {
 
 def numbered(world: World, observation: np.ndarray) -> Tensor:
     """The numbers of the states that the copies are in now."""
-    return world.numbers(world.read(observation))
+    return world.numbers(world.read(observation, world.encode(observation)))
 
 
 def walked(world: World, steps: int) -> tuple[list[Tensor], list[Tensor]]:
