@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.tracking import read_metrics
@@ -111,15 +112,20 @@ def test_a_number_that_is_not_finite_in_the_second_process_stops_both_and_is_wri
     folder = tmp_path / "run"
 
     def work() -> int:
-        look = PGTS.lookahead
+        look, iterate, models = PolicyLookahead.__call__, PGTS.iterate, list[PGTS]()
 
-        def blind(self: PGTS, state_N: torch.Tensor, *, depth: int | None = None) -> Any:
-            found = look(self, state_N, depth=depth)
-            if self.ranks.rank == 1 and self.num_iterations == 1:
+        def watched(self: PGTS) -> Any:
+            models.append(self)
+            return iterate(self)
+
+        def blind(self: PolicyLookahead, state_N: torch.Tensor, *rest: Any) -> Any:
+            found = look(self, state_N, *rest)
+            if models[-1].ranks.rank == 1 and models[-1].num_iterations == 1:
                 check_finite("lookahead", "the lookahead", found.q_BA * torch.nan, state_N)
             return found
 
-        PGTS.lookahead = blind  # type: ignore[method-assign]  # in this process, which ends here
+        # In this process, which ends here.
+        PGTS.iterate, PolicyLookahead.__call__ = watched, blind  # type: ignore[method-assign]
         return main(arguments(folder))
 
     assert launched(2, work) == [1, 1]
