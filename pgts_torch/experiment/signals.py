@@ -1,9 +1,11 @@
 """Signals that end a training, but not in the middle of an iteration."""
 
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self, final
 
@@ -16,7 +18,8 @@ class StopFlag:
     """Records the first signal; a second one ends the process at once, with exit code 128 + signal.
 
     Handles SIGTERM, SIGINT and, unless it is ignored (as under nohup), SIGHUP. A second SIGHUP is ignored: a closing
-    terminal may send two.
+    terminal may send two. A signal that another library's C code handles (`faulthandler.register`) is left to it,
+    because Python could not restore that handler; this is detected on Linux.
 
     Use it as a context: leaving it restores the previous handlers. Outside the main thread, where Python receives no
     signals, it records nothing.
@@ -38,7 +41,7 @@ class StopFlag:
             heard = [signal.SIGTERM, signal.SIGINT]
             if _HANG_UP is not None and signal.getsignal(_HANG_UP) is not signal.SIG_IGN:
                 heard.append(_HANG_UP)
-            self._before = {each: signal.signal(each, self._on_signal) for each in heard}
+            self._before = {each: signal.signal(each, self._on_signal) for each in heard if not _is_foreign(each)}
         return self
 
     def __exit__(
@@ -53,3 +56,14 @@ class StopFlag:
         elif number != _HANG_UP:
             self._at_once()
             os._exit(128 + number)
+
+
+def _is_foreign(number: signal.Signals) -> bool:
+    """Whether a handler is installed that Python does not know of: it reports None, or believes that there is none."""
+    if (known := signal.getsignal(number)) is None or callable(known):
+        return known is None
+    try:
+        caught = re.search(r"^SigCgt:\s*(\w+)", Path("/proc/self/status").read_text(), re.MULTILINE)
+    except OSError:
+        return False
+    return caught is not None and bool(int(caught[1], 16) >> (number - 1) & 1)

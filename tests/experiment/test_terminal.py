@@ -1,5 +1,7 @@
-"""Output that goes nowhere, pipes in place of files, names that are too long or not of this locale."""
+"""Output that goes nowhere, pipes in place of files, names that are too long or not of this locale, and signals that
+others hear."""
 
+import faulthandler
 import json
 import os
 import signal
@@ -11,6 +13,7 @@ import pytest
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.cli import main
+from pgts_torch.experiment.signals import StopFlag
 from pgts_torch.experiment.terminal import SafeStream
 from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.tabular import TabularMDP
@@ -144,3 +147,19 @@ def test_a_warning_on_the_command_line_is_one_line_without_its_place_in_the_code
     first, second, *_ = done.stderr.splitlines()
     assert first == "warning: the table is odd"
     assert second == "<string>:7: RuntimeWarning: of another kind"
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+def test_a_signal_with_a_handler_that_is_not_of_python_stays_with_it(number, tmp_path):
+    before = signal.signal(number, signal.SIG_DFL)
+    with (tmp_path / "traces").open("w+") as file:
+        faulthandler.register(number, file)
+        try:
+            with StopFlag() as stop:
+                os.kill(os.getpid(), number)
+            assert stop.signal is None
+            os.kill(os.getpid(), number)
+        finally:
+            faulthandler.unregister(number)
+        assert (tmp_path / "traces").read_text().count("most recent call first") == 2
+    signal.signal(number, before)
