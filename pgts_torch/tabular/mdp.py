@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from pgts_torch import files
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.tabular import npz
@@ -179,11 +180,12 @@ class TabularMDP:
         )
 
     def save_npz(self, path: str | Path) -> None:
-        """Write the MDP as `load_npz` reads it, without names and shape of the picture.
+        """Write the MDP as `load_npz` reads it, without names and shape of the picture. Only a file that `load_npz`
+        reads is replaced, and an empty one; whoever reads it meanwhile finds the old MDP or the new one.
 
         Raises:
-            PgtsError: the outcomes have several discounts (some end an episode, for instance), or the file cannot be
-                written.
+            PgtsError: the outcomes have several discounts (some end an episode, for instance), another file is there,
+                or the file cannot be written.
         """
         outcomes = self.outcomes
         happens_SAK = outcomes.prob_NAK > 0
@@ -204,7 +206,16 @@ class TabularMDP:
             "gamma": gamma,
             "start": self.start_S.numpy(),
         }
-        npz.write_arrays(path, arrays)
+        npz.write_arrays(files.target(path, lambda _: self._is_npz(path), "an MDP that load_npz reads", most=1), arrays)
+
+    @classmethod
+    def _is_npz(cls, path: str | Path) -> bool:
+        """Whether a file holds an MDP."""
+        try:
+            cls.load_npz(path)
+        except PgtsError:
+            return False
+        return True
 
     @classmethod
     def load_npz(cls, path: str | Path) -> Self:

@@ -1,5 +1,6 @@
 """The arrays of an MDP in a file of numpy.savez."""
 
+import io
 import math
 import struct
 import zipfile
@@ -35,11 +36,9 @@ _UNREADABLE = (
 
 def write_arrays(path: str | Path, arrays: dict[str, Any]) -> None:
     """PgtsError if the file cannot be written."""
-    try:
-        with open(path, "wb") as file:  # numpy would append .npz to a path without it
-            np.savez_compressed(file, **arrays)
-    except OSError as error:
-        raise PgtsError(f"{path}: cannot be written: {error.strerror}") from error
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    files.replace(path, buffer.getvalue())
 
 
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:

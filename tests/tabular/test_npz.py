@@ -180,6 +180,24 @@ def test_an_mdp_with_ends_is_not_written_and_the_reason_is_given(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_file_that_is_no_mdp_is_not_replaced(tmp_path):
+    results, notes, empty = tmp_path / "results.npz", tmp_path / "notes.txt", tmp_path / "empty.npz"
+    np.savez(results, scores=np.arange(3.0))
+    notes.write_text("chapter 1")
+    empty.touch()
+    for path in (results, notes):
+        before = path.read_bytes()
+        with pytest.raises(PgtsError, match=rf"{path} exists and is not an MDP that load_npz reads: move it away"):
+            ladder(3).save_npz(path)
+        assert path.read_bytes() == before
+    for path, mdp in [(empty, ladder(3)), (empty, ladder(4)), (tmp_path / "new.npz", ladder(3))]:
+        mdp.save_npz(path)
+        assert TabularMDP.load_npz(path).num_states == mdp.num_states
+    with pytest.raises(PgtsError, match="is a folder; it must be a file, or not exist"):
+        ladder(3).save_npz(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"results.npz", "notes.txt", "empty.npz", "new.npz"}
+
+
 def test_a_file_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(PgtsError, match="cannot be written: No such file or directory"):
         ladder(3).save_npz(tmp_path / "no folder" / "mdp.npz")
