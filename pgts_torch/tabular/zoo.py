@@ -203,7 +203,8 @@ def combination_lock(
     n: int = 12, num_actions: int = 4, *, seed: int = 0, gamma: float = 0.99, start: Start = 0
 ) -> TabularMDP:
     """A lock of n dials: in each state one action, drawn at random, goes on to the next and every other one back to
-    the first. The right action in the last state earns 1 and ends the episode.        [Kakade 2003]
+    the first. The right action in the last state earns 1 and ends the episode.
+    [Koenig and Simmons 1993, "reset state space"]
 
     A uniform policy opens it once in num_actions^n attempts. J* = gamma^(n-1) from state 0.
     """
@@ -222,10 +223,12 @@ def combination_lock(
 
 def river_swim(n: int = 12, *, gamma: float = 0.99, start: Start = 0) -> TabularMDP:
     """A chain against the current: 'left' goes one state left, 'right' goes right with 0.3, stays with 0.6 and drifts
-    left with 0.1. 'Left' earns 0.005 in the first state, 'right' 1 in the last.        [Strehl and Littman 2008]
+    left with 0.1. 'Left' earns 0.005 in the first state, 'right' 1 in the last.
+    [transitions: Strehl and Littman 2008; rewards: Osband, Russo and Van Roy 2013]
 
-    At the ends 'right' goes right or drifts left with 0.3 and 0.7, in place of staying with 0.7 and 0.3. Strehl and
-    Littman have 6 states, start in the second or third, and pay 10,000 times as much in ten thousandths: 5 and 10,000.
+    In the first state 'right' stays with 0.7; in the last it stays with 0.3 and drifts left with 0.7. Both papers have
+    6 states. Strehl and Littman start in the second or third and pay 5 and, where 'right' stays in the last state,
+    10,000; the current of Osband et al. is weaker (0.35, 0.6 and 0.05).
     """
     _check_size("n", n, 2)
     P: list[list[list[Transition]]] = []
@@ -245,8 +248,9 @@ def corridor(
     column earns 1 and ends the episode. State `length * row + column`; actions left, right, up, down.
 
     An action moves one cell as intended with probability 1 - slip, and to either side at right angles with slip / 2
-    each, as on the ice of Gymnasium's FrozenLake, whose holes are here all along the way. A step against the end of the
-    first column stays. The length is what a lookahead must see or what must be learned column by column.
+    each, as on the ice of Gymnasium's FrozenLake; the long sides are the cliff of its CliffWalking, without the cost. A
+    step against the end of the first column stays. The length is what a lookahead must see or what must be learned
+    column by column.
 
     Args:
         start: default the middle of the first column.

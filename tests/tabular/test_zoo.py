@@ -317,7 +317,7 @@ def successors(mdp: TabularMDP, s: int, a: int) -> list[tuple[float, int]]:
 # River swim
 
 
-def test_river_swim_is_the_one_of_strehl_and_littman():
+def test_river_swim_has_the_current_of_strehl_and_littman_and_the_rewards_of_osband_and_others():
     mdp = river_swim(6)
     assert [successors(mdp, s, LEFT) for s in range(6)] == [[(1.0, max(s - 1, 0))] for s in range(6)]
     assert [successors(mdp, s, RIGHT) for s in (0, 2, 5)] == [
