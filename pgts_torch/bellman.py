@@ -118,6 +118,16 @@ class Outcomes:
         )
 
 
+def policy_mean(pi_NA: Float[Tensor, "N A"], q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
+    """What the actions of a policy are worth on the average:
+
+        <pi(.|s), q(s, .)> = sum over a with pi(a|s) > 0 of pi(a|s) q(s, a)
+
+    So actions that the policy never takes do not count where they are not allowed, q = -inf, either.
+    """
+    return torch.where(pi_NA > 0, pi_NA * q_NA, 0.0).sum(-1)
+
+
 def backup(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
     """Action values one step above the values `v` of the children.
 

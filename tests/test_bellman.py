@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 from torch import Tensor
 
-from pgts_torch.bellman import Outcomes, backup
+from pgts_torch.bellman import Outcomes, backup, policy_mean
 from pgts_torch.seeding import stream
 from tests.support import ZOO, mdps, weights, zoo
 
@@ -125,3 +125,9 @@ def test_the_tests_check_the_shapes_that_signatures_promise():
         Outcomes(row.reward_NA, row.prob_NAK.repeat(2, 1, 1), row.discount_NAK, row.child_NAK, 1)
     with pytest.raises(TypeCheckError):
         backup(row, torch.ones(1, 1, dtype=torch.float64))
+
+
+def test_actions_that_a_policy_never_takes_do_not_count_whatever_they_are_worth():
+    pi_NA = torch.tensor([[0.25, 0.75, 0.0], [0.0, 0.0, 1.0], [0.5, 0.0, 0.5]], dtype=torch.float64)
+    q_NA = torch.tensor([[4.0, 8.0, -torch.inf], [-torch.inf, 1.0, -3.0], [2.0, 7.0, -torch.inf]], dtype=torch.float64)
+    assert policy_mean(pi_NA, q_NA).tolist() == [7.0, -3.0, -torch.inf]

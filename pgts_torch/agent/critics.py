@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pgts_torch.agent.policies import Policy, fitting, listed
 from pgts_torch.agent.rollout import GeometricHorizon, Horizon, Rollout, simulated_returns
+from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.tabular import exact
@@ -100,7 +101,7 @@ class ExactCritic(Critic):
         rewards_SA, allowed_SA = self.mdp.outcomes.reward_NA, pi_SA > 0
         size = float(rewards_SA[allowed_SA].abs().max() + evaluation.v_S.abs().max())
         steps = self.mdp.num_actions + self.mdp.outcomes.num_outcomes + 4
-        residual_S = (torch.where(allowed_SA, pi_SA * evaluation.q_SA, 0.0).sum(-1) - evaluation.v_S).abs()
+        residual_S = (policy_mean(pi_SA, evaluation.q_SA) - evaluation.v_S).abs()
         self.error = 2 * float(evaluation.d_S @ (residual_S + steps * torch.finfo(torch.float64).eps * size))
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -206,7 +207,7 @@ class TabularCritic(Critic):
     def _read(self, value_C: Float[Tensor, "C"], state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         if self.target == "v":
             return value_C[state_N]
-        return (_fitted(self._policy).probs(state_N) * value_C.view(-1, self.num_actions)[state_N]).sum(-1)
+        return policy_mean(_fitted(self._policy).probs(state_N), value_C.view(-1, self.num_actions)[state_N])
 
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
         if self.target != "q":

@@ -10,6 +10,7 @@ from pgts_torch.agent.certificate import Certificates
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.ranks import Draws
 from pgts_torch.agent.rollout import Rollout
+from pgts_torch.bellman import policy_mean
 from pgts_torch.search.lookahead import Lookahead, check_finite
 
 
@@ -73,7 +74,7 @@ class DepthChoice:
         """
         state_N, occupancy_N = experience.visits("occupancy")
         shallow = self.look.in_parts(state_N, 0, draws.search())
-        v_N = (pi_NA * shallow.q_BA).sum(-1)
+        v_N = policy_mean(pi_NA, shallow.q_BA)
         check_finite("value", "the policy's value", v_N, state_N)
         starts = self._certificates.starts(experience, state_N, v_N)
         for depth in self.depths:

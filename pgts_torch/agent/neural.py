@@ -23,6 +23,7 @@ from pgts_torch.agent.networks import MLP, Network, NetworkDescription, Trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
+from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.seeding import stream
 
@@ -251,7 +252,7 @@ class NetworkCritic(Critic):
             return self._values(network, observation_N).squeeze(-1)
         if self._policy is None:
             raise PgtsError("the critic knows no policy yet; fit it, or iterate, before asking for values")
-        return (self._policy.probs(observation_N) * self._values(network, observation_N)).sum(-1)
+        return policy_mean(self._policy.probs(observation_N), self._values(network, observation_N))
 
     def _taken(self, value_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         """v, or Q of the actions taken."""

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import PgtsError
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
@@ -74,8 +75,8 @@ def centred(q_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"], *, rounding
     """
     below_NA = q_NA - q_NA.amax(-1, keepdim=True)
     allowed_NA = below_NA > -math.inf
-    share_N1 = torch.where(allowed_NA & (pi_NA > 0), pi_NA * below_NA, 0.0).sum(-1, keepdim=True)
-    mass_N1 = torch.where(allowed_NA, pi_NA, 0.0).sum(-1, keepdim=True)
+    kept_NA = torch.where(allowed_NA, pi_NA, 0.0)
+    share_N1, mass_N1 = policy_mean(kept_NA, below_NA).unsqueeze(-1), kept_NA.sum(-1, keepdim=True)
     is_part_N1 = (~allowed_NA & (pi_NA > 0)).any(-1, keepdim=True) & (mass_N1 > 0)
     advantage_NA = below_NA - torch.where(is_part_N1, share_N1 / mass_N1, share_N1)
     return torch.where(advantage_NA.abs() > rounding, advantage_NA, 0.0)
@@ -152,10 +153,11 @@ def softmax_direction(
 
         w(s) pi(a|s) (q(s, a) - <pi(.|s), q(s, .)>)
 
-    With w = d^pi and q = Q^pi it is the gradient of J (Sutton et al. 1999); with q = T^m Q^pi the direction of PGTS.
+    It is 0 where pi is. With w = d^pi and q = Q^pi it is the gradient of J (Sutton et al. 1999); with q = T^m Q^pi the
+    direction of PGTS.
     """
-    baseline_N1 = (pi_NA * q_NA).sum(-1, keepdim=True)
-    return weight_N[:, None] * pi_NA * (q_NA - baseline_N1)
+    above_NA = q_NA - policy_mean(pi_NA, q_NA).unsqueeze(-1)
+    return torch.where(pi_NA > 0, weight_N[:, None] * pi_NA * above_NA, 0.0)
 
 
 def softmax_step(

@@ -16,6 +16,7 @@ from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate
 from pgts_torch.agent.optimisers import Optimiser
 from pgts_torch.agent.policies import Biased, SimplexPolicy, SoftmaxPolicy
+from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NotFinite, PgtsError
@@ -251,6 +252,41 @@ def test_an_action_that_is_not_allowed_may_be_worth_minus_infinity(make, options
     assert torch.equal(policy.table()[[0, 3]], make(4, 3).table()[[0, 3]])
     with pytest.raises(NotFinite, match=r"the step along the advantages of state 1 is \[-inf, -inf, -inf\]"):
         MirrorUpdate(1.0)(policy, states, advantage_NA.fill_(-math.inf), weight_N, generator=stream(0, "update"))
+
+
+def test_the_softmax_gradient_leaves_an_action_that_is_not_allowed_and_never_taken_where_it_is():
+    policy, weight_N = SoftmaxPolicy(2, 3), torch.ones(1, dtype=torch.float64)
+    policy.logits_SA[1] = torch.tensor([0.0, 0.0, -math.inf])
+    advantage_NA = torch.tensor([[1.0, -1.0, -math.inf]], dtype=torch.float64)
+    SoftmaxUpdate(0.5)(policy, torch.tensor([1]), advantage_NA, weight_N, generator=stream(0, "update"))
+    # pi = (1/2, 1/2, 0), so the direction is pi A = (1/2, -1/2, 0).
+    assert policy.logits_SA[1].tolist() == [0.25, -0.25, -math.inf]
+
+
+@pytest.mark.parametrize(("make", "update"), [(SoftmaxPolicy, "softmax"), (SimplexPolicy, "projected")])
+def test_a_policy_that_never_takes_what_is_not_allowed_is_trained(make, update, monkeypatch):
+    policy = make(10, 3)
+    if isinstance(policy, SoftmaxPolicy):
+        policy.logits_SA[:, 2] = -math.inf
+    else:
+        policy.probs_SA[:] = torch.tensor([0.5, 0.5, 0.0])
+    options = {"num_envs": 2, "horizon": {"type": "fixed", "length": 5}, "env_kwargs": {"num_actions": 3}}
+    model = PGTS("pgts/Random-v0", depth=1, policy=policy, update=update, **options)
+    in_parts, allowed = PolicyLookahead.in_parts, []
+
+    def denied(*args):
+        look = in_parts(*args)
+        look.q_BA[:, 2] = -math.inf
+        allowed.append(look.q_BA[:, :2])
+        return look
+
+    monkeypatch.setattr(PolicyLookahead, "in_parts", denied)
+    seen = model.iterate()
+    shallow_NA, deep_NA = allowed
+    assert seen.gap_N.tolist() == pytest.approx((deep_NA.amax(-1) - shallow_NA.mean(-1)).clamp(min=0).tolist())
+    after_NA = policy.table()[seen.state_N]
+    assert torch.equal(after_NA[:, 0] > after_NA[:, 1], deep_NA[:, 0] > deep_NA[:, 1])
+    assert not after_NA[:, 2].any()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
