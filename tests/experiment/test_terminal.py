@@ -153,7 +153,7 @@ def test_a_warning_on_the_command_line_is_one_line_without_its_place_in_the_code
 def test_a_signal_with_a_handler_that_is_not_of_python_stays_with_it(number, tmp_path):
     before = signal.signal(number, signal.SIG_DFL)
     with (tmp_path / "traces").open("w+") as file:
-        faulthandler.register(number, file)
+        faulthandler.register(number, file, all_threads=False)
         try:
             with StopFlag() as stop:
                 os.kill(os.getpid(), number)
