@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 import traceback
 import warnings
@@ -10,10 +11,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 from torch import distributed
+
+from pgts_torch.experiment.cli import main
 
 PATIENCE = 120
 """Seconds that a child may take: more than it needs on a busy machine, and less than the time limit of a test."""
@@ -54,6 +57,46 @@ def _forked(work: Callable[[], int]) -> int:
         finally:
             os._exit(code)
     return pid
+
+
+class ForkedCommand:
+    """In place of `subprocess.Popen`, for the trainings of a sweep: the command line of this package, in a process that
+    is forked."""
+
+    def __init__(self, command: list[str], *, stdout: int, stderr: IO[str], env: dict[str, str], process_group: int):
+        def work() -> int:
+            os.setpgid(0, process_group)
+            os.environ.update(env)
+            with open(os.devnull, "w") as sys.stdout, os.fdopen(os.dup(stderr.fileno()), "w") as sys.stderr:
+                return main(command[3:])
+
+        assert (stdout, command[:3]) == (subprocess.DEVNULL, [sys.executable, "-m", "pgts_torch.experiment.cli"])
+        self.returncode: int | None = None
+        self._pid = _forked(work)
+
+    def poll(self) -> int | None:
+        """The exit code, once there is one."""
+        return self._waited(os.WNOHANG)
+
+    def wait(self) -> int | None:
+        """The exit code."""
+        return self._waited(0)
+
+    def _waited(self, how: int) -> int | None:
+        if self.returncode is None:
+            pid, status = os.waitpid(self._pid, how)
+            self.returncode = os.waitstatus_to_exitcode(status) if pid else None
+        return self.returncode
+
+    def terminate(self) -> None:
+        """Tell it to end."""
+        if self.poll() is None:
+            os.kill(self._pid, signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it."""
+        if self.poll() is None:
+            os.kill(self._pid, signal.SIGKILL)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ the results that the long forms of tests have recorded.
 """
 
 import ast
+import functools
 import json
 from collections import defaultdict
 from collections.abc import Iterator
@@ -180,6 +181,7 @@ FAULTS: dict[str, dict[str, str]] = {
 """By group: each fault, and what happens then."""
 
 
+@functools.cache
 def marked() -> dict[str, list[str]]:
     """The tests of each fault that is named in a mark, as path::name, by the text of the test files."""
     found = defaultdict[str, list[str]](list)

@@ -14,11 +14,13 @@ def endless_waits(source: str) -> Iterator[str]:
     """Calls in a test that wait for a process, however long that takes."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            called, limited = ast.unparse(node.func), any(keyword.arg == "timeout" for keyword in node.keywords)
-            runs = called in ("subprocess.run", "subprocess.check_output", "subprocess.check_call")
+            limited = any(keyword.arg == "timeout" for keyword in node.keywords)
+            runs = (
+                node.func.attr in ("run", "check_output", "check_call") and ast.unparse(node.func.value) == "subprocess"
+            )
             waits = node.func.attr in ("wait", "communicate") and not node.args
             if (runs or waits) and not limited:
-                yield f"line {node.lineno}: {called}"
+                yield f"line {node.lineno}: {ast.unparse(node.func)}"
 
 
 def test_every_process_that_a_test_waits_for_has_a_time_limit():

@@ -30,7 +30,6 @@ from pgts_torch.experiment.evaluate import KINDS
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.opening import check_dir, claimed, opened
 from pgts_torch.experiment.ownership import BEST_FILE, FAILURE_FILE, SUMMARY_FILE
-from pgts_torch.experiment.pictures import policy_picture
 from pgts_torch.experiment.progress import Reporter
 from pgts_torch.experiment.resume import Start, find, flat, resuming
 from pgts_torch.experiment.sections import EvalConfig
@@ -326,6 +325,8 @@ class _Recorder:
         config, algorithm, exactly = self.config, self.algorithm, dict[str, float | None]()
         assert self.ended_by is not None
         if self.truth is not None:
+            from pgts_torch.experiment.pictures import policy_picture  # matplotlib, a fifth of what a start takes
+
             pi_SA = algorithm.policy_table()
             title = f"{config.env.id}, depth {config.search.depth}, seed {config.seed}"
             self.folder.picture("policy", policy_picture(algorithm.mdp, pi_SA, title=title), algorithm.num_env_steps)

@@ -14,14 +14,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, final
 
-from matplotlib.figure import Figure
-
 from pgts_torch import files
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.ownership import BEST_FILE, EVENTS_SUFFIX, FAILURE_FILE, METRICS_FILE, is_events
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from torch.utils.tensorboard import SummaryWriter
 
 _PACKAGES = ("pgts_torch", "torch", "numpy", "scipy", "gymnasium", "tensorboard")
@@ -45,7 +44,7 @@ class Folder(ABC):
         """Write a text file atomically."""
 
     @abstractmethod
-    def picture(self, name: str, figure: Figure, step: int) -> None:
+    def picture(self, name: str, figure: "Figure", step: int) -> None:
         """Write a figure as `name`.png."""
 
 
@@ -66,7 +65,7 @@ class NoFolder(Folder):
     def text(self, name: str, content: str) -> None:
         """Do nothing."""
 
-    def picture(self, name: str, figure: Figure, step: int) -> None:
+    def picture(self, name: str, figure: "Figure", step: int) -> None:
         """Do nothing."""
 
 
@@ -183,7 +182,7 @@ class RunFolder(Folder):
         with self._writing(name):
             files.replace(self.path / name, content.encode())
 
-    def picture(self, name: str, figure: Figure, step: int) -> None:
+    def picture(self, name: str, figure: "Figure", step: int) -> None:
         """Write `name`.png, and the same picture to TensorBoard."""
         with self._writing(f"{name}.png"):
             figure.savefig(self.path / f"{name}.png", dpi=120)

@@ -1,5 +1,6 @@
 """Defaults of tables: no policy depends on the unit of the rewards, nor on a constant in all of them."""
 
+import functools
 import math
 
 import pytest
@@ -37,15 +38,19 @@ def trained(mdp: TabularMDP, *, iterations: int = 5, **options) -> list[torch.Te
     return policies
 
 
+@functools.cache
+def plainly_trained(name: str, depth: int | str) -> list[torch.Tensor]:
+    """The policies of a training with the rewards as they are; one for all tests of a process."""
+    return trained(MDPS[name](), depth=depth)
+
+
 @pytest.mark.fault("rewards in another unit, tables")
 @pytest.mark.parametrize("power", [-20, -3, 20])
 @pytest.mark.parametrize("depth", [0, 4, 16, "adaptive"])
 @pytest.mark.parametrize("name", MDPS)
 def test_a_power_of_two_on_all_rewards_leaves_every_policy_bit_for_bit(name, depth, power):
-    mdp = MDPS[name]()
-    plain = trained(mdp, depth=depth)
-    scaled = trained(rewarded(mdp, factor=math.ldexp(1.0, power)), depth=depth)
-    assert all(torch.equal(one, other) for one, other in zip(plain, scaled, strict=True))
+    scaled = trained(rewarded(MDPS[name](), factor=math.ldexp(1.0, power)), depth=depth)
+    assert all(torch.equal(one, other) for one, other in zip(plainly_trained(name, depth), scaled, strict=True))
 
 
 @pytest.mark.parametrize("options", OPTIONS)
@@ -64,9 +69,8 @@ def test_a_step_in_reward_units_does_depend_on_their_scale():
 
 @pytest.mark.parametrize("factor", [1e-3, 0.3, 1e6])
 def test_any_other_factor_changes_no_more_than_the_last_digits(factor):
-    mdp = MDPS["river swim"]()
-    plain, scaled = trained(mdp, depth=4), trained(rewarded(mdp, factor=factor), depth=4)
-    torch.testing.assert_close(plain, scaled, atol=1e-9, rtol=0)
+    scaled = trained(rewarded(MDPS["river swim"](), factor=factor), depth=4)
+    torch.testing.assert_close(plainly_trained("river swim", 4), scaled, atol=1e-9, rtol=0)
 
 
 @pytest.mark.fault("a constant in all rewards of a continuing task, tables")
@@ -74,7 +78,7 @@ def test_any_other_factor_changes_no_more_than_the_last_digits(factor):
 @pytest.mark.parametrize("name", ["random", "river swim"])
 def test_a_constant_in_all_rewards_of_a_continuing_task_does_not_matter(name, constant):
     mdp = MDPS[name]()
-    plain, moved = trained(mdp, depth=4), trained(rewarded(mdp, constant=constant), depth=4)
+    plain, moved = plainly_trained(name, 4), trained(rewarded(mdp, constant=constant), depth=4)
     torch.testing.assert_close(plain, moved, atol=1e-6, rtol=0)
     critic = {"critic": {"type": "tabular", "initial": 0.0}}
     if name == "river swim":  # where unvisited states count 0 the constant makes them heaven or hell

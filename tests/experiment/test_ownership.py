@@ -2,6 +2,7 @@
 
 import json
 import os
+import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,6 +19,7 @@ from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.ownership import MANIFEST_FILE, MARK_FILE, digest, sealed
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
+from tests.forks import ForkedCommand
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -387,7 +389,8 @@ def test_a_page_replaces_a_page_and_nothing_else(here, capsys):
 
 @pytest.mark.fault("file of the user under the name of an output")
 @pytest.mark.parametrize("name", ["table.json", "curves.png"])
-def test_a_sweep_replaces_its_own_table_and_picture_and_nothing_else(name, here, capsys):
+def test_a_sweep_replaces_its_own_table_and_picture_and_nothing_else(name, here, capsys, monkeypatch):
+    monkeypatch.setattr(subprocess, "Popen", ForkedCommand)
     put(here, out__x="mine")
     (here / "out" / name).write_text('{"rows": []}')
     before = tree(here)

@@ -21,7 +21,7 @@ from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import dump
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.processes import train_all
-from tests.forks import PATIENCE, in_child, started
+from tests.forks import PATIENCE, ForkedCommand, in_child, started
 
 HELP = "(see pgts sweep --help)"
 SMALL = ["--total_steps", "60", "--rollout.num_envs", "3", "--rollout.horizon.length", "10", "--eval.episodes", "2"]
@@ -105,7 +105,7 @@ def until(done: Callable[[], bool]) -> None:
 
 @pytest.mark.fault("SIGTERM")
 @pytest.mark.usefixtures("unchecked_shapes")
-def test_a_sweep_that_is_stopped_saves_and_the_same_command_ends_with_the_table_of_one_that_was_not(here):
+def test_a_sweep_that_is_stopped_saves_and_the_same_command_ends_with_the_table_of_one_that_was_not(here, monkeypatch):
     long = ["--total_steps", "1500", "--log.checkpoint_every", "1", "--log.keep", "999", "--run.tensorboard", "false"]
     whole = sweep.plan(None, [*SMALL, *long], depths=(1,), num_seeds=1, out=Path("whole"))
     run.train(whole[0].config)
@@ -122,6 +122,7 @@ def test_a_sweep_that_is_stopped_saves_and_the_same_command_ends_with_the_table_
     RunLock(folder).__exit__(None, None, None)  # nobody has it any more
     first = checkpoint.listed(folder)[0]
     written = first.stat().st_mtime_ns
+    monkeypatch.setattr(subprocess, "Popen", ForkedCommand)
     assert main(arguments) == 0
     assert first.stat().st_mtime_ns == written  # it did not begin anew
     answer = json.loads(Path("out/table.json").read_text())
@@ -211,7 +212,9 @@ def test_a_run_that_was_killed_has_failed(trainer):
     assert train_all({"a": []}, jobs=1) == {"a": "killed by the signal 9"}
 
 
-def test_a_run_that_fails_is_named_and_the_others_go_on(here, capsys):
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_run_that_fails_is_named_and_the_others_go_on(here, capsys, monkeypatch):
+    monkeypatch.setattr(subprocess, "Popen", ForkedCommand)
     finish(planned(num_seeds=1)[0], J=0.5)
     alien = here / "out" / "depth-1" / "seed-0"
     alien.mkdir(parents=True)
