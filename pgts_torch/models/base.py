@@ -128,11 +128,11 @@ class EnumeratingModel(Model):
     """A model that lists all outcomes of a state.
 
     num_outcomes: K; None: it is not known before the model is asked.
-    draws: whether it draws the outcomes that it lists, and remembers them.
+    samples_outcomes: whether it samples the outcomes that it enumerates, and remembers them.
     """
 
     num_outcomes: int | None = None
-    draws: bool = False
+    samples_outcomes: bool = False
 
     @abstractmethod
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:

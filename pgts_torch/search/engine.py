@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pgts_torch.errors import MissingModel, PgtsError, check_count
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
-from pgts_torch.search.empirical import Drawn, Share
+from pgts_torch.search.empirical import FixedSamples, Share
 from pgts_torch.search.expectimax import full_width
 from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaf, Leaves, Lookahead, check_finite
 from pgts_torch.search.mcts import Root, check_options, grow
@@ -267,8 +267,8 @@ class MCTSSearch(Search):
         topology, calls_each = self.topology, 1
         if topology is None:
             key = draw_keys(1, generator=generator).to(self.model.device)
-            drawn = Drawn(sampling(self.model, "mcts"), samples=self.samples, key=key)
-            topology = Topology(drawn, max_bytes=self.max_bytes)
+            samples = FixedSamples(sampling(self.model, "mcts"), samples=self.samples, key=key)
+            topology = Topology(samples, max_bytes=self.max_bytes)
             calls_each = self.samples
         look = grow(
             leaves,

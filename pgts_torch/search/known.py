@@ -73,7 +73,7 @@ class KnownStates:
             tree: what the tree counts: nodes, places and arms.
         """
         learned = self.count + new
-        needed = self.topology.bytes(new, asked=new, kept=new, learned=learned, **tree)
+        needed = self.topology.bytes(new, looked_up=new, kept=new, learned=learned, **tree)
         nodes = tree.get("nodes", 0)
         what = f"the search ({nodes} nodes, {learned} states of {self.num_actions} actions)"
         check_memory(needed, self.topology.max_bytes, what)

@@ -1,4 +1,4 @@
-"""Monte-Carlo tree search below many roots at once: where full width is too much, a tree grows where it matters."""
+"""Monte-Carlo tree search below many roots at once: where full width is too much, trees grow where values are high."""
 
 import math
 from collections.abc import Iterator
@@ -42,7 +42,7 @@ def mcts(
     generator: torch.Generator | None = None,
     max_nodes: int = MAX_NODES,
 ) -> Lookahead:
-    """(T^m Q)(s, .) at the roots for m = depth, as far as so many simulations find out.
+    """(T^m Q)(s, .) at the roots for m = depth, approached by so many simulations.
 
     A simulation descends from a root by the tree rule, expands one node and backs up its value. An expanded node has
     all its actions evaluated at once, with the critic at all their outcomes, so a maximum is never one over visited
@@ -50,19 +50,19 @@ def mcts(
 
         q(n, a) = r + sum_k p_k gamma_k v(n_k),   v(n) = max_a q(n, a) where n is expanded, else the critic's
 
-    Of the outcomes of an action the one that most lacks simulations is taken, argmax_k p_k (N_a + 1) - N_k: chance is
-    enumerated evenly, not drawn. What is expanded down to the last level is complete and never selected again, so
-    after finitely many simulations the answer is T^m Q, and no simulation is spent in vain.
+    Of the outcomes of an action the one that most lacks simulations is taken, argmax_k p_k (N_a + 1) - N_k: outcomes
+    are visited in proportion to their probabilities, not sampled. A node below which everything is expanded is
+    exhausted and never selected again, so after finitely many simulations the answer is T^m Q.
 
-    Simulations go down in waves (`pgts_torch.search.tree`): those of one wave share out actions and outcomes as if they
-    came one by one, but learn nothing from each other. What a wave could not use is sent again.
+    Simulations go down in waves (`pgts_torch.search.tree`): those of one wave are split among actions and outcomes as
+    if they came one by one, but do not see each other's values. What a wave could not use is sent again.
 
-    With root="gumbel" the root's actions share the simulations by sequential halving of
-    g(a) + log prior(a) + sigma(q(a)) (Danihelka et al. 2022); their trees share nothing, so those of one round run side
-    by side. With merge=False the answer is the same bit for bit however the roots are split into batches or ordered.
+    With root="gumbel" the root's actions get simulations by sequential halving of g(a) + log prior(a) + sigma(q(a))
+    (Danihelka et al. 2022); the trees below them are separate, so those of one round run side by side. With merge=False
+    the answer is the same bit for bit however the roots are split into batches or ordered.
 
     Args:
-        model: lists the outcomes of a state.
+        model: enumerates the outcomes of a state.
         root_B: states of the model, int64; repeated ones cost nothing.
         depth: m, a finite whole number of at least 0.
         q_leaf: an estimate of Q^pi: states [N] to [N, A].
@@ -89,7 +89,7 @@ def mcts(
         PgtsError: an option that makes no sense or is ignored by the others, roots that are no states, leaf values of a
             wrong shape or not finite (naming the state), a prior that is no distribution.
         NodeBudgetExceeded: more than `max_nodes` would be needed; or what is to be expanded next would not fit into
-            `max_bytes`, and the model has not been asked about it.
+            `max_bytes`, and the model has not been queried for it.
     """
     check_options(
         simulations=simulations,
@@ -142,10 +142,10 @@ def grow(
         return unexpanded(leaves, root_B)
     state_B, row_B = root_B.unique(return_inverse=True)
     calls_before = topology.model_calls
-    # Tens of small operations a level: without the bookkeeping of autograd each is a fifth cheaper.
+    # A level is tens of small operations, each a fifth cheaper without the bookkeeping of autograd.
     with torch.inference_mode():
         known = KnownStates(topology, leaves)
-        known.rows(state_B)  # before there is a tree: its tables are as wide as K is by then
+        known.rows(state_B)  # before the tree is made, so that its tables have room for K outcomes at once
         selection = Selection(rule, 1.25 if exploration is None else exploration)
         room = len(state_B) * simulations
         tree = Tree(known, leaves.expansions, selection, backup=backup, merge=merge, max_nodes=max_nodes, room=room)
@@ -168,9 +168,10 @@ def grow(
 
 
 def _by_rule(tree: Tree, node_B: Tensor, simulations: int, wave: int | None) -> None:
-    """The tree rule at the root, too; without a given size a wave is as large as all before it together."""
+    """The tree rule at the root too. Without a given size a wave is as large as all waves before it together."""
     used_B = torch.zeros(len(node_B), dtype=torch.float64, device=node_B.device)
     while True:
+        # at_B: the roots that have a whole simulation left and something to expand.
         open_B = tree.open(node_B).any(1)
         budget_B = (simulations - used_B + _WHOLE).floor_()
         at_B = ((budget_B >= 1) & open_B).nonzero().squeeze(1)
@@ -186,16 +187,17 @@ def _by_rule(tree: Tree, node_B: Tensor, simulations: int, wave: int | None) -> 
 def _halve(tree: Tree, node_B: Tensor, simulations: int, wave: int | None, preference_BA: Tensor) -> None:
     """Sequential halving of the root's actions (Karnin, Koren and Somekh 2013; Danihelka et al. 2022, Sec. 3.2).
 
-    What an action that is complete would have got goes to the next best one, also after the last round.
+    The simulations of an exhausted action go to the next best one, also after the last round.
     """
     used_B = torch.zeros(len(node_B), dtype=torch.float64, device=node_B.device)
     alive_BA = torch.ones_like(preference_BA, dtype=torch.bool)
     place_A = torch.arange(tree.A, device=node_B.device)
     before = 0
     for width, most in _rounds(tree.A, simulations, wave):
-        if width != before:
+        if width != before:  # a new round: the best `width` actions of those that are left go on
             order_BA, before = _order(tree, node_B, preference_BA, alive_BA), width
             alive_BA = torch.zeros_like(alive_BA).scatter_(1, order_BA[:, :width], True)
+        # total_B1: the simulations of this wave; the best `lanes_B1` actions share them evenly, the first get one more.
         lanes_B1 = tree.open(node_B).sum(1, keepdim=True).clamp_max_(width)
         left_B1 = (simulations - used_B + _WHOLE).floor_().unsqueeze(1)
         total_B1 = left_B1.minimum(lanes_B1 * most)
@@ -227,7 +229,7 @@ def _rounds(actions: int, simulations: int, wave: int | None) -> Iterator[tuple[
 
 
 def _order(tree: Tree, node_B: Tensor, preference_BA: Tensor, alive_BA: Tensor) -> Int[Tensor, "B A"]:
-    """The actions of each root, best first: survivors before the others, complete ones last."""
+    """The actions of each root, best first: survivors before the others, exhausted ones last."""
     score_BA = preference_BA + sigma(tree.nodes.q_NA[node_B], tree.nodes.visits_NA[node_B])
     by_score_BA = score_BA.argsort(dim=1, descending=True, stable=True)
     rank_BA = torch.where(tree.open(node_B), torch.where(alive_BA, 0, 1), 2).gather(1, by_score_BA)

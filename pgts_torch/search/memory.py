@@ -1,4 +1,4 @@
-"""How much memory a search takes: the one place where it is counted."""
+"""How much memory a search takes, counted in one place."""
 
 from dataclasses import dataclass
 
@@ -10,14 +10,14 @@ GROWTH = 1.5
 """By how much a table that is full becomes longer."""
 
 RESAMPLED = 96
-"""Bytes of a sample that is drawn again, with all that is made on the way."""
+"""Bytes of a resampled outcome, with all that is made on the way."""
 
 
 @dataclass(frozen=True)
 class Sizes:
     """What one state, or one node, takes: A actions with K outcomes each, numbers in `dtype`.
 
-    outcomes: the row of a table of `Outcomes`.
+    outcomes: a row of `Outcomes`, or of the `OutcomeTable`.
     """
 
     num_actions: int
@@ -49,12 +49,12 @@ class Sizes:
 def search_bytes(
     sizes: Sizes,
     *,
-    numbered: int = 0,
-    answered: int = 0,
-    asked: int = 0,
+    states: int = 0,
+    remembered: int = 0,
+    looked_up: int = 0,
     kept: int = 0,
-    drawn: int = 0,
-    drawing: int = 0,
+    sampled: int = 0,
+    sampling: int = 0,
     resampled: int = 0,
     learned: int = 0,
     nodes: int = 0,
@@ -63,26 +63,27 @@ def search_bytes(
 ) -> int:
     """The most memory, in bytes, that a search holds at once while it takes its next step.
 
-    Tables that grow are half empty at worst by `GROWTH`, and while a column is copied its old form is there too. What
-    a step makes and drops again (masks, positions, sorted children, products) is counted by its widest moment.
+    Tables that grow are at worst longer than needed by the factor `GROWTH`, and while a column is copied its old form
+    is there too. What a step makes and drops again (masks, positions, sorted children, products) is counted at its
+    peak.
 
     Args:
-        numbered: states of the model, which have two tables of numbers.
-        answered: states whose outcomes are remembered, after the step.
-        asked: states that the step asks about or looks up.
+        states: of the model, for which a topology has two tables.
+        remembered: rows of the `OutcomeTable`, after the step.
+        looked_up: states whose outcomes the step reads, new or not.
         kept: rows of outcomes of levels, with their sparse weights, after the step.
-        drawn: nodes whose outcomes were sampled, after the step.   drawing: those that the step samples.
-        resampled: nodes whose samples are drawn again at once.
+        sampled: nodes whose outcomes were sampled, after the step.   sampling: those that the step samples.
+        resampled: nodes that the bootstrap samples again at once.
         learned: rows of `KnownStates`.
-        nodes: rows of a `Tree`.   places: of its table by (state, level).   arms: that a wave passes at once.
+        nodes: rows of `Nodes`.   places: of tables by level, by state and by both.   arms: that a wave passes at once.
     """
     s, A, E = sizes.dtype.itemsize, sizes.num_actions, sizes.num_actions * sizes.num_outcomes
     widest = max(s, 8) * E
-    total = 32.0 * numbered  # two tables of int64, twice while they grow
-    total += answered * (GROWTH * sizes.outcomes + widest)
-    total += asked * (sizes.outcomes + 56 * E + 4 * A * s + 64)
+    total = 32.0 * states  # two tables of int64, twice while they grow
+    total += remembered * (GROWTH * sizes.outcomes + widest)
+    total += looked_up * (sizes.outcomes + 56 * E + 4 * A * s + 64)
     total += kept * (sizes.outcomes + E * (s + 4) + A * (2 * s + 4) + 24)
-    total += drawn * (2 * (s + 16) * E + 48) + drawing * 64 * E + resampled * RESAMPLED * E
+    total += sampled * (2 * (s + 16) * E + 48) + sampling * 64 * E + resampled * RESAMPLED * E
     total += learned * (GROWTH * sizes.known + widest)
     total += nodes * (GROWTH * sizes.node + widest + E * (4 * s + 16) + 40 * A)
     total += 8.0 * places
@@ -100,5 +101,5 @@ def check_memory(needed: int, most: int, what: str) -> None:
 
 
 def gib(num_bytes: float) -> str:
-    """As a person reads it."""
+    """A number of bytes in GiB, for a message."""
     return f"{num_bytes / 2**30:.3g} GiB"

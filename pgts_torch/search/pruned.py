@@ -1,4 +1,4 @@
-"""Lookahead of bounded width: the states on which most rests are unfolded, the critic values the others."""
+"""Lookahead of bounded width: the states on which most depends are expanded, the critic values the others."""
 
 from dataclasses import dataclass
 from typing import final
@@ -18,14 +18,14 @@ from pgts_torch.search.topology import Topology
 def pruned(
     leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_width: int, max_nodes: int
 ) -> Lookahead:
-    """(T^m Q)(s, .) at the roots, where at most W states of each level below the roots are unfolded further.
+    """(T^m Q)(s, .) at the roots, where at most W states of each level below the roots are expanded.
 
     A level with more states keeps those of the highest priority; the critic's v stands for what follows the others:
 
         priority(n) = reach(n) (v(n) - min v),     the minimum taken over the states of the level,
 
-    how much of the value of a plan rests on n. reach(n) is the discounted probability with which the plan meets n, from
-    1 at every root: the sum of reach(s) pi(a|s) p gamma over all (s, a) of the level above that lead to n, where
+    how much of the value of a plan depends on n. reach(n) is the discounted probability with which the plan meets n:
+    1 at every root, and the sum of reach(s) pi(a|s) p gamma over all (s, a) of the level above that lead to n, where
 
         pi(a|s) ~ exp(-(max_b q1(s, b) - q1(s, a)) / t),     q1 = r + sum p gamma v,     t = mean of max_b q1 - q1
 
@@ -38,13 +38,13 @@ def pruned(
     order is no better than an arbitrary one. Beam search orders by v(n): as good where outcomes are nearly certain,
     worse for the best value where they spread, and for a batch, of which it serves the roots near high values.
 
-    The batch shares the width: W bounds a level of all roots together, which are always all unfolded. With W at least
+    The batch shares the width: W bounds a level of all roots together, and the roots are all expanded. With W at least
     as large as the largest level the result is that of the full lookahead. pruned is 1 at a pruned state, 0 at the
-    last level and max_a sum p gamma pruned(child) at one that is unfolded. The critic is asked once for each level
-    below the roots; the model at most (roots + W (levels - 1)) A times.
+    last level and max_a sum p gamma pruned(child) at one that is expanded. The critic is called once for each level
+    below the roots; the model is queried for at most (roots + W (levels - 1)) A pairs.
 
     Args:
-        leaves: the critic, and how many levels are unfolded.
+        leaves: the critic, and how many levels are expanded.
         topology: what is known of the model; this search adds to it.
         root_B: states of the model, int64.
         max_width: W >= 1.
@@ -65,8 +65,8 @@ def pruned(
         q_NA = leaves.q(roots)
         pruned_NA = torch.zeros_like(q_NA)
     else:
-        levels, v_C = _unfold(leaves, topology, roots, max_width, max_nodes, nodes_per_level)
-        q_NA, pruned_NA = _fold(levels, v_C)
+        levels, v_C = _expand(leaves, topology, roots, max_width, max_nodes, nodes_per_level)
+        q_NA, pruned_NA = _back_up(levels, v_C)
     q_BA = q_NA[row_B]
     return Lookahead(
         q_BA,
@@ -80,11 +80,11 @@ def pruned(
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """The N distinct states of one level, of which M are unfolded.
+    """The N distinct states of one level, of which M are expanded.
 
-    v_N: the critic's values; those of the unfolded states give way to what is found below them.
-    kept_M: the positions of the unfolded ones among the N.
-    step: outcomes of the M in terms of positions in the next level.
+    v_N: the critic's values; those of the expanded states are replaced by what is backed up from below.
+    kept_M: the positions of the expanded ones among the N.
+    step: outcomes of the M, with positions in the next level as children.
     """
 
     v_N: Float[Tensor, "N"]
@@ -92,7 +92,7 @@ class _Level:
     step: Outcomes
 
 
-def _unfold(
+def _expand(
     leaves: Leaves, topology: Topology, roots: Tensor, max_width: int, max_nodes: int, nodes_per_level: list[int]
 ) -> tuple[list[_Level], Float[Tensor, "C"]]:
     """The levels from the roots down, and the critic's values below the last of them."""
@@ -114,12 +114,12 @@ def _unfold(
     return levels, v_N
 
 
-def _fold(levels: list[_Level], v_C: Float[Tensor, "C"]) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
-    """q of all actions of the roots, and how much of it rests on pruned states."""
+def _back_up(levels: list[_Level], v_C: Float[Tensor, "C"]) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
+    """q of all actions of the roots, and how much of it depends on pruned states."""
     pruned_C = torch.zeros_like(v_C)
     for level in reversed(levels):
         step = level.step
-        if step.num_children == 0:  # everything ends here
+        if step.num_children == 0:  # every outcome is terminal
             q_MA, pruned_MA = step.reward_NA, torch.zeros_like(step.reward_NA)
         else:
             q_MA = backup(step, v_C)
@@ -131,20 +131,24 @@ def _fold(levels: list[_Level], v_C: Float[Tensor, "C"]) -> tuple[Float[Tensor, 
 
 @final
 class _Plan:
-    """The plan that takes better actions more often, as it meets one level after the other."""
+    """How much discounted probability each state of a level gets from a plan that prefers better actions.
+
+    reach_N: that, for the level at hand; 1 for the roots.
+    """
 
     def __init__(self, roots: Int[Tensor, "N"], dtype: torch.dtype) -> None:
         self.reach_N: Float[Tensor, "N"] = torch.ones(len(roots), dtype=dtype, device=roots.device)
         self._mean_regret, self._pairs = torch.zeros((), dtype=dtype, device=roots.device), 0
 
     def descend(self, level: _Level, v_C: Float[Tensor, "C"]) -> None:
-        """On to the next level, whose states the critic values at v."""
+        """From the reach of a level to that of the next one, whose states the critic values at v."""
         step = level.step
-        # Halves, here and in the priority: the difference of the largest numbers is a number still.
+        # Halves, here and in the priority, so that the difference of the largest numbers is finite.
         half_MA = backup(step, v_C) / 2
         regret_MA = half_MA.amax(-1, keepdim=True) - half_MA
         self._average(regret_MA[regret_MA.isfinite()])
         scale = self._mean_regret.clamp(min=torch.finfo(regret_MA.dtype).tiny)
+        # flow_MA: the reach of a state, shared out among its actions; each then goes to the children by p gamma.
         flow_MA = torch.softmax(-regret_MA / scale, -1) * self.reach_N[level.kept_M].unsqueeze(-1)
         weight_MAK = (step.prob_NAK * step.discount_NAK).masked_fill(~has_weight(step), 0.0)
         self.reach_N = torch.zeros_like(v_C).scatter_add_(
@@ -172,5 +176,5 @@ def _check_budget(nodes_per_level: list[int], max_nodes: int) -> None:
     if nodes > max_nodes:
         raise NodeBudgetExceeded(
             f"the lookahead has {nodes} nodes on levels 0 to {len(nodes_per_level) - 1}; max_nodes is {max_nodes}: "
-            "lower the depth or the width, ask for fewer roots or raise the budget"
+            "lower the depth or the width, search from fewer roots or raise the budget"
         )

@@ -1,4 +1,4 @@
-"""Sparse sampling: lookahead over C drawn outcomes of each action, however many there may be."""
+"""Sparse sampling: lookahead over C sampled outcomes of each action, however many there may be."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import get_args
@@ -27,7 +27,7 @@ from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import draw_keys, mix, uniform
 
 _RESAMPLE = 0x626F6F74
-"""Parts the keys of the bootstrap from those of the samples."""
+"""Mixed into the keys of the bootstrap, so that they differ from those of the samples."""
 
 _CHUNK = 2**22
 """The most resampled outcomes of one level that are held at a time, or those of one replicate."""
@@ -51,9 +51,9 @@ def sampled(
 
         q(s, a) = 1/C sum_c [ r_c + gamma_c max_b q(s'_c, b) ]        (Kearns, Mansour and Ng 2002)
 
-    All actions of all nodes are looked at. Leaves are those of `expectimax`, asked about distinct states. A sample is
-    named by (search, level, state, action, c), so q is the same bit for bit however the roots are split into
-    batches or ordered, as long as the generator is in the same state and the model numbers its states alike.
+    All actions of all nodes are looked at. Leaves are those of `expectimax`, each state once. A sample is named by
+    (search, level, state, action, c), so q is the same bit for bit however the roots are split into batches or ordered,
+    as long as the generator is in the same state and the model numbers its states alike.
 
     The error falls as 1 / sqrt(C). The maxima over noisy values make the estimate too high wherever actions are nearly
     tied: E q >= T^m Q, with equality where there is one action and where no maximum is over sampled values. `bias_BA`
@@ -63,27 +63,27 @@ def sampled(
     one below varies with both. Both are NaN (not estimated) without replicates and with C = 1 at any level.
 
     Args:
-        model: draws an outcome of a state and an action.
+        model: samples an outcome of a state and an action.
         root_B: states of the model, int64; repeated ones share their samples, whatever `share` says, and cost nothing.
         depth: m, a finite whole number of at least 0.
         q_leaf: an estimate of Q^pi: states [N] to [N, A].
         v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.
         samples: C, or one C for each level from the roots down; the last one serves all deeper levels, and those below
-            the leaves are not used. None lists all outcomes of a level exactly, which the model must be able to do;
-            where all levels are listed the search is `expectimax`.
-        share: "none": every path draws for itself, and the nodes are a tree. "level": paths that meet in a state at one
-            level are one node, with one set of samples. "search": a state has one set of samples at all levels: fewest
-            calls, one C, and a closed set as in `expectimax`. All three have the same rate.
-        generator: gives one key, from which all samples of this search follow.
+            the leaves are not used. None enumerates all outcomes of a level, which the model must be able to do;
+            where all levels are enumerated the search is `expectimax`.
+        share: "none": every path has its own samples, and the nodes are a tree. "level": paths that meet in a state at
+            one level are one node, with one set of samples. "search": a state has one set of samples at all levels:
+            fewest calls, one C, and a closed set as in `expectimax`. All three have the same rate.
+        generator: of one key, which decides all samples of this search.
         replicates: R of the bootstrap: 0, or at least 2.
-        max_nodes: the most nodes, summed over levels; the samples of a level are drawn before its children are counted.
-        max_bytes: the most memory that the search may take; a level is estimated before it is drawn.
+        max_nodes: the most nodes, summed over levels; a level is sampled before its children are counted.
+        max_bytes: the most memory that the search may take; a level is estimated before it is sampled.
 
     Returns:
-        `model_calls` counts each (state, action, sample), and one for a (state, action) whose outcomes are listed.
+        `model_calls` counts each (state, action, sample), and one for a (state, action) whose outcomes are enumerated.
 
     Raises:
-        PgtsError: as `expectimax`; C below 1; several C with share="search"; a model that cannot do what is asked.
+        PgtsError: as `expectimax`; C below 1; several C with share="search"; a model that cannot do what is needed.
         NodeBudgetExceeded: more than `max_nodes` or `max_bytes` would be needed.
     """
     return sparse(
@@ -127,7 +127,7 @@ def sparse(
         return full_width(leaves, topology, root_B, max_nodes=max_nodes)
     empirical = Empirical(model, root_B, samples=plan, share=share, key=key)
     topology = Topology(empirical, max_bytes=max_bytes)
-    steps, bottom_N, nodes_per_level = _unfolded(empirical, topology, leaves.expansions, share, max_nodes)
+    steps, bottom_N, nodes_per_level = _expanded(empirical, topology, leaves.expansions, share, max_nodes)
     v_N = _leaf_values(leaves, empirical, steps, bottom_N)
     q_BA = _backups([outcomes for _, outcomes in reversed(steps)], v_N)[empirical.root_B]
     stderr_BA = bias_BA = torch.full_like(q_BA, torch.nan)
@@ -155,7 +155,7 @@ def sparse(
 def plan_levels(
     samples: int | Sequence[int | None], expansions: int, share: str, model: Model
 ) -> tuple[int | None, ...]:
-    """C of each of `expansions` levels, None where outcomes are listed."""
+    """C of each of `expansions` levels, None where outcomes are enumerated."""
     given = list(samples) if isinstance(samples, Sequence) else [samples]
     for C in given:
         if C is not None and (isinstance(C, bool) or not isinstance(C, int) or C < 1):
@@ -168,22 +168,24 @@ def plan_levels(
     if share == "search" and len(set(plan)) > 1:
         raise PgtsError(f"samples is {samples}; with share='search' a state has one C at all levels")
     if None in plan and not isinstance(model, EnumeratingModel):
-        raise PgtsError(f"samples is {samples}; {type(model).__name__} cannot list outcomes, so None is not possible")
+        raise PgtsError(
+            f"samples is {samples}; {type(model).__name__} cannot enumerate outcomes, so None is not possible"
+        )
     if set(plan) - {None} and not isinstance(model, SamplingModel):
-        raise PgtsError(f"samples is {samples}; {type(model).__name__} cannot draw outcomes, only list them")
+        raise PgtsError(f"samples is {samples}; {type(model).__name__} cannot sample outcomes, only enumerate them")
     return plan
 
 
 Step = tuple[Tensor, Outcomes]
-"""The nodes of one level, shape [N], and what follows them."""
+"""The nodes of one level, shape [N], and their outcomes."""
 
 
-def _unfolded(
+def _expanded(
     empirical: Empirical, topology: Topology, expansions: int, share: Share, max_nodes: int
 ) -> tuple[list[Step], Tensor | None, tuple[int, ...]]:
     """The levels from the roots down, the nodes at the bottom (None: every path ends above), and how many there are."""
-    for unfolded in range(1, expansions + 1):
-        levels = topology.levels(empirical.root_B, unfolded, max_nodes=max_nodes)
+    for expanded in range(1, expansions + 1):
+        levels = topology.levels(empirical.root_B, expanded, max_nodes=max_nodes)
         if levels.closed is not None:
             break
     steps: list[Step] = list(zip(levels.frontiers, levels.outcomes, strict=False))
@@ -193,7 +195,7 @@ def _unfolded(
         topology.levels(empirical.root_B, expansions, max_nodes=max_nodes)
         steps += [(levels.closed_states, levels.closed)] * levels.sweeps(expansions)
         return steps, levels.leaves(expansions), levels.nodes_per_level(expansions)
-    # Other nodes than states never recur: a set of them that is closed has no children that count.
+    # Paths, and states at a level, never recur: where no new node is met, no outcome of the level before has weight.
     widths = [len(frontier) for frontier in levels.frontiers]
     return steps, None, (*widths, *[0] * (expansions + 1 - len(widths)))
 
@@ -201,7 +203,7 @@ def _unfolded(
 def _leaf_values(
     leaves: Leaves, empirical: Empirical, steps: list[Step], bottom_N: Tensor | None
 ) -> Float[Tensor, "leaves"]:
-    """What the critic says of the nodes at the bottom; where every path ends above, zeros that nothing leads to."""
+    """The critic's values of the nodes at the bottom; where every path ends above, zeros to which no outcome leads."""
     if bottom_N is None:
         return torch.zeros(steps[-1][1].num_children, dtype=empirical.dtype, device=empirical.device)
     state_N, row_N = torch.unique(empirical.state_N[bottom_N], return_inverse=True)
@@ -209,7 +211,11 @@ def _leaf_values(
 
 
 def _backups(outcomes: Iterable[Outcomes], v_N: Float[Tensor, "leaves"]) -> Float[Tensor, "N A"]:
-    """Values at the last of the levels, which come from the leaves up, from values v at the leaves."""
+    """Values at the roots, from values v at the leaves.
+
+    Args:
+        outcomes: of the levels, from the lowest up.
+    """
     for step in outcomes:
         q_NA = backup(step, v_N)
         v_N = q_NA.amax(-1)
@@ -224,12 +230,15 @@ def _bootstrap(
     replicates: int,
     at_once: int,
 ) -> Float[Tensor, "R N A"]:
-    """Values at the roots, done again with resampled outcomes, of which about so many are held at once beyond those of
-    one replicate."""
+    """Values at the roots, backed up again with resampled outcomes.
+
+    Args:
+        at_once: about how many resampled outcomes may be held beyond those of one replicate.
+    """
     key_N, reward_NAC = empirical.key_N, empirical.reward_NAC
 
     def resampled(replicate_R: Tensor) -> Iterator[Outcomes]:
-        done: tuple[Outcomes, Outcomes] | None = None
+        done: tuple[Outcomes, Outcomes] | None = None  # the levels of a closed set are one, resampled once
         for (node_N, outcomes), C in zip(reversed(steps), reversed(plan[: len(steps)]), strict=True):
             if done is None or done[0] is not outcomes:
                 reward = reward_NAC[node_N, :, : C or 0]
@@ -243,8 +252,8 @@ def _bootstrap(
 
 
 def _resampled(outcomes: Outcomes, C: int | None, key_N: Tensor, reward_NAC: Tensor, replicate_R: Tensor) -> Outcomes:
-    """R replicates of the outcomes, one below the other, each with children of its own: of the C outcomes of each
-    (s, a) C - 1 with replacement; where C is None all are kept."""
+    """R replicates of the outcomes as one table of R * N rows: of the C outcomes of each (s, a) C - 1 with replacement;
+    where C is None all are kept. The children of replicate r are the r-th block of R * num_children values."""
     R, N, A = len(replicate_R), outcomes.num_states, outcomes.num_actions
     if C is None:
         prob, discount, child = outcomes.prob_NAK, outcomes.discount_NAK, outcomes.child_NAK
@@ -252,6 +261,7 @@ def _resampled(outcomes: Outcomes, C: int | None, key_N: Tensor, reward_NAC: Ten
         reward = outcomes.reward_NA.expand(R, -1, -1)
     else:
         device = replicate_R.device
+        # A random number for each (replicate, node, action, c), and the position of the sample that it picks.
         row_RNA = mix(key_N.view(-1, 1), replicate_R.view(-1, 1, 1), torch.arange(A, device=device))
         draw_RNAC = mix(row_RNA.unsqueeze(-1), torch.arange(C - 1, device=device))
         pick = (uniform(draw_RNAC) * C).long()
@@ -262,6 +272,7 @@ def _resampled(outcomes: Outcomes, C: int | None, key_N: Tensor, reward_NAC: Ten
         prob = torch.full((), 1 / (C - 1), dtype=outcomes.dtype, device=device).expand(pick.shape)
         discount, child = picked(outcomes.discount_NAK[..., :C]), picked(outcomes.child_NAK[..., :C])
         reward = (picked(reward_NAC) / (C - 1)).sum(-1)
+    # Replicate r reads its own block of child values.
     child = child + outcomes.num_children * torch.arange(R, device=child.device).view(-1, 1, 1, 1)
     return Outcomes(
         reward.reshape(R * N, A),

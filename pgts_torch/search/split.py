@@ -1,6 +1,6 @@
-"""How simulations are shared among the actions of a node and among the outcomes of an action.
+"""How simulations are split among the actions of a node and among the outcomes of an action.
 
-Both follow one principle: as if they were given one by one, without news from those under way.
+Both as if the simulations came one by one, and none saw the results of those before it.
 """
 
 import math
@@ -20,7 +20,7 @@ _TIE = 1e-8
 """Values that differ by less than this share of them are ties: rounding must not choose."""
 
 _GRID = 2.0**20
-"""Deficits that are equal in units of 1 / _GRID are ties, for the same reason."""
+"""Deficits that are equal in units of 1 / _GRID are ties, for the same reason: rounding must not choose."""
 
 
 @final
@@ -51,10 +51,12 @@ class Selection:
     ) -> Float[Tensor, "N A"]:
         """How many of the simulations of a node each action gets: none where it is exhausted, at most `most_NA`."""
         if self.rule == "gumbel":
+            # Deficits: the visits that pi' deals each action of all N + b, minus those it has had.
             policy_NA = prior_NA.double() * sigma(q_NA, visits_NA).exp_()
             policy_NA /= policy_NA.sum(1, keepdim=True).clamp_min_(torch.finfo(torch.float64).tiny)
             total_N1 = visits_NA.sum(1).add_(budget_N).unsqueeze(1)
             return apportion(policy_NA.mul_(total_N1).sub_(visits_NA).add_(exhausted_NA), budget_N, most_NA)
+        # One simulation of every node at a time, each to the best action; their number grows with `given_NA`.
         limit_NA = None if most_NA is None else visits_NA + most_NA
         q_NA, given_NA = scaled(q_NA).add_(exhausted_NA), visits_NA.clone()
         for given in range(math.ceil(budget_N.amax())):
@@ -67,7 +69,7 @@ class Selection:
             if limit_NA is not None:
                 score_NA.masked_fill_(given_NA >= limit_NA, -torch.inf)
             best_N1, a_N1 = score_NA.max(1, keepdim=True)
-            # In a graph a budget may end in a fraction.
+            # In a graph a budget may end in a fraction, and the last simulation is one.
             takes_N1 = (budget_N - given).clamp_(0, 1).unsqueeze(1).masked_fill_(best_N1 == -torch.inf, 0)
             given_NA.scatter_add_(1, a_N1, takes_N1.to(given_NA.dtype))
         return given_NA - visits_NA
@@ -82,7 +84,7 @@ def scaled(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
     """Values on the scale on which the best action of a node has 0 and the worst that is allowed -1."""
     high_N1 = q_NA.amax(1, keepdim=True)
     low_N1 = q_NA.amin(1, keepdim=True)
-    if not math.isfinite(low_N1.amin()):
+    if not math.isfinite(low_N1.amin()):  # -inf of actions that are not allowed: the worst of the others
         low_N1 = torch.where(q_NA > -torch.inf, q_NA, high_N1).amin(1, keepdim=True)
     span_N1 = (high_N1 - low_N1).add_(high_N1.abs(), alpha=_TIE).clamp_min_(torch.finfo(q_NA.dtype).tiny)
     return (q_NA - high_N1).div_(span_N1)
@@ -91,7 +93,8 @@ def scaled(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
 def apportion(
     deficit_NK: Float[Tensor, "N K"], budget_N: Float[Tensor, "N"], most_NK: Float[Tensor, "N K"] | None = None
 ) -> Float[Tensor, "N K"]:
-    """So many units a row, each in turn to the place with the largest deficit, which falls by 1; none to -inf.
+    """Give each row so many units, one after the other to the place with the largest deficit, which falls by 1; none to
+    places at -inf.
 
     That is water-filling: with the level mu for which sum_k max(0, d_k - mu) = b every place gets the whole part of
     max(0, d_k - mu), and what is left goes to the largest fractions. mu = max_i (d_(1) + .. + d_(i) - b) / i over the
@@ -102,24 +105,27 @@ def apportion(
     Args:
         deficit_NK: every row has a place that is not -inf.
         budget_N: whole numbers.
-        most_NK: the most that a place takes; what no place takes is not handed out.
+        most_NK: the most that a place takes; what no place takes is left over.
     """
     K = deficit_NK.shape[1]
     if K == 1:
         given_NK = budget_N.unsqueeze(1)
         return given_NK if most_NK is None else given_NK.minimum(most_NK)
+    # sharp_NK: deficits in units of the grid, with the least preference for earlier places: no two are equal.
     place_K = torch.arange(K, dtype=deficit_NK.dtype, device=deficit_NK.device)
     sharp_NK = deficit_NK.mul(_GRID).round_().sub_(place_K, alpha=1 / _GRID).div_(_GRID)
     if int(budget_N.amax()) == 1:
         return torch.zeros_like(sharp_NK).scatter_(1, sharp_NK.argmax(1, keepdim=True), budget_N.unsqueeze(1))
+    # mu_NK: the level if the i + 1 largest deficits were filled; the largest of these is the level.
     mu_NK = sharp_NK.sort(1, descending=True).values.cumsum(1).sub_(budget_N.unsqueeze(1)).div_(place_K + 1)
     filled_NK = sharp_NK.sub_(mu_NK.amax(1, keepdim=True)).clamp_min_(0)
     given_NK = filled_NK.floor()
-    left_N1 = (budget_N - given_NK.sum(1)).unsqueeze(1)
+    left_N1 = (budget_N - given_NK.sum(1)).unsqueeze(1)  # fewer units than places that were filled
     order_NK = filled_NK.sub_(given_NK).sort(1, descending=True).indices
     given_NK.scatter_add_(1, order_NK, (place_K < left_N1).to(given_NK.dtype))
     if most_NK is None or not bool((given_NK > most_NK).any()):
         return given_NK
+    # What full places cannot take goes to the others, by the same rule.
     given_NK = given_NK.minimum(most_NK)
     left_N = budget_N - given_NK.sum(1)
     free_NK = (deficit_NK > -torch.inf) & (given_NK < most_NK)

@@ -286,7 +286,7 @@ class Topology:
 
         def needed() -> int:
             remembered = sum(each.rows for each in self._levels.values() if each is not levels)
-            return self.bytes(missing, asked=len(state_N), kept=kept + own + remembered + len(state_N))
+            return self.bytes(missing, looked_up=len(state_N), kept=kept + own + remembered + len(state_N))
 
         while needed() > self.max_bytes and any(each is not levels for each in self._levels.values()):
             self._levels.pop(next(key for key, each in self._levels.items() if each is not levels))
@@ -304,14 +304,14 @@ class Topology:
         A, K = self.model.num_actions, self.num_outcomes
         return f"the outcomes of {which} of the lookahead ({states} nodes, {A} actions, {K} outcomes of each)"
 
-    def bytes(self, new: int, *, asked: int = 0, kept: int = 0, **counts: int) -> int:
+    def bytes(self, new: int, *, looked_up: int = 0, kept: int = 0, **counts: int) -> int:
         """`search_bytes` of a search that queries the model for so many new states and looks up so many."""
         sizes = Sizes(self.model.num_actions, self.num_outcomes, self.model.dtype)
-        numbered, answered = max(self.model.num_states, len(self.row_S)), self.table.count + new
-        if self.model.draws:
+        states, remembered = max(self.model.num_states, len(self.row_S)), self.table.count + new
+        if self.model.samples_outcomes:
             rows = [step.num_states for each in self._levels.values() for step in each.outcomes]
-            counts |= {"drawn": answered, "drawing": new, "resampled": max([asked, *rows])}
-        return search_bytes(sizes, numbered=numbered, answered=answered, asked=asked, kept=kept, **counts)
+            counts |= {"sampled": remembered, "sampling": new, "resampled": max([looked_up, *rows])}
+        return search_bytes(sizes, states=states, remembered=remembered, looked_up=looked_up, kept=kept, **counts)
 
     def _check_generation(self) -> None:
         if self.model.generation != self._generation:

@@ -1,4 +1,4 @@
-"""Upper bounds of v* from what has been asked of a model so far. They ask it nothing."""
+"""Upper bounds of v* from what a model has answered so far, without further queries."""
 
 import math
 from typing import Any, final
@@ -29,15 +29,15 @@ class UpperBound:
 
         v_hat = T v_hat  on X,        v_hat = w >= v*  elsewhere
 
-    Two functions are swept at once, and go on where the last call left them as long as X is the same:
+    Two functions are swept at once, from where the last call left them as long as X is the same:
 
     - one from above, from w: every sweep of an upper bound of v* is one;
     - one from below, which comes to v_hat in about as many sweeps as the best plan has steps, however close the
       discount is to 1. As it is swept it proves v_hat <= T u + beta delta / (1 - beta), with delta = max over X of
       T u - u, not below 0, and beta the largest sum_k p_k gamma_k in X (MacQueen 1966; Prop. 5).
 
-    A state that may stay where it is for ever, undiscounted and for nothing, counts as one outside X: there T says
-    nothing. Such is one in which an episode was truncated.
+    A state that may stay where it is for ever, undiscounted and with reward 0, counts as one outside X: T does not
+    bound its value. Such is a state in which an episode was truncated.
 
     The bound is the smaller of the two and never rises. A call has a budget of sweeps, so it may take several calls
     to come down to v_hat; at any time it is an upper bound.
@@ -64,17 +64,17 @@ class UpperBound:
         self._below_S = self._bound_S
 
     def tighten(self, least: int) -> None:
-        """Sweep at least so often, unless nothing changes any more, and as far as the budget goes.
+        """Sweep at least so often, and further as far as the budget goes, or until nothing changes.
 
         With as many sweeps as a lookahead of full width has levels, the bound at its roots is no larger than T^n w.
         """
         if self.w < math.inf:
             before = self._taken
-            self._take_in()
+            self._update_states()
             if not self._settled and len(self._state_X):
                 entries = len(self._reward) * self._num_outcomes
                 times = max(least, min(_MOST_SWEEPS, _WORK // entries))
-                # Where X has just grown, and no longer fits the budget, nothing is gained by beginning from below.
+                # Where X has just grown and is too large for the budget, sweeps from below would not come far enough.
                 both = self._beta < UNDISCOUNTED and (self._taken == before or times * entries <= _WORK)
                 self._sweep(times, both=both)
 
@@ -86,34 +86,35 @@ class UpperBound:
         """T^n w, n = `times`, at states from which everything within n - 1 steps is in X: whatever else is in X."""
         u_S1 = torch.full_like(self._grown(self._bound_S), self.w).unsqueeze(-1)
         if self.w < math.inf:
-            self._take_in()
+            self._update_states()
             for _ in range(times if len(self._state_X) else 0):
                 u_S1[self._state_X] = self._backed_up(u_S1)
         return u_S1[state_N, 0]
 
     def state_dict(self) -> dict[str, Any]:
         """What later bounds depend on, in the order of `topology.queried`, on the CPU."""
-        asked = self.topology.queried
+        queried = self.topology.queried
         return {
-            "bound": self._grown(self._bound_S)[asked].cpu(),
-            "below": self._grown(self._below_S)[asked].cpu(),
+            "bound": self._grown(self._bound_S)[queried].cpu(),
+            "below": self._grown(self._below_S)[queried].cpu(),
             "settled": self._settled,
             "current": self._taken == self.topology.num_expanded,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave; the topology has recalled what was asked."""
+        """Take over what `state_dict` gave; the topology has preloaded the states."""
         if self.w < math.inf:
-            self._take_in()
-            asked = self.topology.queried
-            self._bound_S[asked] = state["bound"].to(asked.device)
-            self._below_S[asked] = state["below"].to(asked.device)
+            self._update_states()
+            queried = self.topology.queried
+            self._bound_S[queried] = state["bound"].to(queried.device)
+            self._below_S[queried] = state["below"].to(queried.device)
             self._settled = state["settled"]
-            if not state["current"]:  # states were expanded since: to be taken in once more
+            if not state["current"]:  # states were expanded since: X is to be updated once more
                 self._taken = -1
 
-    def _take_in(self) -> None:
-        """The states that were expanded since. What was swept from below begins anew: it need not be below any more."""
+    def _update_states(self) -> None:
+        """Take the states that were expanded since into X. The sweeps from below start again: with more states the old
+        values need not be below v_hat any more."""
         if self._taken == self.topology.num_expanded:
             return
         self._taken, self._settled = self.topology.num_expanded, False
@@ -135,9 +136,10 @@ class UpperBound:
         old_XC = u_SC[self._state_X]
         for n in range(1, times + 1):
             new_XC = self._backed_up(u_SC)
-            # From above a sweep never rises, but for rounding.
+            # From above a sweep never rises, except by rounding.
             new_XC[:, 0] = torch.minimum(new_XC[:, 0], old_XC[:, 0])
             u_SC[self._state_X] = new_XC
+            # Converged where one of the two functions has stopped moving: no fall from above, or no rise from below.
             if n % _EVERY == 0 or n == times:
                 change_C, size = (new_XC - old_XC).amax(0).tolist(), self._largest_reward + float(u_SC.abs().max())
                 fall = float((old_XC[:, 0] - new_XC[:, 0]).max())
@@ -164,13 +166,13 @@ class UpperBound:
         return new_XC
 
     def _grown(self, value_S: Float[Tensor, "S"]) -> Float[Tensor, "more"]:
-        """With w for the states that the model has numbered since."""
+        """With w for the states that the model has met since."""
         new = self.topology.model.num_states - len(value_S)
         return torch.nn.functional.pad(value_S, (0, new), value=self.w) if new else value_S
 
 
 def _without_ends(state_X: Int[Tensor, "X"], outcomes: Outcomes) -> tuple[Int[Tensor, "kept"], Outcomes]:
-    """Without the states that may stay where they are for ever, undiscounted and for nothing."""
+    """Without the states that may stay where they are for ever, undiscounted and with reward 0."""
     stays_XAK = (outcomes.child_NAK == state_X[:, None, None]) & (outcomes.discount_NAK >= UNDISCOUNTED)
     stays_XA = torch.where(stays_XAK, outcomes.prob_NAK, 0.0).sum(-1) >= UNDISCOUNTED
     ends_X = (stays_XA & (outcomes.reward_NA == 0)).any(-1)

@@ -631,9 +631,9 @@ def test_a_reward_that_is_no_number_is_named_by_the_state_of_the_model():
 
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_a_model_is_asked_for_no_more_than_it_can():
-    with pytest.raises(PgtsError, match="Recorder cannot list outcomes"):
+    with pytest.raises(PgtsError, match="Recorder cannot enumerate outcomes"):
         sampled(Recorder(ladder()), torch.tensor([0]), depth=1, v_leaf=zeros, samples=[3, None], generator=stream(0))
-    with pytest.raises(PgtsError, match="WatchedModel cannot draw outcomes"):
+    with pytest.raises(PgtsError, match="WatchedModel cannot sample outcomes"):
         sampled(watched(ladder()), torch.tensor([0]), depth=1, v_leaf=zeros, samples=[3, None], generator=stream(0))
 
 
