@@ -4,8 +4,8 @@ from pgts_torch.models.actions import with_torques
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.classic import Acrobot, CartPole, MountainCar, Pendulum
 from pgts_torch.models.fidelity import check_model
-from pgts_torch.models.numbering import Numbering
 from pgts_torch.models.simulator import SimulatorModel
+from pgts_torch.models.state_index import StateIndex
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.tensor import TensorModel
 
@@ -14,10 +14,10 @@ __all__ = [
     "CartPole",
     "EnumeratingModel",
     "MountainCar",
-    "Numbering",
     "Pendulum",
     "SamplingModel",
     "SimulatorModel",
+    "StateIndex",
     "TabularModel",
     "TensorModel",
     "Transitions",

@@ -24,10 +24,10 @@ from torch import Tensor
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.actions import base_actions
 from pgts_torch.models.base import ExactModel
-from pgts_torch.models.numbering import Merge
 from pgts_torch.models.provenance import overridden
 from pgts_torch.models.rewards import value_range
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.state_index import Merge
 from pgts_torch.models.steps import number_of
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.models.wrappers import transforms_of

@@ -10,7 +10,7 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import DENIED, EnumeratingModel, Happened, SamplingModel, Transitions, step_text
-from pgts_torch.models.numbering import Merge, Numbering
+from pgts_torch.models.state_index import Merge, StateIndex
 
 _ROUNDING = 1e-12
 """By how much dynamics that do the same arithmetic in another order, or on another device, may be off."""
@@ -44,7 +44,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
         state_dtype: of the vectors: floating, or int64.
         dtype: of rewards, discounts and values.
         device: where everything lies.
-        merge: whether equal states get one number (`Numbering`).
+        merge: whether equal states get one number (`StateIndex`).
         action_repeat: k, how often an action is taken in one outcome.
 
     Raises:
@@ -66,9 +66,9 @@ class TensorModel(EnumeratingModel, SamplingModel):
     ) -> None:
         if action_repeat < 1:
             raise PgtsError(f"action_repeat is {action_repeat}; it must be at least 1")
-        self._numbering = Numbering(state_size, dtype=state_dtype, device=device, merge=merge)
+        self._index = StateIndex(state_size, dtype=state_dtype, device=device, merge=merge)
         self.num_actions = num_actions
-        self.device = self._numbering.device
+        self.device = self._index.device
         self.dtype = dtype
         self.action_repeat = action_repeat
         self.is_certain = True
@@ -88,7 +88,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
 
     @property
     def num_states(self) -> int:  # type: ignore[override]
-        return len(self._numbering)
+        return len(self._index)
 
     def number(self, state_ND: Num[Tensor, "N D"]) -> Int[Tensor, "N"]:
         """The number of each state; new ones get the next numbers.
@@ -96,16 +96,16 @@ class TensorModel(EnumeratingModel, SamplingModel):
         Raises:
             PgtsError: states of a wrong size or dtype, or with a nan (naming the row).
         """
-        return self._numbering.number(state_ND)
+        return self._index.number(state_ND)
 
     def states(self, state_N: Int[Tensor, "N"]) -> Num[Tensor, "N D"]:
         """The states with these numbers."""
-        return self._numbering.rows(state_N)
+        return self._index.rows(state_N)
 
     def clear(self) -> None:
         """Forget all states and give their memory back. Their numbers mean nothing afterwards: a `Topology` over this
         model refuses to go on, and a new one is to be made."""
-        self._numbering.clear()
+        self._index.clear()
         self.generation += 1
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:

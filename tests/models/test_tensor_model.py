@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models import Numbering, TensorModel, numbering
-from pgts_torch.models.numbering import hash_rows
+from pgts_torch.models import StateIndex, TensorModel, state_index
+from pgts_torch.models.state_index import hash_rows
 from pgts_torch.search import Topology, expectimax
 from pgts_torch.seeding import draw_keys, stream
 from tests.search.models import walk_the_tree
@@ -44,13 +44,13 @@ HASHES = {
 }
 
 
-# Numbering
+# StateIndex
 
 
 @pytest.mark.parametrize("name", HASHES)
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_rows_are_numbered_as_a_dictionary_would_whatever_the_hash(name, dtype):
-    ours, naive = Numbering(2, dtype=dtype, hash=HASHES[name]), Naive()
+    ours, naive = StateIndex(2, dtype=dtype, hash=HASHES[name]), Naive()
     for seed, count in enumerate([1, 0, 40, 3, 700, 90]):
         rows = whole_rows(count, seed=seed, dtype=dtype)
         assert torch.equal(ours.number(rows), naive.number(rows))
@@ -60,7 +60,7 @@ def test_rows_are_numbered_as_a_dictionary_would_whatever_the_hash(name, dtype):
 
 @given(st.lists(st.lists(st.tuples(st.integers(-2, 2), st.integers(-2, 2)), max_size=30), max_size=5))
 def test_any_batches_of_rows_are_numbered_as_a_dictionary_would(batches):
-    ours, naive = Numbering(2, dtype=torch.int64, hash=HASHES["of three values"]), Naive()
+    ours, naive = StateIndex(2, dtype=torch.int64, hash=HASHES["of three values"]), Naive()
     for batch in batches:
         rows = torch.tensor(batch, dtype=torch.int64).reshape(-1, 2)
         assert torch.equal(ours.number(rows), naive.number(rows))
@@ -72,24 +72,24 @@ def test_rows_that_differ_in_their_last_bit_alone_are_different(dtype):
     other = one.clone()
     other[0, 2] += 1 if dtype == torch.int64 else torch.finfo(dtype).eps
     for hash in HASHES.values():
-        ours = Numbering(3, dtype=dtype, hash=hash)
+        ours = StateIndex(3, dtype=dtype, hash=hash)
         assert ours.number(torch.cat([one, other, one])).tolist() == [0, 1, 0]
 
 
 def test_large_integers_that_no_float_tells_apart_are_different():
-    ours = Numbering(1, dtype=torch.int64)
+    ours = StateIndex(1, dtype=torch.int64)
     assert ours.number(torch.tensor([[2**60], [2**60 + 1], [-(2**63)], [2**60]])).tolist() == [0, 1, 2, 0]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_minus_0_equals_0_and_infinities_equal_themselves(dtype):
     rows = torch.tensor([[0.0], [-0.0], [math.inf], [-math.inf], [math.inf], [-0.0]], dtype=dtype)
-    assert Numbering(1, dtype=dtype).number(rows).tolist() == [0, 0, 1, 2, 1, 0]
+    assert StateIndex(1, dtype=dtype).number(rows).tolist() == [0, 0, 1, 2, 1, 0]
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_rows_that_cannot_be_numbered_are_refused_and_named_and_leave_no_trace():
-    ours = Numbering(2, dtype=torch.float64)
+    ours = StateIndex(2, dtype=torch.float64)
     for rows, message in [
         (torch.tensor([[0.0, 1.0], [2.0, math.nan]], dtype=torch.float64), r"row 1 is \[2\.0, nan\]"),
         (torch.zeros(3, 2), r"rows are torch\.float32 \(3, 2\); they must be torch\.float64 \[N, 2\]"),
@@ -100,11 +100,11 @@ def test_rows_that_cannot_be_numbered_are_refused_and_named_and_leave_no_trace()
             ours.number(rows)
         assert len(ours) == 0
     with pytest.raises(PgtsError, match="merge is 'sometimes'"):
-        Numbering(2, dtype=torch.float64, merge="sometimes")
+        StateIndex(2, dtype=torch.float64, merge="sometimes")
 
 
 def test_memory_at_most_doubles_and_is_given_back():
-    ours = Numbering(2, dtype=torch.float64, merge=True)
+    ours = StateIndex(2, dtype=torch.float64, merge=True)
     capacities = []
     for seed in range(40):
         ours.number(real_rows(500, seed))
@@ -123,7 +123,7 @@ def test_a_call_hashes_its_own_rows_and_not_the_whole_table_except_when_that_dou
         hashed.append(len(bits_ND))
         return hash_rows(bits_ND)
 
-    ours = Numbering(2, dtype=torch.float64, merge=True, hash=hash)
+    ours = StateIndex(2, dtype=torch.float64, merge=True, hash=hash)
     for seed in range(100):
         ours.number(real_rows(100, seed))
     assert sum(hashed) <= 4 * 10_000
@@ -134,7 +134,7 @@ def test_a_call_hashes_its_own_rows_and_not_the_whole_table_except_when_that_dou
 
 
 def test_rows_that_do_not_recur_are_no_longer_looked_up_and_rows_that_recur_are_again():
-    ours = Numbering(2, dtype=torch.float64)
+    ours = StateIndex(2, dtype=torch.float64)
     assert ours.merging
     first = real_rows(6_000, 0)
     ours.number(first)
@@ -150,7 +150,7 @@ def test_rows_that_do_not_recur_are_no_longer_looked_up_and_rows_that_recur_are_
 
 
 def test_rows_that_recur_are_looked_up_for_ever():
-    ours, naive = Numbering(2, dtype=torch.int64), Naive()
+    ours, naive = StateIndex(2, dtype=torch.int64), Naive()
     for seed in range(8):
         rows = whole_rows(4_000, seed=seed, dtype=torch.int64, below=40)
         assert torch.equal(ours.number(rows), naive.number(rows))
@@ -160,7 +160,7 @@ def test_rows_that_recur_are_looked_up_for_ever():
 def test_whether_merged_or_not_a_number_leads_back_to_its_row():
     recurring = real_rows(3_000, 99)
     for merge in ("auto", True, False):
-        ours = Numbering(2, dtype=torch.float64, merge=merge)
+        ours = StateIndex(2, dtype=torch.float64, merge=merge)
         known = []
         for seed in range(6):
             rows = torch.cat([real_rows(5_000, seed), recurring[: 1_000 * (seed // 2)]])
@@ -173,7 +173,7 @@ def test_whether_merged_or_not_a_number_leads_back_to_its_row():
 
 
 def test_without_merging_every_row_is_new():
-    ours = Numbering(2, dtype=torch.float64, merge=False)
+    ours = StateIndex(2, dtype=torch.float64, merge=False)
     assert ours.number(torch.zeros(5, 2, dtype=torch.float64)).tolist() == [0, 1, 2, 3, 4]
     assert not ours.merging
 
@@ -326,6 +326,6 @@ def test_a_search_in_inference_mode_leaves_a_model_that_serves_outside():
 
 def test_the_sample_of_rows_is_drawn_by_the_hash_so_that_equal_rows_are_both_in_it_or_neither():
     bits = torch.arange(20_000).view(-1, 2)
-    top = hash_rows(bits) >> (64 - numbering._SAMPLE_BITS)
+    top = hash_rows(bits) >> (64 - state_index._SAMPLE_BITS)
     share = float((top == 0).double().mean())
     assert abs(share - 1 / 16) < 5 * math.sqrt(1 / 16 * 15 / 16 / 10_000)  # 5 sigma: one seed in 1.7 million would fail

@@ -1,4 +1,4 @@
-"""Numbers for states that are vectors: equal rows get the same number, whatever their hash says."""
+"""Numbers for states that are vectors: equal rows get the same number, also where hashes collide."""
 
 from collections.abc import Callable
 from typing import Literal, final
@@ -26,13 +26,13 @@ _BITS = {
 }
 
 _JUDGED_AFTER = 4096
-"""How many rows are asked about before it is judged whether they recur."""
+"""After how many lookups it is judged whether rows recur."""
 
 _PAYS, _PAYS_AGAIN = 1.01, 1.05
-"""How often rows recur on average where looking them up goes on, and where it is taken up again."""
+"""How often rows must recur on average for lookups to go on, and to be resumed."""
 
 _SAMPLE_BITS = 4
-"""While rows are not looked up, those whose hash begins with so many zeros are."""
+"""While lookups are given up, rows whose hash begins with so many zeros are still looked up, as a sample."""
 
 
 def hash_rows(bits_ND: Int[Tensor, "N D"]) -> Int[Tensor, "N"]:
@@ -45,24 +45,24 @@ def hash_rows(bits_ND: Int[Tensor, "N D"]) -> Int[Tensor, "N"]:
 
 
 @final
-class Numbering:
+class StateIndex:
     """Numbers 0, 1, 2, ... for the distinct rows of all tensors seen so far, in the order of their first appearance.
 
     An open-addressing hash table with linear probing (Knuth, TAOCP 6.4), at most half full, that takes a whole tensor
     at once: in each round every row that is still looking visits one slot, and of those that find it empty the first
-    one takes it. Two rows count as equal only when all their numbers are, so a collision costs a round and never an
-    error. A call costs O(N) for N rows however many are known, growth spread over the calls that cause it.
+    one takes it. Rows are compared in full, so a collision of hashes costs a round and never an error. A call costs
+    O(N) for N rows however many are known; the cost of growth is spread over the calls that cause it.
 
-    Where rows do not recur, looking for them buys nothing. With `merge` "auto" rows are given numbers of their own,
-    unseen, once a few thousand of them have recurred less than 1.01 times on average. One row in 16 is looked up all
-    the same, chosen by its hash, so that rows equal to it are chosen too: when these recur all rows are looked up
-    again, after one call that lists what was missed. A row that got several numbers is then known by the first one.
+    Where rows do not recur, lookups are a waste. With `merge` "auto" each row gets a number of its own, without a
+    lookup, once a few thousand of them have recurred less than 1.01 times on average. One row in 16 is still looked up,
+    chosen by its hash, so that rows equal to it are chosen too: when these recur, lookups are resumed, after one call
+    that enters the rows that were skipped. A row that got several numbers is then known by the first one.
 
     Args:
         num_columns: D.
         dtype: of the rows: floating, where -0.0 equals 0.0, or an integer type.
         device: where rows and table lie.
-        merge: whether equal rows get one number. False: never; every row asked about is a new one.
+        merge: whether equal rows get one number. False: never; every row is a new one.
         hash: which slot a row visits first.
     """
 
@@ -79,6 +79,7 @@ class Numbering:
             raise PgtsError(f"merge is {merge!r}; it must be 'auto', True or False")
         self._merge, self._hash = merge, hash
         with torch.inference_mode(False):
+            # _rows: the row of each number, with room for more. _slots: the table, numbers or _EMPTY.
             self._rows = torch.empty(0, num_columns, dtype=dtype, device=device)
         self.clear()
 
@@ -102,8 +103,8 @@ class Numbering:
     # What is kept must be ordinary tensors even if the caller is in inference mode.
     @torch.inference_mode(False)
     def clear(self) -> None:
-        """Forget all rows and give their memory back."""
-        self._count = self._listed = self._asked = self._new = 0
+        """Drop all rows and free their memory."""
+        self._count = self._entered = self._looked_up = self._new = 0
         self._merging = self._merge is not False
         self._rows = self._rows.new_empty(0, self._rows.shape[1])
         self._slots = self._empty_slots(_LEAST_SLOTS)
@@ -118,49 +119,52 @@ class Numbering:
         """The number of each row; rows not seen before get the next ones.
 
         Raises:
-            PgtsError: the rows have another width or dtype than told, or one is not a number (naming it).
+            PgtsError: the rows have another width or dtype than was given, or one holds a NaN (naming it).
         """
         row_ND = self._checked(row_ND)
         first, last = self._count, self._count + len(row_ND)
         self._make_room(last)
+        # All rows are first written behind the known ones, where they can be compared with these and each other: row i
+        # is new, with the number `first + i`, unless an equal one is found.
         self._rows[first:last] = row_ND
-        # Row i is new, with the number `first + i`, unless an equal one is found.
         fresh_N = torch.arange(first, last, device=self.device)
         if self._merge is False:
             self._count = last
             return fresh_N
         hash_N = self._hashed(row_ND)
+        # looking_L: the L rows that are looked up; found_L: the first row equal to each, which may be itself.
         looking_L = fresh_N
         if not self._merging:
             looking_L = fresh_N[hash_N >> (64 - _SAMPLE_BITS) == 0]
         found_L, slot_L = self._look_up(looking_L, hash_N[looking_L - first])
         new_N = torch.ones_like(fresh_N, dtype=torch.bool)
         new_N[looking_L - first] = found_L == looking_L
-        # The new ones move together, to the least numbers that are free.
+        # New rows move together: their numbers are `first` and the next ones, and the table is told of it.
         number_N = first - 1 + new_N.cumsum(0)
         own = torch.nonzero(found_L == looking_L).flatten()
         self._slots[slot_L[own]] = number_N[looking_L[own] - first]
         new = torch.nonzero(new_N).flatten()
         self._rows[first : first + len(new)] = row_ND[new]
-        self._count, self._listed = first + len(new), self._listed + len(own)
+        self._count, self._entered = first + len(new), self._entered + len(own)
+        # The others take the number of what was found: an old row's own, or the one that a row of this call just got.
         at_L = (found_L - first).clamp(min=0)
         number_N[looking_L - first] = torch.where(found_L < first, found_L, number_N[at_L])
         if self._merge == "auto":
             self._judge(len(looking_L), len(own))
         return number_N
 
-    def _judge(self, asked: int, new: int) -> None:
-        """Give up looking rows up, or take it up again, by how often those that were looked up have recurred."""
-        self._asked += asked
+    def _judge(self, looked_up: int, new: int) -> None:
+        """Give up lookups, or resume them, by how often the rows that were looked up have recurred."""
+        self._looked_up += looked_up
         self._new += new
-        if self._asked < (_JUDGED_AFTER if self._merging else _JUDGED_AFTER >> _SAMPLE_BITS):
+        if self._looked_up < (_JUDGED_AFTER if self._merging else _JUDGED_AFTER >> _SAMPLE_BITS):
             return
         if self._merging:
-            self._merging = self._asked > _PAYS * self._new
-        elif self._asked > _PAYS_AGAIN * self._new:
+            self._merging = self._looked_up > _PAYS * self._new
+        elif self._looked_up > _PAYS_AGAIN * self._new:
             self._merging = True
-            self._list(torch.arange(self._count, device=self.device), 2 * self._count)
-        self._asked = self._new = 0
+            self._enter(torch.arange(self._count, device=self.device), 2 * self._count)
+        self._looked_up = self._new = 0
 
     def _checked(self, row_ND: Tensor) -> Tensor:
         """The rows without -0.0."""
@@ -169,11 +173,12 @@ class Numbering:
             raise PgtsError(f"the rows are {row_ND.dtype} {tuple(row_ND.shape)}; they must be {dtype} [N, {D}]")
         if not dtype.is_floating_point:
             return row_ND
+        # NaN equals nothing, not even itself: such a row would be new each time.
         bad_N = row_ND.isnan().any(-1)
         if bool(bad_N.any()):
             n = int(torch.nonzero(bad_N)[0, 0])
             raise NotFinite(f"row {n} is {row_ND[n].tolist()}; what is not a number equals nothing", what="state")
-        return row_ND + 0.0
+        return row_ND + 0.0  # -0.0 becomes 0.0, so that equal rows have equal bits
 
     def _hashed(self, row_ND: Tensor) -> Int[Tensor, "N"]:
         return self._hash((row_ND.view(_BITS[row_ND.dtype]) if row_ND.dtype in _BITS else row_ND).long())
@@ -188,21 +193,23 @@ class Numbering:
             more[: self._count] = self._rows[: self._count]
             self._rows = more
 
-    def _list(self, number_L: Tensor, num_slots: int) -> None:
-        """A table of at least so many slots that lists these rows."""
+    def _enter(self, number_L: Tensor, num_slots: int) -> None:
+        """A new table of at least so many slots, with these rows."""
         self._slots = self._empty_slots(max(_LEAST_SLOTS, 1 << (num_slots - 1).bit_length()))
-        self._listed = 0
+        self._entered = 0
         found_L, _ = self._look_up(number_L, self._hashed(self._rows[number_L]))
-        self._listed = int((found_L == number_L).sum())
+        self._entered = int((found_L == number_L).sum())
 
     def _look_up(self, looking_L: Tensor, hash_L: Tensor) -> tuple[Tensor, Tensor]:
-        """For each of these rows in memory the number of the first one that equals it, and its slot; rows that equal
-        none before them are listed. The caller counts them."""
-        needed = 2 * (self._listed + len(looking_L))
+        """For each of these rows the number of the first one that equals it, and its slot; rows that equal none before
+        them are entered. The caller counts them."""
+        needed = 2 * (self._entered + len(looking_L))
         if needed > len(self._slots):
-            self._list(self._slots[self._slots != _EMPTY], needed)
+            self._enter(self._slots[self._slots != _EMPTY], needed)
         last_slot = len(self._slots) - 1
         found_L, at_L = torch.empty_like(looking_L), torch.empty_like(looking_L)
+        # index: which of the rows are still looking. In each round they compare themselves with the row in their slot,
+        # and those that differ go on to the next slot.
         index, slot_L = torch.arange(len(looking_L), device=self.device), hash_L & last_slot
         while len(looking_L):
             here_L = self._slots.index_select(0, slot_L)
