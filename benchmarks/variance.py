@@ -84,8 +84,7 @@ def softmax_policy(pi_SA: Float[Tensor, "S A"]) -> SoftmaxPolicy:
 
 def columns(episodes: Rollout, chosen: slice) -> Rollout:
     """Some of the episodes."""
-    fields = {name: value[:, chosen] for name, value in vars(episodes).items() if name.endswith("_TB")}
-    return replace(episodes, **fields)
+    return replace(episodes, **{name: value[:, chosen] for name, value in vars(episodes).items()})
 
 
 @dataclass(frozen=True)
