@@ -20,7 +20,7 @@ DENSE = (
     "search/split.py",
     "search/empirical.py",
     "search/sampled.py",
-    "models/numbering.py",
+    "models/state_index.py",
     "models/simulator.py",
 )
 """Masks, scatters and index arithmetic: here a reader needs comments."""

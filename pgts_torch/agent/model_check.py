@@ -13,7 +13,7 @@ from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import ModelMismatch, PgtsError
-from pgts_torch.models.base import DENIED, DRAWN, ExactModel, Happened, step_text
+from pgts_torch.models.base import CONTRADICTED, RANDOM, ExactModel, Happened, step_text
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.seeding import numpy_stream
@@ -112,7 +112,7 @@ class ModelCheck:
 
     def _hold(self, experience: Rollout, iteration: int) -> "_Told":
         """What comes of this rank's part of the steps; those of tables are handed to the test of their frequencies."""
-        model, ask_N = self._model, None
+        model, query_N = self._model, None
         assert model is not None
         # Tables and dynamics cut no episode off, so whether one went on says nothing about them.
         happened = _steps(experience, follows="alive_TB" if model.is_cheap else "follows_TB")
@@ -121,29 +121,29 @@ class ModelCheck:
                 mine = self._ranks.part(torch.from_numpy(np.unique(happened.state_N))).numpy()
                 happened = happened.part(np.isin(happened.state_N, mine))
             random = numpy_stream(self._seed, "iteration", iteration, "model check", *self._ranks.names)
-            ask_N = random.random(len(happened.state_N)) < _SHARE
+            query_N = random.random(len(happened.state_N)) < _SHARE
         steps_before = model.simulator_steps
-        held_N = model.hold(happened, ask_N=ask_N)
+        held_N = model.outcome_of(happened, query_N=query_N)
         calls, agrees = model.simulator_steps - steps_before, not len(held_N) or held_N.min() >= 0
         if isinstance(model, TabularModel) and self._frequencies["steps"].has_chance:
             known = slice(None) if agrees else held_N >= 0
             self._frequencies["steps"].observe(model.rows(happened)[known], held_N[known])
         if agrees:
             return _Told(calls)
-        denied = np.flatnonzero(held_N == DENIED)
+        denied = np.flatnonzero(held_N == CONTRADICTED)
         story = self._denied(happened.part(denied[:1])) if len(denied) else ""
-        return _Told(calls, len(denied), story, bool((held_N == DRAWN).any()))
+        return _Told(calls, len(denied), story, bool((held_N == RANDOM).any()))
 
     def _denied(self, one: Happened) -> str:
         """A step that the model denies, and what it says."""
         model = self._model
         assert model is not None
         state, action, reward, discount, next_state, follows = (column.item() for column in vars(one).values())
-        happened = step_text(reward, discount, model.shown(next_state))
+        happened = step_text(reward, discount, model.state_text(next_state))
         happened += ", and the episode went on" * (follows and not model.is_cheap)
         return (
-            f"{self._name} contradicts its {model.kind}: {model.shown(state)} under action {action} "
-            f"gave {happened}; the {model.kind} says {model.told(state, action)}. {_WAY_OUT}"
+            f"{self._name} contradicts its {model.kind}: {model.state_text(state)} under action {action} "
+            f"gave {happened}; the {model.kind} says {model.outcomes_text(state, action)}. {_WAY_OUT}"
         )
 
     def _only_drawn(self) -> str:
@@ -185,10 +185,10 @@ class ModelCheck:
         assert isinstance(model, TabularModel)
         worst = self._frequencies[what].worst()
         if what == "starts":
-            where, event = "an episode began in", model.shown(worst.outcome)
+            where, event = "an episode began in", model.state_text(worst.outcome)
         else:
             state, action = divmod(worst.row, model.num_actions)
-            where = f"{model.shown(state)} under action {action} gave"
+            where = f"{model.state_text(state)} under action {action} gave"
             event = model.outcome_text(state, action, worst.outcome)
         return (
             f"{self._name} contradicts the probabilities of its {self._kind}: {where} {event} in {worst.happened} of "

@@ -1,7 +1,7 @@
-"""What a lookahead may ask of a model. Ask for the smallest ability: a signature says which.
+"""What a lookahead may query a model for. A signature names the smallest ability that it needs.
 
-A state is an integer below `num_states`. A model whose states are something else (snapshots, vectors) numbers them as
-it meets them, equal states alike, so that a search can merge them.
+A state is an integer below `num_states`. A model whose states are something else (snapshots, vectors) gives them
+numbers as it meets them, equal states the same one, so that a search can merge them.
 """
 
 import math
@@ -20,7 +20,7 @@ from pgts_torch.models.rewards import RewardRange
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """One drawn outcome for each of N pairs (state, action).
+    """One sampled outcome for each of N pairs (state, action).
 
     reward_N: in reward units.   discount_N: in [0, 1], 0 after a terminal outcome.   next_state_N: states of the model.
     """
@@ -32,8 +32,8 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False)
 class Happened:
-    """N steps of an environment, in the states of a model; in numpy, where few numbers cost a third of what they do in
-    torch.
+    """N steps of an environment, in the states of a model; in numpy, where operations on few numbers cost a third of
+    what they do in torch.
 
     reward_N: in reward units.   discount_N: in [0, 1], 0 where the episode ended.
     follows_N: whether the episode went on with another step.
@@ -47,26 +47,26 @@ class Happened:
     follows_N: Bool[np.ndarray, "N"]
 
     def part(self, at: Any) -> "Happened":
-        """Those at some positions, or under a mask."""
+        """The steps at some positions, or under a mask."""
         return Happened(*(column_N[at] for column_N in vars(self).values()))
 
 
-DENIED, DRAWN, UNASKED = -1, -2, -3
-"""What comes of holding a step to a model, in place of an outcome: there is none like it with a positive probability;
-the model draws what follows and lists nothing to hold it to; the answer would have cost a call."""
+CONTRADICTED, RANDOM, NOT_QUERIED = -1, -2, -3
+"""What `ExactModel.outcome_of` returns in place of an outcome: the model has none like this step with a positive
+probability; the model samples what follows, and enumerates nothing to compare with; the answer would cost a call."""
 
 
 class Model(ABC):
     """A finite action set over numbered states.
 
     exact: whether it claims to be the environment, as a table, dynamics or a simulator do, and a learned model does
-        not: what the environment does is held to it, and a bound that it proves is called proved.
+        not: each step of the environment is compared with it, and a bound from it is called proved.
     highest_value: an upper bound of v* in every state; infinite where none is known.
     lowest_value: a lower bound of v^pi, of every policy in every state; -infinite where none is known.
-    reward_range: what its rewards are held to; None: nothing.
+    reward_range: between which numbers its rewards must be; None: any.
     action_repeat: how often an action is taken in one outcome.
     is_certain: whether it is known that no action has more than one outcome.
-    generation: how often the model has forgotten its states and begun to number them anew.
+    generation: how often the model has been cleared, so that states have got other numbers.
     """
 
     num_states: int
@@ -83,11 +83,11 @@ class Model(ABC):
 
 
 class ExactModel(Model):
-    """A model that claims to be the environment, and so can be held to what the environment does.
+    """A model that claims to be the environment, so that what the environment does can contradict it.
 
     kind: the word for it in a message.
-    is_cheap: whether it can be held to all steps for next to nothing; else only to those that it was asked about, and
-        to a few more.
+    is_cheap: whether it can be compared with all steps at almost no cost; else only with those that it was queried for,
+        and a few more.
     simulator_steps: how often a simulator behind it was stepped.
     """
 
@@ -97,37 +97,37 @@ class ExactModel(Model):
     simulator_steps: int = 0
 
     @abstractmethod
-    def hold(self, happened: Happened, *, ask_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
+    def outcome_of(self, happened: Happened, *, query_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
         """Which of its outcomes of positive probability each step was (0 where there is only one), the first of those
-        that look like it: reward, discount and, unless the episode ended, next state are the same. Where there is none,
-        DENIED, DRAWN or UNASKED.
+        with the same reward, discount and, unless the episode ended, next state; else CONTRADICTED, RANDOM or
+        NOT_QUERIED.
 
-        With repeated actions the model is held to its single steps.
+        With repeated actions these are the outcomes of single steps.
 
         Args:
-            ask_N: where an answer is worth a call. Default: everywhere.
+            query_N: where an answer is worth a call. Default: everywhere.
         """
 
     @abstractmethod
-    def shown(self, state: int) -> str:
+    def state_text(self, state: int) -> str:
         """A state in a message."""
 
     @abstractmethod
-    def told(self, state: int, action: int) -> str:
-        """What the model says of a state and an action, in a message."""
+    def outcomes_text(self, state: int, action: int) -> str:
+        """The outcomes of a state and an action, in a message."""
 
 
 def promise(model: Model, reward_range: RewardRange, *, gamma: float) -> None:
-    """Hold a model to a range of rewards, and bound what its states can be worth by it."""
+    """Give a model a range that its rewards must be in, and the bounds of its values that follow."""
     low, high = reward_range.values(gamma)
     model.reward_range = reward_range
     model.lowest_value, model.highest_value = max(model.lowest_value, low), min(model.highest_value, high)
 
 
 class EnumeratingModel(Model):
-    """A model that lists all outcomes of a state.
+    """A model that enumerates all outcomes of a state.
 
-    num_outcomes: K; None: it is not known before the model is asked.
+    num_outcomes: K; None: it is not known before the first query.
     samples_outcomes: whether it samples the outcomes that it enumerates, and remembers them.
     """
 
@@ -140,19 +140,19 @@ class EnumeratingModel(Model):
 
 
 class SamplingModel(Model):
-    """A model that draws one outcome of a state and an action."""
+    """A model that samples one outcome of a state and an action."""
 
     @abstractmethod
     def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
         """One outcome of each (state, action): a function of state, action and key (`seeding.mix`) and of nothing else.
 
-        So a search owns its randomness, cannot foresee what an environment will draw, and finds the same outcome
-        however its batch is split or ordered.
+        So the randomness is that of the search, which cannot foresee what an environment will do, and finds the same
+        outcome however its batch is split or ordered.
         """
 
 
 def step_text(reward: float, discount: float, then: str) -> str:
-    """A step in a message: what it paid, and what came after it."""
+    """A step in a message: its reward, and what came after it."""
     return f"reward {_exactly(reward)}, " + (
         "an end" if discount == 0 else f"discount {_exactly(discount)}, then {then}"
     )

@@ -1,4 +1,4 @@
-"""A simulator as a model: its states are snapshots, numbered as they are met, equal ones alike."""
+"""A simulator as a model: its states are snapshots, numbered as they are met, equal ones with the same number."""
 
 import itertools
 import math
@@ -20,9 +20,9 @@ from pgts_torch.models.actions import all_actions
 from pgts_torch.models.adapters import adapter_for
 from pgts_torch.models.answers import Answers, Step, copied
 from pgts_torch.models.base import (
-    DENIED,
-    DRAWN,
-    UNASKED,
+    CONTRADICTED,
+    NOT_QUERIED,
+    RANDOM,
     EnumeratingModel,
     ExactModel,
     Happened,
@@ -37,22 +37,22 @@ from pgts_torch.models.wrappers import transforms_of
 from pgts_torch.seeding import SharedGenerators
 
 _KEY_OF_CERTAINTY = 0
-"""Outcomes that are listed draw nothing; this is what they would draw from."""
+"""The key of steps that must not use any: a step that does is random, and is not enumerated."""
 
 
 @final
 class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
-    """An instance of a Gymnasium environment that answers what may follow a state and an action.
+    """An instance of a Gymnasium environment that is put into a state and stepped, to find what may follow an action.
 
-    The instance belongs to the model alone. What its wrappers make of an action, a reward or an observation is in the
-    answers (`transforms_of`); a `TimeLimit` is left out and ends no episode here. Nothing that the model is asked
-    touches the environment that an agent acts in. Where the environment itself truncates an episode the model never
-    steps on: such a state leads to itself with reward 0 and discount 1, under its first action alone, so that T leaves
-    it the value that stands at the leaves, which is the critic's, at any depth.
+    The instance is used by the model alone, so queries never touch the environment that an agent acts in. What its
+    wrappers make of actions, rewards and observations is part of the outcomes (`transforms_of`); a `TimeLimit` is left
+    out and ends no episode here. Where the environment itself truncates an episode the model never steps on: such a
+    state leads to itself with reward 0 and discount 1, under its first action alone, so that at any depth T leaves it
+    the value that the critic gives it at the leaves.
 
-    Chance comes from the keys of the search, so a search cannot foresee what that environment will draw. A transition
-    that draws nothing is asked of the simulator once, and the answer outlives `clear`, for it is no matter of numbers;
-    only where answers take much memory are they forgotten.
+    Chance comes from the keys of the search, so a search cannot foresee what the environment of the agent will do. For
+    a transition that uses no chance the simulator is stepped once. The answer is kept by snapshot, so it outlives
+    `clear`; only where answers take much memory are they dropped.
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
@@ -69,8 +69,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
 
     Raises:
         MissingModel: no adapter knows the environment, or a wrapper may change more than single answers.
-        PgtsError: it cannot be made, gamma is no discount, its actions cannot be listed, or action_repeat is below 1,
-            or above 1 beside a highest value.
+        PgtsError: it cannot be made, gamma is no discount, its actions cannot be enumerated, or action_repeat is below
+            1, or above 1 beside a highest value.
     """
 
     kind, is_cheap = "simulator", False
@@ -102,6 +102,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         self.env: Any = made.unwrapped
         self.adapter = adapter or adapter_for(made)
         self.transforms, self._space = transforms_of(made), made.observation_space
+        # Actions as the outermost wrapper takes them, and as the bare instance does, which is the one that is stepped.
         outer = all_actions(made.action_space) if actions is None else actions
         self.actions = [self.transforms.action(action) for action in outer]
         if not self.actions:
@@ -112,9 +113,11 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         """How often the simulator was stepped."""
         self._observe = observe
         try:
-            self.env.reset(seed=0)  # to have a state at all, which the first snapshot replaces
+            # Only to have a state at all: the first snapshot replaces it.
+            self.env.reset(seed=0)
         except BaseException as error:
             raise failure(f"{self.name} failed in reset with seed 0", error) from error
+        # What makes the observation of the present state, where steps do not.
         self._show = self.adapter.skip_observations(self.env)
         self._draws_its_own = draws_its_own(made)
         self._names_discounts = names_discounts(self.env)
@@ -123,8 +126,9 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         self.clear()
 
     def clear(self) -> None:
-        """Forget all states. Their numbers mean nothing from here on: numbering begins anew."""
+        """Drop all states. Their numbers are given to other states from here on."""
         self.generation += 1
+        # By number: the snapshot of a state, and its observation, None where that is unknown. By snapshot: the number.
         self.num_states = 0
         self._snapshots: list[Snapshot] = []
         self._observations: list[Any] = []
@@ -137,11 +141,12 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
 
         Args:
             env: wrapped or not; it has been reset.
-            observation: what it shows there, through its wrappers; needed only by critics that read observations.
+            observation: its observation there, through its wrappers; needed only by critics that read observations.
 
         Raises:
             PgtsError: it is another environment, or has another map or other constants than the model's.
         """
+        # Each instance is compared with the model's own once.
         base: Any = env.unwrapped
         if not any(base is known for known in self._known_worlds):
             if not self.adapter.same_world(base, self.env):
@@ -165,22 +170,23 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         return number
 
     def _see(self, number: int, observation: Any) -> None:
-        shown = self._observe(observation) if self._observe else observation
-        self._observations[number] = copied(shown)  # an environment may write into what it has shown
+        seen = self._observe(observation) if self._observe else observation
+        # Copied, because an environment may write into the arrays that it has returned.
+        self._observations[number] = copied(seen)
 
-    def _known(self, snapshot: Snapshot, shown: Any) -> int:
-        """The number of a state that shows this."""
+    def _known(self, snapshot: Snapshot, seen: Any) -> int:
+        """The number of a state with this observation (as `observe` has made it, or None)."""
         number = self._number.setdefault(snapshot.name, self.num_states)
         if number == self.num_states:
             self.num_states += 1
             self._snapshots.append(snapshot)
-            self._observations.append(shown)
+            self._observations.append(seen)
         elif self._observations[number] is None:
-            self._observations[number] = shown
+            self._observations[number] = seen
         return number
 
     def export(self, state_N: Int[Tensor, "N"]) -> list[tuple[Snapshot, Any]]:
-        """The snapshot of each state, and what `observe` made of what it shows: for `adopt` in another process."""
+        """The snapshot of each state and what `observe` made of its observation, for `adopt` in another process."""
         return [(self.snapshot(state), self._observations[state]) for state in state_N.tolist()]
 
     def adopt(self, exported: Iterable[tuple[Snapshot, Any]]) -> Int[Tensor, "N"]:
@@ -193,7 +199,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         return self._snapshots[state]
 
     def observations(self, state_N: Int[Tensor, "N"]) -> np.ndarray:
-        """What `observe` made of what the environment shows in each state, stacked: [N, ...].
+        """What `observe` made of the observation of each state, stacked: [N, ...].
 
         Without `observe` that is [N, *shape] of a Box, [N] of a Discrete space, and `gymnasium.spaces.flatten` of any
         other, in the dtype of the space.
@@ -230,8 +236,8 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
                 step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=self.action_repeat)
                 if step.random:
                     raise RandomOutcomes(
-                        f"{self.name} is random in state {state} under action {action}: its outcomes cannot be listed; "
-                        "search it by `sampled`, or make a TabularModel of it if it has a table P"
+                        f"{self.name} is random in state {state} under action {action}: its outcomes cannot be "
+                        "enumerated; search it by `sampled`, or make a TabularModel of it if it has a table P"
                     )
                 steps.append(step)
         reward_N, discount_N, child_N = self._answer(steps)
@@ -251,18 +257,19 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             PgtsError: no such state or action; or the environment raises, or answers with a reward or an observation
                 that is not finite or does not fit its space: naming environment, state, action and key.
         """
-        asked = zip(state_N.tolist(), action_N.tolist(), key_N.tolist(), strict=True)
+        queries = zip(state_N.tolist(), action_N.tolist(), key_N.tolist(), strict=True)
         with self._watched():
-            return Transitions(*self._answer([self._step(*one, repeat=self.action_repeat) for one in asked]))
+            return Transitions(*self._answer([self._step(*one, repeat=self.action_repeat) for one in queries]))
 
     def is_random(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
-        """Whether chance decides what follows each (state, action). The simulator is asked; raises as `sample`."""
+        """Whether chance decides what follows each (state, action), by a step of the simulator; raises as `sample`."""
         random = []
         for pair in zip(state_N.tolist(), action_N.tolist(), strict=True):
             with SharedGenerators() as shared:
                 step = self._step(*pair, _KEY_OF_CERTAINTY, repeat=self.action_repeat)
             if shared.drawn:
-                self._sure.forget()
+                # A step that used a global generator looked certain, and may have been remembered.
+                self._sure.clear()
             random.append(step.random or bool(shared.drawn))
         return torch.tensor(random, dtype=torch.bool, device=self.device)
 
@@ -275,7 +282,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         with SharedGenerators() as shared:
             yield
         if shared.drawn:
-            self._sure.forget()
+            self._sure.clear()
             raise MissingModel(
                 f"{self.name} cannot be a model: step draws from the global generator of {shared.drawn[0]}: draw from "
                 "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
@@ -289,55 +296,58 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             torch.tensor([self._number[step.child.name] for step in steps], dtype=torch.int64, device=self.device),
         )
 
-    def hold(self, happened: Happened, *, ask_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
-        """0 where a step is, bit for bit, what the simulator gives; from memory where it was asked before, or where
-        `ask_N` says so by a step of the simulator."""
+    def outcome_of(self, happened: Happened, *, query_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
+        """0 where a step is, bit for bit, what the simulator gives: from memory where it was queried for that before,
+        and where `query_N` says so by a step of the simulator."""
         columns = [column_N.tolist() for column_N in vars(happened).values()]
-        ask = itertools.repeat(True) if ask_N is None else ask_N.tolist()
+        query = itertools.repeat(True) if query_N is None else query_N.tolist()
         with self._watched():
-            return np.array([self._hold(*one) for one in zip(*columns, ask, strict=False)], dtype=np.int64)
+            return np.array([self._outcome_of(*one) for one in zip(*columns, query, strict=False)], dtype=np.int64)
 
-    def _hold(
-        self, state: int, action: int, reward: float, discount: float, next_state: int, follows: bool, ask: bool
+    def _outcome_of(
+        self, state: int, action: int, reward: float, discount: float, next_state: int, follows: bool, query: bool
     ) -> int:
         step = self._sure.get((self._snapshots[state].key, action, 1))
         if step is None:
-            if not ask:
-                return UNASKED
+            if not query:
+                return NOT_QUERIED
             step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=1)
             if step.random:
-                return DRAWN
+                return RANDOM
+        # A truncated episode cannot have gone on.
         if step.reward != reward or step.discount != discount or (step.child.cut and follows):
-            return DENIED
-        return 0 if discount == 0 or self.adapter.same_state(step.child, self._snapshots[next_state]) else DENIED
+            return CONTRADICTED
+        return 0 if discount == 0 or self.adapter.same_state(step.child, self._snapshots[next_state]) else CONTRADICTED
 
-    def shown(self, state: int) -> str:
-        """What the environment shows there, or else its snapshot."""
-        shown = self._observations[state]
-        what = repr(self._snapshots[state].key) if shown is None else np.array2string(np.asarray(shown), threshold=20)
+    def state_text(self, state: int) -> str:
+        """With its observation, or else its snapshot."""
+        seen = self._observations[state]
+        what = repr(self._snapshots[state].key) if seen is None else np.array2string(np.asarray(seen), threshold=20)
         return f"state {state} ({what})"
 
-    def told(self, state: int, action: int) -> str:
+    def outcomes_text(self, state: int, action: int) -> str:
         """The one outcome of a single step."""
         step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=1)
-        then = self.shown(self._number[step.child.name]) + step.child.cut * ", where the episode is truncated"
+        then = self.state_text(self._number[step.child.name]) + step.child.cut * ", where the episode is truncated"
         return step_text(step.reward, step.discount, then)
 
     def _step(self, state: int, action: int, key: int, *, repeat: int) -> Step:
-        """What follows an action that is taken so many times; from memory where it is sure."""
+        """What follows an action that is taken so many times; from memory where no chance is involved."""
         self._check("state", state, self.num_states)
         self._check("action", action, self.num_actions)
         at = self._snapshots[state]
         if at.cut:
+            # The state leads to itself under its first action alone, see the class.
             return Step(-math.inf if action else 0.0, 1.0, at, self._observations[state], random=False)
-        asked = at.key, action, repeat
-        if (known := self._sure.get(asked)) is not None:
-            step = known
-            self._known(step.child, step.shown)  # now, so that numbers do not depend on what is remembered
-            return step
+        query = at.key, action, repeat
+        if (known := self._sure.get(query)) is not None:
+            # The child gets its number now, so that numbers do not depend on what is remembered.
+            self._known(known.child, known.observation)
+            return known
         taken = self.actions[action]
         try:
             self.adapter.set_state(self.env, at.data)
+            # Over the repeats: the discounted sum of rewards, the product of discounts, whether chance was involved.
             total, discount, random = 0.0, 1.0, False
             for _ in range(repeat):
                 observation, reward, weight, drew, truncated = self._stepped(taken, None if random else key)
@@ -345,9 +355,11 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
                 discount *= weight
                 if discount == 0 or truncated:
                     break
+            # Truncation is part of the state, unless the episode has also ended: then nothing follows anyway.
             reached = self.adapter.get_state(self.env)
             child = self._known(replace(reached, cut=True) if truncated and discount else reached, None)
             if self._observations[child] is None:
+                # The observation after the last repeat, or that made for the state now.
                 inner = observation if self._show is None else self._checked(self._show(), total)
                 self._see(child, self._outside(inner))
         except BaseException as error:
@@ -355,12 +367,16 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             raise failure(where, error) from error
         step = Step(total, discount, self._snapshots[child], self._observations[child], random)
         if not random:
-            self._sure.add(asked, step)
+            self._sure.add(query, step)
         return step
 
     def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, float, bool, bool]:
         """Observation, reward, discount, whether chance decided and whether the episode was truncated, of one step.
-        The generator is seeded by the key, where there is one; later draws of the same outcome go on from it."""
+
+        Args:
+            key: the seed of the environment's generator; None: it goes on, in later steps of the same outcome.
+        """
+        # Where the adapter cannot tell whether chance decides, the generator does: it has moved if it was drawn from.
         known = self.adapter.is_random(self.env, taken)
         if known is not False and key is not None:
             self.adapter.seed(self.env, key)
@@ -368,6 +384,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         observation, reward, terminated, truncated, info = self.env.step(taken)
         self.simulator_steps += 1
         drew = generator_state(self.env) != before if known is None else known
+        # What is not finite or does not fit its space is found before it is transformed.
         if self._show is None:
             self._checked(observation, number_of("reward", reward))
         reward = number_of("reward", self.transforms.reward(reward))

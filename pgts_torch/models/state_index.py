@@ -40,6 +40,7 @@ def hash_rows(bits_ND: Int[Tensor, "N D"]) -> Int[Tensor, "N"]:
 
     Multilinear hashing (Lemire and Kaser 2014) with SplitMix64 as finaliser: one round however long the row.
     """
+    # Odd factors, so that no bit of a number is lost modulo 2**64.
     odd_D = mix(torch.arange(bits_ND.shape[1], device=bits_ND.device), 0) | 1
     return mix((bits_ND * odd_D).sum(-1), 0)
 
@@ -157,12 +158,14 @@ class StateIndex:
         """Give up lookups, or resume them, by how often the rows that were looked up have recurred."""
         self._looked_up += looked_up
         self._new += new
+        # The sample of one row in 16 is judged after a sixteenth as many.
         if self._looked_up < (_JUDGED_AFTER if self._merging else _JUDGED_AFTER >> _SAMPLE_BITS):
             return
         if self._merging:
             self._merging = self._looked_up > _PAYS * self._new
         elif self._looked_up > _PAYS_AGAIN * self._new:
             self._merging = True
+            # All rows so far, those that were skipped too; of equal ones the first is entered.
             self._enter(torch.arange(self._count, device=self.device), 2 * self._count)
         self._looked_up = self._new = 0
 
@@ -203,6 +206,7 @@ class StateIndex:
     def _look_up(self, looking_L: Tensor, hash_L: Tensor) -> tuple[Tensor, Tensor]:
         """For each of these rows the number of the first one that equals it, and its slot; rows that equal none before
         them are entered. The caller counts them."""
+        # At most half of the slots are full even if all these rows are new.
         needed = 2 * (self._entered + len(looking_L))
         if needed > len(self._slots):
             self._enter(self._slots[self._slots != _EMPTY], needed)
@@ -214,7 +218,8 @@ class StateIndex:
         while len(looking_L):
             here_L = self._slots.index_select(0, slot_L)
             free = torch.nonzero(here_L == _EMPTY).flatten()
-            if len(free):  # of the rows that find a slot empty the first one takes it
+            if len(free):
+                # Of the rows that find a slot empty the first one takes it; the others compare themselves with that.
                 free_slot = slot_L[free]
                 self._slots.scatter_reduce_(0, free_slot, looking_L[free], "amin")
                 here_L[free] = self._slots[free_slot]

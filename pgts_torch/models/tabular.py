@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.models.base import (
-    DENIED,
+    CONTRADICTED,
     EnumeratingModel,
     ExactModel,
     Happened,
@@ -24,14 +24,14 @@ from pgts_torch.seeding import uniform
 from pgts_torch.tabular.mdp import TabularMDP
 from pgts_torch.tabular.stationary import highest_value, lowest_value
 
-_MOST_TOLD = 8
+_MOST_NAMED = 8
 """How many outcomes a message names."""
 
 _CHUNK = 2**18
-"""About how many probabilities are held at a time while outcomes are drawn."""
+"""About how many probabilities are in memory at a time while outcomes are sampled."""
 
 _ODD = [factor - 2**64 for factor in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)]
-"""By which what tells outcomes apart is multiplied, modulo 2**64."""
+"""Odd factors, modulo 2**64, of the hash of an outcome, see `_looks`."""
 
 
 @final
@@ -66,7 +66,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
     def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
         """One outcome of each (state, action) by inverting the distribution function; the reward is r(s, a)."""
         pieces = [each.split(max(1, _CHUNK // self.table.num_outcomes)) for each in (state_N, action_N, key_N)]
-        k_N = torch.cat([self._drawn(*piece) for piece in zip(*pieces, strict=True)])
+        k_N = torch.cat([self._sampled(*piece) for piece in zip(*pieces, strict=True)])
         table = self.table
         return Transitions(
             table.reward_NA[state_N, action_N],
@@ -74,8 +74,8 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
             table.child_NAK[state_N, action_N, k_N],
         )
 
-    def _drawn(self, state_N: Tensor, action_N: Tensor, key_N: Tensor) -> Int[Tensor, "N"]:
-        """Which outcome is drawn."""
+    def _sampled(self, state_N: Tensor, action_N: Tensor, key_N: Tensor) -> Int[Tensor, "N"]:
+        """Which outcome is sampled."""
         cumulative_NK = self._cumulative_NAK[state_N, action_N]
         level_N1 = uniform(key_N, self.dtype).unsqueeze(-1) * cumulative_NK[:, -1:]
         # The first k whose cumulative probability exceeds u < total always has positive probability.
@@ -93,7 +93,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
         """s * A + a of each step."""
         return happened.state_N * self.num_actions + happened.action_N
 
-    def hold(self, happened: Happened, *, ask_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
+    def outcome_of(self, happened: Happened, *, query_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
         """The outcome that looks like each step, bit for bit; a reward may also be one that was rounded to float32."""
         looks_N, row_N = _looks(happened.next_state_N, happened.discount_N, happened.reward_N), self.rows(happened)
         same_NK = self._looks_RK.take(row_N, 0) == looks_N[:, None]
@@ -107,25 +107,25 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
             rounded_NK &= discount_NK == happened.discount_N[:, None]
             rounded_NK &= (discount_NK == 0) | (outcomes.child_NAK.numpy()[at] == happened.next_state_N[:, None])
             same_NK |= rounded_NK
-            return np.where(same_NK.any(-1), same_NK.argmax(-1), DENIED)
+            return np.where(same_NK.any(-1), same_NK.argmax(-1), CONTRADICTED)
         return first_N
 
-    def shown(self, state: int) -> str:
+    def state_text(self, state: int) -> str:
         """Its number."""
         return f"state {state}"
 
-    def told(self, state: int, action: int) -> str:
+    def outcomes_text(self, state: int, action: int) -> str:
         """The outcomes of a row, the most probable first."""
         prob_K = self._mdp.outcomes.prob_NAK[state, action].tolist()
         likely = sorted((k for k, p in enumerate(prob_K) if p > 0), key=lambda k: -prob_K[k])
-        told = [f"{self.outcome_text(state, action, k)} (probability {prob_K[k]:.4g})" for k in likely[:_MOST_TOLD]]
-        return ", or ".join(told) + (f", or {len(likely) - _MOST_TOLD} others" if len(likely) > _MOST_TOLD else "")
+        told = [f"{self.outcome_text(state, action, k)} (probability {prob_K[k]:.4g})" for k in likely[:_MOST_NAMED]]
+        return ", or ".join(told) + (f", or {len(likely) - _MOST_NAMED} others" if len(likely) > _MOST_NAMED else "")
 
     def outcome_text(self, state: int, action: int, k: int) -> str:
         """One outcome of a row, in a message."""
         outcomes, at = self._mdp.outcomes, (state, action, k)
         reward, discount = float(self._mdp.outcome_reward_SAK[at]), float(outcomes.discount_NAK[at])
-        return step_text(reward, discount, self.shown(int(outcomes.child_NAK[at])))
+        return step_text(reward, discount, self.state_text(int(outcomes.child_NAK[at])))
 
     def frequencies(self) -> Float[Tensor, "R K"]:
         """The probability of what each outcome of each row looks like, at the first that looks so; elsewhere 0."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NotFinite, PgtsError
-from pgts_torch.models.base import DENIED, EnumeratingModel, Happened, SamplingModel, Transitions, step_text
+from pgts_torch.models.base import CONTRADICTED, EnumeratingModel, Happened, SamplingModel, Transitions, step_text
 from pgts_torch.models.state_index import Merge, StateIndex
 
 _ROUNDING = 1e-12
@@ -17,13 +17,13 @@ _ROUNDING = 1e-12
 
 
 class TensorModel(EnumeratingModel, SamplingModel):
-    """Deterministic dynamics over vectors of D numbers. A subclass gives `step`; this class numbers the states as it
-    meets them, equal ones alike, so that a search merges them.
+    """Deterministic dynamics over vectors of D numbers. A subclass defines `step`; this class gives states a number as
+    it meets them, equal ones the same, so that a search merges them.
 
     Memory grows with every new state until `clear`.
 
-    With `action_repeat` k > 1 an outcome is what comes of taking the same action k times, so that a reward far ahead
-    comes into the sight of a search of little depth:
+    With `action_repeat` k > 1 an outcome is that of taking the same action k times, so that a search of little depth
+    sees rewards that are far ahead:
 
         r = sum_{i<k} gamma_0 ... gamma_{i-1} r_i,    discount = gamma_0 ... gamma_{k-1},    next state s_k
 
@@ -73,7 +73,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
         self.action_repeat = action_repeat
         self.is_certain = True
         self.simulator_steps = 0
-        """How many (state, action) `step` was asked for."""
+        """For how many (state, action) `step` was called."""
 
     @abstractmethod
     def step(
@@ -103,8 +103,8 @@ class TensorModel(EnumeratingModel, SamplingModel):
         return self._index.rows(state_N)
 
     def clear(self) -> None:
-        """Forget all states and give their memory back. Their numbers mean nothing afterwards: a `Topology` over this
-        model refuses to go on, and a new one is to be made."""
+        """Drop all states and free their memory. Their numbers are given to other states from here on: a `Topology` of
+        this model refuses to go on, and a new one is to be made."""
         self._index.clear()
         self.generation += 1
 
@@ -112,8 +112,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
         """The one outcome of each action, K = 1.
 
         Raises:
-            PgtsError: `step` answers with another shape or dtype than asked for, a discount outside [0, 1], or a nan in
-                a state that counts.
+            PgtsError: `step` returns a wrong shape or dtype, a discount outside [0, 1], or NaN in a state that counts.
         """
         A = self.num_actions
         action_NA = torch.arange(A, device=self.device).expand(len(state_N), A)
@@ -128,22 +127,22 @@ class TensorModel(EnumeratingModel, SamplingModel):
         return Transitions(*self._followed(state_N, action_N))
 
     @torch.no_grad()
-    def hold(self, happened: Happened, *, ask_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
+    def outcome_of(self, happened: Happened, *, query_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
         """0 where a step is what `step` gives: the discount exactly, the reward and, unless the episode ended, every
         number of the next state within 1e-12 (1 + its size)."""
         columns = vars(happened).values()
         state_N, action_N, reward_N, discount_N, next_N, _ = (torch.from_numpy(x).to(self.device) for x in columns)
-        told_N, weight_N, ahead_ND = self.step(self.states(state_N), action_N)
-        agrees_N = _close(told_N, reward_N) & (weight_N == discount_N)
+        paid_N, weight_N, ahead_ND = self.step(self.states(state_N), action_N)
+        agrees_N = _close(paid_N, reward_N) & (weight_N == discount_N)
         agrees_N &= _close(ahead_ND, self.states(next_N)).all(-1) | (discount_N == 0)
-        return torch.where(agrees_N, 0, DENIED).cpu().numpy()
+        return torch.where(agrees_N, 0, CONTRADICTED).cpu().numpy()
 
-    def shown(self, state: int) -> str:
+    def state_text(self, state: int) -> str:
         """The vector."""
         return f"state {self.states(torch.tensor([state], device=self.device))[0].tolist()}"
 
     @torch.no_grad()
-    def told(self, state: int, action: int) -> str:
+    def outcomes_text(self, state: int, action: int) -> str:
         """The one outcome."""
         state_1D, action_1 = self.states(torch.tensor([state], device=self.device)), torch.tensor([action])
         reward_1, discount_1, next_1D = self.step(state_1D, action_1.to(self.device))
@@ -151,9 +150,10 @@ class TensorModel(EnumeratingModel, SamplingModel):
 
     @torch.no_grad()
     def _followed(self, state_N: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Reward, discount and number of the next state; where nothing counts after an outcome, its own state."""
+        """Reward, discount and number of the next state; where nothing counts after an outcome, the state itself."""
         reward_N, discount_N, next_ND = self._stepped(self.states(state_N), action_N)
         for _ in range(self.action_repeat - 1):
+            # on: the pairs whose action is taken once more, and then those of them where it is allowed.
             on = torch.nonzero((discount_N > 0) & (reward_N > -torch.inf)).flatten()
             more_N, then_N, ahead_ND = self._stepped(next_ND[on], action_N[on])
             allowed_N = more_N > -torch.inf
@@ -167,23 +167,25 @@ class TensorModel(EnumeratingModel, SamplingModel):
         return reward_N, discount_N, next_N
 
     def _stepped(self, state_ND: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What `step` answers, checked."""
+        """What `step` returns, checked."""
         self.simulator_steps += len(state_ND)
         reward_N, discount_N, next_ND = self.step(state_ND, action_N)
         given = tuple(reward_N.shape), tuple(discount_N.shape), tuple(next_ND.shape)
-        asked = tuple(action_N.shape), tuple(action_N.shape), tuple(state_ND.shape)
-        if given != asked:
-            raise PgtsError(f"step answered with shapes {given}; {len(action_N)} states and actions ask for {asked}")
+        expected = tuple(action_N.shape), tuple(action_N.shape), tuple(state_ND.shape)
+        if given != expected:
+            raise PgtsError(
+                f"step returned shapes {given}; for {len(action_N)} states and actions they must be {expected}"
+            )
         if not reward_N.dtype == discount_N.dtype == self.dtype:
             raise PgtsError(
-                f"step answered with rewards in {reward_N.dtype} and discounts in {discount_N.dtype}; "
-                f"the model speaks {self.dtype}"
+                f"step returned rewards in {reward_N.dtype} and discounts in {discount_N.dtype}; "
+                f"the dtype of the model is {self.dtype}"
             )
         if bool((off_N := ~((discount_N >= 0) & (discount_N <= 1))).any()):
             n = int(torch.nonzero(off_N)[0, 0])
             raise PgtsError(
-                f"step answers state {state_ND[n].tolist()} and action {int(action_N[n])} with the discount "
-                f"{float(discount_N[n])}; it must be in [0, 1]"
+                f"step returned the discount {float(discount_N[n])} for state {state_ND[n].tolist()} and action "
+                f"{int(action_N[n])}; it must be in [0, 1]"
             )
         if self.reward_range is not None:
             self.reward_range.check(reward_N.cpu())

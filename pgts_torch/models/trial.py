@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import DENIED, ExactModel, Happened, step_text
+from pgts_torch.models.base import CONTRADICTED, ExactModel, Happened, step_text
 from pgts_torch.models.classic import ClassicModel, dynamics_of
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
 from pgts_torch.models.tabular import TabularModel, tabular_truth
@@ -31,7 +31,7 @@ def table_contradiction(
     """The first thing in a short random walk that cannot be by a table, empty where there is none; and how many steps
     were held to it.
 
-    Starts must have positive probability, and each step must be one of the outcomes that have (`TabularModel.hold`).
+    Starts must have positive probability, and each step must be an outcome that has (`TabularModel.outcome_of`).
 
     Args:
         env: an instance that nobody else needs, in the wrappers that the table is meant to hold for.
@@ -56,8 +56,8 @@ def table_contradiction(
 def dynamics_contradiction(
     model: ClassicModel, env: gymnasium.Env, generator: np.random.Generator, *, seconds: float = _SECONDS
 ) -> tuple[str, int]:
-    """The first step of a short random walk that dynamics in torch do not give too (`TensorModel.hold`), empty where
-    there is none; and how many steps were held to them.
+    """The first step of a short random walk that dynamics in torch contradict (`TensorModel.outcome_of`), empty where
+    there is none; and how many steps were compared.
 
     Args:
         model: of its own, for it numbers the states that are met.
@@ -114,13 +114,13 @@ def _denied(model: ExactModel, steps: Iterator[_Step]) -> tuple[str, int]:
         return "", 0
     state_N, action_N, reward_N, discount_N, next_N = map(np.array, columns)
     happened = Happened(state_N, action_N, reward_N, discount_N, next_N, np.zeros(len(state_N), dtype=bool))
-    off = np.flatnonzero(model.hold(happened) == DENIED)
+    off = np.flatnonzero(model.outcome_of(happened) == CONTRADICTED)
     if not off.size:
         return "", len(state_N)
     state, action, reward, discount, following = (column[off[0]] for column in columns)
     return (
-        f"after action {action} in {model.shown(state)} came {step_text(reward, discount, model.shown(following))}; "
-        f"it has {model.told(state, action)}"
+        f"after action {action} in {model.state_text(state)} came "
+        f"{step_text(reward, discount, model.state_text(following))}; it has {model.outcomes_text(state, action)}"
     ), len(state_N)
 
 

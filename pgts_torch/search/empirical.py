@@ -65,10 +65,12 @@ class Empirical(EnumeratingModel):
         self._rewards: list[Tensor] = []
         # With share "search" the node of each state, -1 where there is none yet.
         self._node_S = torch.empty(0, dtype=torch.int64, device=model.device)
+        # Nodes 0, 1, ... are the distinct roots in ascending order, so that equal roots share their samples.
         roots = torch.unique(root_B)
         self.root_B: Int[Tensor, "B"] = torch.searchsorted(roots, root_B)
         """The node of each root."""
         if share == "search":
+            # Below, a path may come back to a root's state: then that node is met again.
             self._new_nodes(roots)
         self._add(roots, self._state_keys(roots))
 
@@ -91,6 +93,7 @@ class Empirical(EnumeratingModel):
         """The outcomes of the nodes that the call before has met; children are nodes."""
         assert len(state_N) == len(self._states[-1])
         assert int(state_N[0]) == self.num_states - len(state_N)
+        # The last nodes that were added, and the C of the level that they form.
         states, key_N, C = self._states[-1], self._keys[-1], self._samples[len(self._rewards)]
         if C is None:
             assert isinstance(self._model, EnumeratingModel)
@@ -100,6 +103,7 @@ class Empirical(EnumeratingModel):
             answer, reward_NAC = sample_outcomes(self._model, states, key_N, C)
         self.model_calls += len(states) * self.num_actions * (1 if C is None else C)
         check_outcomes(self._model, states, answer)
+        # The bootstrap reads all levels as one table, as wide as the largest C.
         unfilled = self._most_samples - reward_NAC.shape[-1]
         self._rewards.append(torch.nn.functional.pad(reward_NAC.to(self.dtype), (0, unfilled)))
         weighs_NAK = has_weight(answer)
@@ -116,12 +120,15 @@ class Empirical(EnumeratingModel):
     def _met(self, state_N: Tensor, edge_N: Tensor) -> Tensor:
         """The nodes of these children, each reached by an outcome with the key `edge_N`; new ones are added."""
         if self._share == "none":
+            # Each outcome is a new path, whose key follows from those of the path so far.
             new, key_N = state_N, mix(edge_N, _PATH)
             node_N = self.num_states + torch.arange(len(state_N), device=self.device)
         elif self._share == "level":
+            # All nodes of the next level are new; outcomes that lead to one state lead to one node.
             new, row_N = torch.unique(state_N, return_inverse=True)
             node_N, key_N = self.num_states + row_N, self._state_keys(new)
         else:
+            # Only states that no level has met get a node.
             new = self._new_nodes(torch.unique(state_N))
             node_N, key_N = self._node_S[state_N], self._state_keys(new)
         self._add(new, key_N)
@@ -170,6 +177,7 @@ def sample_outcomes(
     model: SamplingModel, state_N: Int[Tensor, "N"], key_N: Int[Tensor, "N"], samples: int
 ) -> tuple[Outcomes, Float[Tensor, "N A C"]]:
     """C samples of every action of these states, as equally likely outcomes, and their rewards."""
+    # One pair for each (state, action, sample), in the order of a flattened [N, A, C].
     shape = len(state_N), model.num_actions, samples
     sampled = model.sample(
         state_N.view(-1, 1, 1).expand(shape).reshape(-1),

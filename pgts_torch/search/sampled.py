@@ -121,23 +121,27 @@ def sparse(
     key = draw_keys(1, generator=generator).to(model.device)
     if not plan:
         return unexpanded(leaves, root_B)
+    # Without a sampled level there is nothing empirical: the search is exact.
     if all(C is None for C in plan):
         assert isinstance(model, EnumeratingModel)
         topology = Topology(model, max_bytes=max_bytes)
         return full_width(leaves, topology, root_B, max_nodes=max_nodes)
     empirical = Empirical(model, root_B, samples=plan, share=share, key=key)
     topology = Topology(empirical, max_bytes=max_bytes)
+    # The empirical model's states are nodes: expand them, value the lowest, back up as in `expectimax`.
     steps, bottom_N, nodes_per_level = _expanded(empirical, topology, leaves.expansions, share, max_nodes)
     v_N = _leaf_values(leaves, empirical, steps, bottom_N)
     q_BA = _backups([outcomes for _, outcomes in reversed(steps)], v_N)[empirical.root_B]
     stderr_BA = bias_BA = torch.full_like(q_BA, torch.nan)
     fewest = min(C for C in plan if C is not None)
     if replicates and fewest > 1:
+        # The bootstrap may fill what the levels leave of the memory.
         kept = sum(outcomes.num_states for _, outcomes in steps)
         free = max(0, max_bytes - topology.bytes(0, kept=kept))
         again_RNA = _bootstrap(empirical, plan, steps, v_N, replicates, at_once=free // RESAMPLED)
         stderr_BA, bias_BA = _spread(q_BA, again_RNA[:, empirical.root_B])
-        if len(plan) == 1:  # it would be noise of the bootstrap: there is no maximum over samples
+        if len(plan) == 1:
+            # No maximum over samples was taken: what differs from 0 is noise of the bootstrap.
             bias_BA = torch.zeros_like(bias_BA)
     return Lookahead(
         q_BA,
@@ -164,6 +168,7 @@ def plan_levels(
         raise PgtsError("samples is empty; give C, or one C for each level")
     if share not in get_args(Share):
         raise PgtsError(f"share is {share!r}; it must be one of {', '.join(get_args(Share))}")
+    # The last C serves all deeper levels.
     plan = tuple(given[min(level, len(given) - 1)] for level in range(expansions))
     if share == "search" and len(set(plan)) > 1:
         raise PgtsError(f"samples is {samples}; with share='search' a state has one C at all levels")
@@ -184,6 +189,7 @@ def _expanded(
     empirical: Empirical, topology: Topology, expansions: int, share: Share, max_nodes: int
 ) -> tuple[list[Step], Tensor | None, tuple[int, ...]]:
     """The levels from the roots down, the nodes at the bottom (None: every path ends above), and how many there are."""
+    # One level at a time: a set that closes early ends the sampling.
     for expanded in range(1, expansions + 1):
         levels = topology.levels(empirical.root_B, expanded, max_nodes=max_nodes)
         if levels.closed is not None:
@@ -192,6 +198,7 @@ def _expanded(
     if levels.closed is None:
         return steps, levels.leaves(expansions), levels.nodes_per_level(expansions)
     if share == "search":
+        # States recur: the remaining levels are the closed set, again and again.
         topology.levels(empirical.root_B, expansions, max_nodes=max_nodes)
         steps += [(levels.closed_states, levels.closed)] * levels.sweeps(expansions)
         return steps, levels.leaves(expansions), levels.nodes_per_level(expansions)
@@ -206,6 +213,7 @@ def _leaf_values(
     """The critic's values of the nodes at the bottom; where every path ends above, zeros to which no outcome leads."""
     if bottom_N is None:
         return torch.zeros(steps[-1][1].num_children, dtype=empirical.dtype, device=empirical.device)
+    # Several nodes may be of one state, which the critic values once.
     state_N, row_N = torch.unique(empirical.state_N[bottom_N], return_inverse=True)
     return leaves.v(state_N)[row_N]
 
@@ -245,6 +253,7 @@ def _bootstrap(
                 done = outcomes, _resampled(outcomes, C, mix(key_N[node_N], _RESAMPLE), reward, replicate_R)
             yield done[1]
 
+    # As many replicates at once as fit, at least one; each of their levels has R * N rows.
     largest = max(outcomes.child_NAK.numel() for _, outcomes in steps)
     chunks = torch.arange(replicates, device=v_N.device).split(1 + min(at_once, _CHUNK) // largest)
     A = empirical.num_actions
@@ -269,6 +278,7 @@ def _resampled(outcomes: Outcomes, C: int | None, key_N: Tensor, reward_NAC: Ten
         def picked(x_NAC: Tensor) -> Tensor:
             return x_NAC.expand(R, -1, -1, -1).gather(-1, pick)
 
+        # C - 1 resampled outcomes, equally likely, with the mean of their rewards.
         prob = torch.full((), 1 / (C - 1), dtype=outcomes.dtype, device=device).expand(pick.shape)
         discount, child = picked(outcomes.discount_NAK[..., :C]), picked(outcomes.child_NAK[..., :C])
         reward = (picked(reward_NAC) / (C - 1)).sum(-1)

@@ -82,6 +82,7 @@ def sigma(q_NA: Float[Tensor, "N A"], visits_NA: Float[Tensor, "N A"]) -> Float[
 
 def scaled(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
     """Values on the scale on which the best action of a node has 0 and the worst that is allowed -1."""
+    # The span is at least a share of the values, so that differences by rounding stay small, and never 0.
     high_N1 = q_NA.amax(1, keepdim=True)
     low_N1 = q_NA.amin(1, keepdim=True)
     if not math.isfinite(low_N1.amin()):  # -inf of actions that are not allowed: the worst of the others

@@ -2,7 +2,6 @@
 
 import math
 from collections import OrderedDict
-from dataclasses import dataclass, field
 from typing import final
 
 import torch
@@ -12,60 +11,13 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NodeBudgetExceeded, PgtsError
 from pgts_torch.models.base import EnumeratingModel
+from pgts_torch.search.levels import Levels
 from pgts_torch.search.lookahead import MAX_BYTES, check_states, check_vector
 from pgts_torch.search.memory import Sizes, check_memory, search_bytes
 from pgts_torch.search.outcome_table import OutcomeTable, check_outcomes, has_weight
 
 _REMEMBERED_ROOTS = 8
 """How many different batches of roots keep their levels."""
-
-
-@dataclass(eq=False)
-class Levels:
-    """The levels below a batch of roots, as far as a search has expanded them.
-
-    frontiers: the distinct states at level 0, 1, ...
-    outcomes: outcomes[k] leads from frontier k to positions in frontier k + 1; the last one, where there is a closed
-        set, to positions in that.
-    closed: outcomes of the closed set, with positions in it as children; None until a level brings no new state.
-    closed_states: every state met so far, in the order of `closed`; all there are once there is a closed set.
-    root_row_B: the position of each root in frontier 0.
-    """
-
-    frontiers: list[Int[Tensor, "N"]]
-    root_row_B: Int[Tensor, "B"]
-    outcomes: list[Outcomes] = field(default_factory=list)
-    closed: Outcomes | None = None
-    closed_states: Int[Tensor, "N"] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.closed_states = self.frontiers[0]
-
-    @property
-    def rows(self) -> int:
-        """How many rows of outcomes are kept."""
-        closed = 0 if self.closed is None else self.closed.num_states
-        return closed + sum(outcomes.num_states for outcomes in self.outcomes)
-
-    def sweeps(self, expansions: int) -> int:
-        """How many of `expansions` levels, counted from the leaves, are the closed set."""
-        return max(0, expansions - len(self.outcomes))
-
-    def leaves(self, expansions: int) -> Int[Tensor, "N"]:
-        """The states at the bottom of `expansions` levels."""
-        if self.closed is not None and expansions >= len(self.outcomes):
-            return self.closed_states
-        return self.frontiers[expansions]
-
-    def nodes_per_level(self, expansions: int) -> tuple[int, ...]:
-        """How many nodes each of the levels 0 .. expansions holds."""
-        frontiers = [len(frontier) for frontier in self.frontiers[: expansions + 1]]
-        return (*frontiers, *[len(self.closed_states)] * (expansions + 1 - len(frontiers)))
-
-    def nodes(self, expansions: int) -> int:
-        """How many nodes the levels 0 .. expansions hold together; in constant time for any depth of a closed set."""
-        frontiers = [len(frontier) for frontier in self.frontiers[: expansions + 1]]
-        return sum(frontiers) + len(self.closed_states) * (expansions + 1 - len(frontiers))
 
 
 @final
@@ -90,8 +42,10 @@ class Topology:
         self._generation = model.generation
         self.table = OutcomeTable(model)
         self.row_S = torch.empty(0, dtype=torch.int64, device=model.device)
-        self._scratch_S = torch.empty(0, dtype=torch.int64, device=model.device)  # see `_position` and `_distinct`
-        self._levels: OrderedDict[bytes, Levels] = OrderedDict()  # by the bytes of the roots, least recently used first
+        # One number for each state, written and read within a method: positions, see `_position` and `_distinct`.
+        self._scratch_S = torch.empty(0, dtype=torch.int64, device=model.device)
+        # By the bytes of the roots; the least recently used first.
+        self._levels: OrderedDict[bytes, Levels] = OrderedDict()
 
     def levels(self, root_B: Int[Tensor, "B"], expansions: int, *, max_nodes: int) -> Levels:
         """The levels below `root_B`, at least `expansions` of them or a closed set.
@@ -115,6 +69,7 @@ class Topology:
             if len(self._levels) > _REMEMBERED_ROOTS:
                 self._levels.popitem(last=False)
         self._levels.move_to_end(key)
+        # Level by level: the nodes are counted, and their memory is found, before the model is queried.
         while levels.closed is None and len(levels.outcomes) < expansions:
             self._check_nodes(levels, len(levels.outcomes), expansions, max_nodes)
             self._afford(levels.frontiers[-1], levels, f"level {len(levels.outcomes)} of the {expansions}")
@@ -141,6 +96,7 @@ class Topology:
         self._grow_tables()
         self._afford(state_N, None, "one level", kept=kept)
         outcomes = self._outcomes(state_N)
+        # Children are those of outcomes with weight: nothing below the others can change a value.
         weighs_NAK = has_weight(outcomes)
         children = self._distinct(outcomes.child_NAK.masked_select(weighs_NAK))
         return self._with_positions(outcomes, weighs_NAK, children), children
@@ -168,6 +124,7 @@ class Topology:
         """The states that the model was queried for, in that order, and their outcomes, with states as children and in
         the memory of the table."""
         queried = self.queried
+        # The inverse of `row_S`: the state of each row.
         state_X = torch.empty_like(queried)
         state_X[self.row_S[queried]] = queried
         return state_X, self.table.all(self.model.num_states)
@@ -200,6 +157,7 @@ class Topology:
         outcomes = self._outcomes(frontier)
         weighs_NAK = has_weight(outcomes)
         children = self._distinct(outcomes.child_NAK.masked_select(weighs_NAK))
+        # Without new children all states met so far lead to each other: the closed set, in which `step` then points.
         new = self._missing(children, levels.closed_states)
         step = self._with_positions(outcomes, weighs_NAK, children if len(new) else levels.closed_states)
         # `levels` changes only after the last thing that may fail for want of memory.
@@ -216,10 +174,12 @@ class Topology:
 
     def _outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
         """Outcomes with states as children; the model is queried for new states only."""
+        # Callers pass states without repetition, so that none is queried, or added to the table, twice.
         missing = state_N[self.row_S[state_N] < 0]
         if len(missing):
             answer = self.model.outcomes(missing)
             self.model_calls += len(missing) * self.model.num_actions
+            # The model may have met new states; their ids are checked, and given room, before they are used.
             self._grow_tables()
             check_outcomes(self.model, missing, answer)
             self.row_S[missing] = self.table.append(answer)
@@ -229,6 +189,7 @@ class Topology:
         self, outcomes: Outcomes, weighs_NAK: Bool[Tensor, "N A K"], states: Int[Tensor, "C"]
     ) -> Outcomes:
         """The same outcomes with children given by their position among `states`; those without weight get 0."""
+        # Children without weight need not be among `states`: their position is stale, and replaced below.
         position_NAK = self._position(states)[outcomes.child_NAK]
         return Outcomes(
             outcomes.reward_NA,
@@ -247,7 +208,8 @@ class Topology:
 
     def _missing(self, state_N: Int[Tensor, "N"], among: Int[Tensor, "C"]) -> Int[Tensor, "missing"]:
         """Those of the states that are not `among` others."""
-        self._scratch_S[state_N] = -1  # stays so where `among` has no position
+        # -1 stays where `among` writes no position.
+        self._scratch_S[state_N] = -1
         return state_N[self._position(among)[state_N] < 0]
 
     def _position(self, states: Int[Tensor, "N"]) -> Int[Tensor, "S"]:
@@ -267,6 +229,7 @@ class Topology:
             return nodes
         size = f"the lookahead has {nodes} nodes on levels 0 to {level}; max_nodes is {max_nodes}"
         if level < expansions:
+            # As many as if no two paths met below this level.
             last, children = len(levels.frontiers[level]), self.model.num_actions * self.num_outcomes
             most = nodes - last + tree_nodes(last, children, expansions - level)
             size += f", and levels 0 to {expansions} hold up to {most:.3g}"
@@ -288,11 +251,13 @@ class Topology:
             remembered = sum(each.rows for each in self._levels.values() if each is not levels)
             return self.bytes(missing, looked_up=len(state_N), kept=kept + own + remembered + len(state_N))
 
+        # Levels of other roots only save time: they go first, the least recently used before the others.
         while needed() > self.max_bytes and any(each is not levels for each in self._levels.values()):
             self._levels.pop(next(key for key, each in self._levels.items() if each is not levels))
         check_memory(needed(), self.max_bytes, self._described(which, len(state_N)))
         if missing > 1 and self.table.count == 0 and self.model.num_outcomes is None:
-            self._probe(state_N[:1])  # only the answer of the model tells K
+            # Only the answer of the model tells K: one state is queried alone, and the memory counted once more.
+            self._probe(state_N[:1])
             check_memory(needed(), self.max_bytes, self._described(which, len(state_N)))
 
     @torch.inference_mode(False)
@@ -309,6 +274,7 @@ class Topology:
         sizes = Sizes(self.model.num_actions, self.num_outcomes, self.model.dtype)
         states, remembered = max(self.model.num_states, len(self.row_S)), self.table.count + new
         if self.model.samples_outcomes:
+            # Such a model keeps what it has sampled, and the bootstrap resamples a level as a whole.
             rows = [step.num_states for each in self._levels.values() for step in each.outcomes]
             counts |= {"sampled": remembered, "sampling": new, "resampled": max([looked_up, *rows])}
         return search_bytes(sizes, states=states, remembered=remembered, looked_up=looked_up, kept=kept, **counts)
@@ -321,6 +287,7 @@ class Topology:
         """Room for the states that the model has met since, and for as many again: growing is rare."""
         room = len(self.row_S)
         if self.model.num_states > room:
+            # At least doubled; -1 is a state that was not queried.
             missing = max(self.model.num_states, 2 * room) - room
             unknown = torch.full((missing,), -1, dtype=torch.int64, device=self.model.device)
             self.row_S = torch.cat([self.row_S, unknown])

@@ -207,6 +207,7 @@ class Tree:
         """As in trees, but the simulations of all edges that lead to a node arrive there together, and nodes that other
         paths have expanded are backed up first, so that what was found below them counts."""
         nodes, level = self.nodes, step.level + 1
+        # The states among the children that have no node at this level yet, each once.
         new_C = state_L[nodes.node_at.index_select(0, nodes.place(state_L, level)) == 0].unique()
         first = nodes.count
         if len(new_C):
@@ -239,6 +240,7 @@ class Tree:
         elif self.merge:
             self._back_up_whole(step.node_F, step.level)
         else:
+            # The node of a child replaces the critic's value, and says whether anything is left below the edge.
             nodes.value_NE.view(-1).scatter_(0, edge_L, nodes.v_N.index_select(0, step.child_C))
             nodes.exhausted_outcome_NE.view(-1).scatter_(0, edge_L, nodes.exhausted_N.index_select(0, step.child_C))
             self._back_up(step.node_F, step.arm_M, step.table_arm_M)
@@ -249,6 +251,7 @@ class Tree:
     def _back_up(self, node_F: Tensor, arm_M: Tensor, table_arm_M: Tensor) -> None:
         """q of these actions and v of these nodes, and whether they are exhausted."""
         nodes, table, K = self.nodes, self.known.topology.table, self.nodes.K
+        # q_MK: p_k gamma_k v_k of each outcome; their sum and the reward are q.
         q_MK = table.prob_RAK.view(-1, K).index_select(0, table_arm_M)
         q_MK *= table.discount_RAK.view(-1, K).index_select(0, table_arm_M)
         q_MK *= nodes.value_NE.view(-1, K).index_select(0, arm_M)

@@ -15,7 +15,7 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import ModelMismatch, PgtsError
 from pgts_torch.experiment.diagnostics import metrics
 from pgts_torch.models import CartPole, SimulatorModel, TabularModel
-from pgts_torch.models.base import DENIED, DRAWN, UNASKED, Happened, Model
+from pgts_torch.models.base import CONTRADICTED, NOT_QUERIED, RANDOM, Happened, Model
 from pgts_torch.tabular import TabularMDP
 from tests.forks import on_ranks
 
@@ -161,13 +161,13 @@ def test_dynamics_hold_a_step_that_differs_in_the_last_bits_and_no_more():
     model = CartPole(env, gamma=0.9)
     start = model.number(model.vectors([env]))
     *_, ahead = model.step(model.states(start), torch.tensor([1]))
-    for off, held in ((0.0, 0), (1e-15, 0), (1e-10, DENIED)):
+    for off, held in ((0.0, 0), (1e-15, 0), (1e-10, CONTRADICTED)):
         there = model.number(ahead + off)
         step = Happened(*map(np.array, ([int(start)], [1], [1.0], [0.9], [int(there)], [True])))
-        assert model.hold(step).tolist() == [held]
+        assert model.outcome_of(step).tolist() == [held]
     for reward, discount in ((1.0 + 1e-9, 0.9), (1.0, 0.0)):
         step = Happened(*map(np.array, ([int(start)], [1], [reward], [discount], [int(model.number(ahead))], [True])))
-        assert model.hold(step).tolist() == [DENIED]
+        assert model.outcome_of(step).tolist() == [CONTRADICTED]
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e6, -1e6, 1 / 3])
@@ -351,13 +351,13 @@ def test_a_step_is_unasked_drawn_or_held_as_the_simulator_can():
     there = model.root(env, env.shown())
     step = Happened(*map(np.array, ([start], [1], [0.0], [0.9], [there], [True])))
     no, yes = np.array([False]), np.array([True])
-    assert model.hold(step, ask_N=no).tolist() == [UNASKED]
-    assert model.hold(step, ask_N=yes).tolist() == [0]
-    assert model.hold(step, ask_N=no).tolist() == [0]
+    assert model.outcome_of(step, query_N=no).tolist() == [NOT_QUERIED]
+    assert model.outcome_of(step, query_N=yes).tolist() == [0]
+    assert model.outcome_of(step, query_N=no).tolist() == [0]
     random = SimulatorModel(lambda: Restored(slip=0.3), gamma=0.9)
     start = random.number(random.adapter.get_state(Restored()))
     step = Happened(*map(np.array, ([start], [1], [0.0], [0.9], [start], [True])))
-    assert random.hold(step).tolist() == [DRAWN]
+    assert random.outcome_of(step).tolist() == [RANDOM]
 
 
 @pytest.mark.parametrize("pack", [lambda x: (x, [x]), lambda x: pickle.dumps({"x": x})])
@@ -388,7 +388,13 @@ def test_outcomes_that_look_alike_are_one():
     steps = [(2.0, 0.9, 1), (3.0, 0.9, 1), (2.0, 0.0, 7), (2.0, 0.9, 0), (-0.0, 0.9, 1)]
     reward_N, discount_N, next_N = map(np.array, zip(*steps, strict=True))
     zeros = np.zeros(len(steps), dtype=np.int64)
-    assert model.hold(Happened(zeros, zeros, reward_N, discount_N, next_N, zeros > 0)).tolist() == [0, 1, 2, -1, -1]
+    assert model.outcome_of(Happened(zeros, zeros, reward_N, discount_N, next_N, zeros > 0)).tolist() == [
+        0,
+        1,
+        2,
+        -1,
+        -1,
+    ]
 
 
 def test_a_saved_check_goes_on_with_the_same_bits(tmp_path):

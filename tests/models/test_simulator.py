@@ -450,7 +450,7 @@ def slippery() -> SimulatorModel:
 
 ZERO = torch.zeros(1, dtype=torch.int64)
 REFUSALS = {
-    "FrozenLake-v1 is random in state 0 under action 0: its outcomes cannot be listed; search it by `sampled`": (
+    "FrozenLake-v1 is random in state 0 under action 0: its outcomes cannot be enumerated; search it by `sampled`": (
         lambda: slippery().outcomes(ZERO)
     ),
     "FrozenLake-v1: state 1 does not exist; there are 1, from 0 on": lambda: slippery().outcomes(ZERO + 1),

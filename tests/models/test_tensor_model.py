@@ -306,8 +306,11 @@ def test_a_step_with_a_wrong_answer_is_refused_and_named():
             return reward_N, discount_N.float(), next_ND
 
     for model, message in [
-        (Rough(), r"rewards in torch\.float64 and discounts in torch\.float32; the model speaks torch\.float64"),
-        (Narrow(), r"step answered with shapes .*\(3, 1\)\); 3 states and actions ask for .*\(3, 2\)"),
+        (
+            Rough(),
+            r"rewards in torch\.float64 and discounts in torch\.float32; the dtype of the model is torch\.float64",
+        ),
+        (Narrow(), r"step returned shapes .*\(3, 1\)\); for 3 states and actions they must be .*\(3, 2\)"),
         (Lost(), r"step leads from state \[0\.0, 4\.0\] by action 0 to \[nan, inf\]"),
     ]:
         state_N = model.number(torch.tensor([[0.0, 4.0]], dtype=torch.float64))

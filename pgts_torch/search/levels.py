@@ -1,0 +1,56 @@
+"""The levels of a lookahead: which states it has at which depth."""
+
+from dataclasses import dataclass, field
+
+from jaxtyping import Int
+from torch import Tensor
+
+from pgts_torch.bellman import Outcomes
+
+
+@dataclass(eq=False)
+class Levels:
+    """The levels below a batch of roots, as far as a search has expanded them.
+
+    frontiers: the distinct states at level 0, 1, ...
+    outcomes: outcomes[k] leads from frontier k to positions in frontier k + 1; the last one, where there is a closed
+        set, to positions in that.
+    closed: outcomes of the closed set, with positions in it as children; None until a level brings no new state.
+    closed_states: every state met so far, in the order of `closed`; all there are once there is a closed set.
+    root_row_B: the position of each root in frontier 0.
+    """
+
+    frontiers: list[Int[Tensor, "N"]]
+    root_row_B: Int[Tensor, "B"]
+    outcomes: list[Outcomes] = field(default_factory=list)
+    closed: Outcomes | None = None
+    closed_states: Int[Tensor, "N"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.closed_states = self.frontiers[0]
+
+    @property
+    def rows(self) -> int:
+        """How many rows of outcomes are kept."""
+        closed = 0 if self.closed is None else self.closed.num_states
+        return closed + sum(outcomes.num_states for outcomes in self.outcomes)
+
+    def sweeps(self, expansions: int) -> int:
+        """How many of `expansions` levels, counted from the leaves, are the closed set."""
+        return max(0, expansions - len(self.outcomes))
+
+    def leaves(self, expansions: int) -> Int[Tensor, "N"]:
+        """The states at the bottom of `expansions` levels."""
+        if self.closed is not None and expansions >= len(self.outcomes):
+            return self.closed_states
+        return self.frontiers[expansions]
+
+    def nodes_per_level(self, expansions: int) -> tuple[int, ...]:
+        """How many nodes each of the levels 0 .. expansions holds."""
+        frontiers = [len(frontier) for frontier in self.frontiers[: expansions + 1]]
+        return (*frontiers, *[len(self.closed_states)] * (expansions + 1 - len(frontiers)))
+
+    def nodes(self, expansions: int) -> int:
+        """How many nodes the levels 0 .. expansions hold together; in constant time for any depth of a closed set."""
+        frontiers = [len(frontier) for frontier in self.frontiers[: expansions + 1]]
+        return sum(frontiers) + len(self.closed_states) * (expansions + 1 - len(frontiers))
