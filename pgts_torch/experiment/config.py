@@ -273,8 +273,9 @@ def with_types(data: dict[str, Any]) -> dict[str, Any]:
     tables, networks = policy not in NETWORKS, policy not in TABLES
     for_tables: list[type[Section]] = [ProjectedUpdateConfig if policy == "simplex" else MirrorUpdateConfig]
     for_networks: list[type[Section]] = [PPOUpdateConfig] if sampled else [CMPOUpdateConfig, PPOUpdateConfig]
-    if policy in NETWORKS:  # also where states are numbered
-        data = data | {"critic": {"type": "network"} | (data.get("critic") or {})}
+    critic = data.get("critic") or {}
+    if policy in NETWORKS and isinstance(critic, dict):  # also where states are numbered
+        data = data | {"critic": {"type": "network"} | critic}
     data = _typed(data, "critic", [TabularCriticConfig] * tables + [NetworkCriticConfig] * networks)
     return _typed(data, "update", for_tables * tables + for_networks * networks)
 

@@ -82,7 +82,6 @@ def test_no_certificate_of_an_exact_critic_is_below_what_is_missing_and_a_mean_o
 
 
 @pytest.mark.long
-@pytest.mark.timeout(3600)
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_none_of_a_thousand_runs_proves_something_false():
     wrong, wrong_of_drawn, ended = false_proofs(range(1000), iterations=40)

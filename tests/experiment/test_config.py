@@ -218,6 +218,10 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
             "critic.network.type is cnn and policy.type is mlp; a cnn sees images, the others do not",
         ),
         (
+            "{policy: {type: mlp}, critic: tabular}",
+            "critic is 'tabular'; it must be a mapping with the key type (auto, exact, network, rollout or tabular)",
+        ),
+        (
             "{policy: {type: cnn}, critic: {network: {type: mlp}}}",
             "critic.network.type is mlp and policy.type is cnn; a cnn sees images, the others do not",
         ),
