@@ -1,4 +1,4 @@
-"""Actions as a lookahead needs them: numbered from 0 on, so that it can take each."""
+"""Actions as a lookahead needs them: enumerated, with numbers from 0 on."""
 
 import itertools
 import math
@@ -15,7 +15,7 @@ from pgts_torch.models.wrappers import transforms_of
 from pgts_torch.seeding import numpy_stream
 
 MOST_ACTIONS = 10_000
-"""That are made of those of several dimensions."""
+"""The most actions that the values of several dimensions are combined to."""
 
 
 def all_actions(space: spaces.Space) -> Iterator[Any]:
@@ -30,7 +30,7 @@ def all_actions(space: spaces.Space) -> Iterator[Any]:
         shape, start = space.nvec.shape, space.start
         each = itertools.product(*[range(n) for n in space.nvec.reshape(-1)])
         return (np.array(action, dtype=space.dtype).reshape(shape) + start for action in each)
-    raise PgtsError(f"the actions of {space} cannot be listed: give some, as grid_actions or sampled_actions do")
+    raise PgtsError(f"the actions of {space} cannot be enumerated: give some, as grid_actions or sampled_actions do")
 
 
 def grid_actions(space: spaces.Space, per_dimension: int) -> list[np.ndarray]:
@@ -50,7 +50,7 @@ def grid_actions(space: spaces.Space, per_dimension: int) -> list[np.ndarray]:
 
 
 def sampled_actions(space: spaces.Space, count: int, *, seed: int) -> list[np.ndarray]:
-    """`count` actions drawn uniformly from a bounded Box.
+    """`count` actions sampled uniformly from a bounded Box.
 
     Raises:
         PgtsError: the space is no bounded Box, or count is below 1.
@@ -58,8 +58,8 @@ def sampled_actions(space: spaces.Space, count: int, *, seed: int) -> list[np.nd
     low, high = _bounds(space)
     if count < 1:
         raise PgtsError(f"count is {count}; it must be at least 1")
-    drawn = numpy_stream(seed, "actions").uniform(low, high, (count, *low.shape))
-    return list(drawn.astype(low.dtype))
+    sampled = numpy_stream(seed, "actions").uniform(low, high, (count, *low.shape))
+    return list(sampled.astype(low.dtype))
 
 
 def _bounds(space: spaces.Space) -> tuple[np.ndarray, np.ndarray]:
@@ -76,14 +76,14 @@ def with_torques(env: gymnasium.Env, count: int = 5) -> gymnasium.Env:
 
 
 def base_actions(env: gymnasium.Env) -> list[Any]:
-    """What each action of a discrete space becomes on its way through the wrappers of `env`."""
+    """For each action of a discrete space the action of the environment inside the wrappers of `env`."""
     inner = transforms_of(env).action
     return [inner(action) for action in all_actions(env.action_space)]
 
 
 @final
 class Numbered(gymnasium.ActionWrapper):
-    """An environment whose actions are numbers from 0 on; `actions` holds what each stands for."""
+    """An environment whose actions are numbers from 0 on: positions in `actions`."""
 
     def __init__(self, env: gymnasium.Env, actions: Sequence[Any]) -> None:
         super().__init__(env)

@@ -1,4 +1,4 @@
-"""What an environment holds, in values that can be compared: are two instances alike, and what changes in a step?"""
+"""Attributes of environments as values that can be compared: are two instances alike, and what does a step change?"""
 
 import collections
 import contextlib
@@ -19,36 +19,36 @@ import torch
 from gymnasium import spaces
 
 _NOT_COMPARED = frozenset({"env", "spec", "_cached_spec", "_np_random", "_np_random_seed", "np_random"})
-"""Attributes that differ between instances that are alike: what is wrapped, and what chance is drawn from."""
+"""Attributes that differ between instances that are alike: the wrapped environment, its spec and its generator."""
 
 _GENERATORS = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random, torch.Generator)
 
 _LARGE = 4096
-"""Bytes from which on a digest stands for an array."""
+"""Larger arrays, in bytes, are compared by a digest."""
 
 _MOST_PARTS = 100_000
-"""Of one attribute that are compared; an environment may hold a link to half of the program."""
+"""How many parts of one attribute are compared; an environment may refer to half of the program."""
 
 _INSTANCES = 6
-"""That are compared: where two have drawn the same, others have not."""
+"""How many are compared: two may have drawn the same value by chance."""
 
 _EPISODES, _LOOKED_AFTER, _LONGEST, _SECONDS = 3, 5, 200, 0.2
-"""How `changing` walks: so many episodes, looking after each of the first steps and at the end, which is after so many
-steps at the latest, and after one step once these seconds are over."""
+"""How `changing` looks for changes: in so many episodes, after each of the first steps and at the end. An episode is
+ended after so many steps, and after one step once these seconds are over."""
 
 _ACTIONS = 20
-"""That are drawn for a walk in which `unlike` looks for differences."""
+"""How many are sampled for the walk in which `unlike` looks for differences."""
 
 _LEAST_RESETS, _MOST_RESETS = 10, 100
-"""So often an environment is reset until an attribute that differs is taken for one that lasts: of two goals, each
-drawn in every second reset, one is missed in less than one in a thousand cases."""
+"""How often an environment is reset before a difference is taken for a lasting one: of two goals, each the outcome of
+every second reset, one is missed in less than one in a thousand cases."""
 
 
 def attributes(env: gymnasium.Env, *, but: Iterable[str] = ()) -> dict[str, Any]:
-    """Every attribute of an environment and its wrappers by its name, as what `fingerprint` makes of it.
+    """The `fingerprint` of every attribute of an environment and its wrappers, by name.
 
-    Attributes of a wrapper are called `WRAPPER.NAME`, those of a second of its kind `WRAPPER.2.NAME`. What classes
-    outside of Gymnasium keep for all their instances is among them. Generators are not.
+    Attributes of a wrapper are called `WRAPPER.NAME`, those of a second of its kind `WRAPPER.2.NAME`. Class attributes
+    of classes outside of Gymnasium are included, generators are not.
     """
     but, layers = _NOT_COMPARED.union(but), list[Any]([env])
     while isinstance(layers[-1], gymnasium.Wrapper):
@@ -60,16 +60,16 @@ def attributes(env: gymnasium.Env, *, but: Iterable[str] = ()) -> dict[str, Any]
         start = "" if layer is layers[-1] else f"{type(layer).__name__}.{number}"
         own = {name: value for cls in reversed(_classes_outside(type(layer))) for name, value in _data_of(cls).items()}
         named = {name: value for name, value in (own | vars(layer)).items() if name not in but}
-        # The layers themselves are no part of what they hold: a function may enclose one of them.
+        # A function among the attributes may enclose one of the layers, which is not compared again there.
         held |= {start + name: fingerprint(value, besides=layers) for name, value in named.items()}
     return held
 
 
 def changing(env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Generator, **but: Any) -> set[str]:
-    """The names of the attributes that change in resets and steps; the environment is walked in.
+    """The names of the attributes that change in resets and steps of a random walk.
 
     Args:
-        env: an instance that nobody else needs.
+        env: an instance for this alone; it is stepped.
         but: as in `attributes`.
     """
     return set(_changes(env, actions, generator, **but))
@@ -96,7 +96,7 @@ def _changes(
 
 
 class Unlike(NamedTuple):
-    """What an environment is found to differ in from another instance: its number, and the attribute in words."""
+    """An environment that differs from other instances: its position, and the attribute in words."""
 
     number: int
     what: str
@@ -110,16 +110,16 @@ def unlike(
     *,
     apart: Set[str] = frozenset(),
 ) -> Unlike | None:
-    """The first environment that is not like the new instance beside it, in whatever state it is; None: all are.
+    """The first environment that is not like the new instance beside it, whatever its present state; None: all are.
 
-    An attribute makes a difference if its value is neither that of the new instance nor the one that an instance has
-    after episodes, unless it keeps changing: what changes once, as a goal that is set in the first reset, may be
-    another one in an environment for ever.
+    An attribute is a difference if its value is neither that of the new instance nor the one that an instance has after
+    episodes, unless it keeps changing. One that changes once, as a goal that is set in the first reset, may differ for
+    ever.
 
     Args:
         envs: the environments.
-        new: instances that are only looked at.
-        walked: an instance that nobody else needs; it is walked in, and rendered if it can be.
+        new: instances that are not changed.
+        walked: an instance for this alone; it is stepped, and rendered if it can be.
         apart: attributes of which each instance has its own.
     """
     pairs = [(attributes(env), attributes(other)) for env, other in zip(envs, new, strict=False)]
@@ -129,7 +129,7 @@ def unlike(
     walked.action_space.seed(int(generator.integers(2**31)))
     actions = [walked.action_space.sample() for _ in range(_ACTIONS)]
     of_state = {name for name, count in _changes(walked, actions, generator).items() if count > 1}
-    if walked.render_mode is not None:  # what rendering leaves behind is no difference
+    if walked.render_mode is not None:  # attributes that rendering sets are no difference
         with contextlib.suppress(Exception):
             walked.render()
     until = time.monotonic() + _SECONDS
@@ -140,11 +140,11 @@ def unlike(
             break
         walked.reset(seed=int(generator.integers(2**31)))
         of_state |= different(now, attributes(walked))
-    return next((Unlike(k, told(min(names), pairs[k][0], now)) for k, names in enumerate(left) if names), None)
+    return next((Unlike(k, in_words(min(names), pairs[k][0], now)) for k, names in enumerate(left) if names), None)
 
 
 def own_to_each(make: Callable[[], gymnasium.Env]) -> set[str]:
-    """The names of the attributes in which a few new instances differ, as a map that is drawn when one is made."""
+    """The names of the attributes in which a few new instances differ, for instance a map that is random."""
     until, first, found = time.monotonic() + _SECONDS, attributes(make()), set[str]()
     for k in range(_INSTANCES - 1):
         if k and time.monotonic() > until:
@@ -159,16 +159,16 @@ def different(held: dict[str, Any], other: dict[str, Any]) -> set[str]:
     return {name for name in held.keys() | other.keys() if held.get(name, missing) != other.get(name, missing)}
 
 
-def told(name: str, held: dict[str, Any], other: dict[str, Any]) -> str:
-    """An attribute that is another one in two environments, in words, with what it is where that is short."""
+def in_words(name: str, held: dict[str, Any], other: dict[str, Any]) -> str:
+    """An attribute that differs between two environments, in words; with its values where they are short."""
     plain = [name in each and isinstance(each[name], bool | int | float | str | None) for each in (held, other)]
     return f"{name} = {held[name]!r}, where another instance has {other[name]!r}" if all(plain) else f"another {name}"
 
 
 def fingerprint(value: Any, *, besides: Sequence[Any] = ()) -> Any:
-    """Something that is equal for values that are alike. Functions are alike where their code and what they enclose
-    is; objects where their attributes are; what cannot be looked into, where its class is the same; and so are the
-    objects that are in `besides`."""
+    """A value that is equal for values that are alike. Functions are alike where their code and the values that they
+    enclose are; objects where their attributes are; objects that cannot be looked into where their classes are the
+    same; and each object in `besides` is like the one at the same position in another call."""
     return _print_of(value, {id(known): -1 - k for k, known in enumerate(besides)}, [0])
 
 
@@ -189,7 +189,7 @@ def _print_of(value: Any, seen: dict[int, int], parts: list[int]) -> Any:
         return kind
     if kind in (list, tuple, dict):
         try:
-            return marshal.dumps(value, 2)  # a large table takes a millisecond so, and twenty one by one
+            return marshal.dumps(value, 2)  # a large table takes a millisecond; entry by entry twenty
         except ValueError:
             pass
     if id(value) in seen:
@@ -220,17 +220,17 @@ def _parts_of(value: Any, inner: Callable[[Any], Any]) -> Any:
         return [(name, inner(part)) for name, part in named.items() if name not in _NOT_COMPARED]
     try:
         return pickle.dumps(value)
-    except Exception:  # a window, a lock, a handle: nothing to compare
+    except Exception:  # a window, a lock, a file: nothing to compare
         return None
 
 
 def _classes_outside(cls: type) -> list[type]:
-    """The classes that an environment is made of, except Gymnasium's and Python's own."""
+    """The classes among the bases of an environment that are not Gymnasium's or Python's own."""
     return [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("gymnasium", "typing", "builtins")]
 
 
 def _data_of(cls: type) -> dict[str, Any]:
-    """What a class holds beside its code."""
+    """The attributes of a class that are not code."""
     code = (types.FunctionType, staticmethod, classmethod, property, functools.cached_property, type)
     plain = {name: value for name, value in vars(cls).items() if not name.startswith("__")}
     return {name: value for name, value in plain.items() if not isinstance(value, code) and name != "metadata"}

@@ -3,8 +3,8 @@
 Constants are read from an instance of the environment, so changed ones are honoured; the arithmetic is Gymnasium's,
 operation by operation. On the CPU in float64 rewards, ends and states are those of the environment bit for bit (sines,
 cosines and powers by numpy, as there); on other devices, and where numpy's cosine is not that of Python's `math`, which
-MountainCar uses, up to the last bits. What an environment shows is a float32 rounding of its state and is no part of
-the dynamics. After an end Gymnasium leaves undefined what follows; here an ended state is stepped like any other.
+MountainCar uses, up to the last bits. The observations are float32 roundings of states and no part of the dynamics.
+After an end Gymnasium leaves undefined what follows; here an ended state is stepped like any other.
 """
 
 import math
@@ -36,11 +36,11 @@ from pgts_torch.models.wrappers import transforms_of
 class ClassicModel(TensorModel, ExactModel):
     """The dynamics of one environment of classic control, with the constants of an instance of it.
 
-    The state is the vector `env.unwrapped.state`. States, rewards and values are float64 unless told otherwise.
+    The state is the vector `env.unwrapped.state`. States, rewards and values are float64 by default.
 
     Args:
         env: an instance, wrapped or not; nothing of it changes. Its actions are discrete, by itself or by an action
-            wrapper (`with_torques`). What its wrappers make of rewards is in the answers (`transforms_of`).
+            wrapper (`with_torques`). Its wrappers' transforms of rewards are part of the outcomes (`transforms_of`).
         gamma: discount in [0, 1] of a step that does not terminate.
         action_repeat, device, merge: as in `TensorModel`.
         dtype: of states, rewards and values.
@@ -54,7 +54,7 @@ class ClassicModel(TensorModel, ExactModel):
     env_class: type
     size: int
     constants: tuple[str, ...]
-    """Everything that a step of the environment reads of it, beside its state."""
+    """All attributes of the environment that a step reads, beside its state."""
     pays_ends_only: bool = True
     """Whether every reward is one end of the range of rewards or the other."""
 

@@ -1,4 +1,4 @@
-"""Whether a simulator can serve as a model: what a search relies on, tried out, and what a call costs."""
+"""Whether a simulator can serve as a model: checks of everything that a search relies on, and the cost of a call."""
 
 import functools
 import itertools
@@ -30,14 +30,14 @@ _CONTINUOUS_ACTIONS = 8
 
 _ACTIONS_TRIED, _TIMED_CALLS = 8, 200
 _SHORT_WALKS, _SHORT_LENGTH, _LONG_LENGTH, _STEPS_IN_ALL, _TIMED_STEPS = 4, 20, 300, 20, 3
-"""Of the short form: some walks for what shows at once, and one to the end of an episode; so many times its length are
-the steps of all. A few steps are timed first."""
+"""Of the short form: a few short walks, and one to the end of an episode, of which all the steps together are so many
+times as many. A few steps are timed first."""
 
 _WALKS_APART = 12
-"""In as many instances, where each has something of its own: two may have drawn the same."""
+"""In as many instances, where instances differ: two may be alike by chance."""
 
 _LEVELS, _WIDTH = 3, 8
-"""The search that is run beside a real environment: so many levels, and states of a level."""
+"""The search that is made beside a real environment: its levels, and the states of each."""
 
 _GENERATORS = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random, torch.Generator)
 
@@ -72,7 +72,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Report:
-    """The answer of `check_model`.
+    """The result of `check_model`.
 
     random_share: how many of the (state, action) tried are decided by chance, in [0, 1].
     cost: of a call; None where one fails.
@@ -95,13 +95,13 @@ class Report:
         missing = "; ".join(check.detail for check in self.checks if not check.passed)
         if not self.usable:
             return f"{self.env} cannot serve as a model: {missing}"
-        random = "random, so search it by `sampled`" if self.random_share else "its outcomes can be listed"
+        random = "random, so search it by `sampled`" if self.random_share else "its outcomes can be enumerated"
         return f"{self.env} can serve as a model: {random}{'; but ' * bool(missing)}{missing}"
 
 
 @dataclass
 class _Tried:
-    """What the check of answers learns beside them."""
+    """What the check of answers finds out for the report."""
 
     random_share: float = 0.0
 
@@ -111,16 +111,16 @@ class _Missing(Exception):
 
 
 def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: int = 20) -> Report:
-    """Try out whether an environment can serve as a `SimulatorModel`.
+    """Check whether an environment can serve as a `SimulatorModel`.
 
         answers     rewards and observations are finite and fit the spaces that the environment declares
-        restore     from a snapshot, the same actions and draws give the same observations (in the dtypes declared),
-                    rewards and ends, bit for bit, in another instance that has been elsewhere since
+        restore     from a snapshot, the same actions and keys give the same observations (in the dtypes declared),
+                    rewards and ends, bit for bit, in another instance that has been in other states since
         merge       equal states have equal snapshots, so that a search can merge them
         chance      what follows is a function of state, action and key, and no generator is in a snapshot: a search
                     cannot foresee what the environment is about to draw
-        untouched   a search from the state of a real environment leaves it and its generator as they were: it goes on
-                    like a twin that nobody searched from
+        untouched   a search from the state of a real environment changes neither it nor its generator: it goes on like
+                    an equal one without a search
         table       where there is one: steps and starts of a short walk are among its outcomes, bit for bit
         dynamics    where they are known in torch: they give the steps of a short walk up to rounding
 
@@ -136,7 +136,7 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
     Raises:
         MissingModel: no adapter knows the environment, the message says what to implement; or a wrapper may change more
             than single answers.
-        PgtsError: it cannot be made, or cannot be walked in.
+        PgtsError: it cannot be made, or raises in random walks.
     """
     if min(continuations, length) < 1:
         raise PgtsError(f"continuations is {continuations} and length is {length}; both must be at least 1")
@@ -151,7 +151,7 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
     try:
         walks = walks_of(setup, continuations, length)
     except BaseException as error:
-        raise PgtsError(f"{setup.name} fails in random walks with seed {seed}: {_told(error)}") from error
+        raise PgtsError(f"{setup.name} fails in random walks with seed {seed}: {_in_words(error)}") from error
     tried = _Tried()
     repeated = functools.cache(lambda: replays(setup, walks))
     checks = (
@@ -167,15 +167,15 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
         return replace(report, cost=_cost(setup, walks))
     except BaseException as error:
         if report.usable:
-            raise PgtsError(f"{setup.name} fails where its calls are timed: {_told(error)}") from error
+            raise PgtsError(f"{setup.name} fails where its calls are timed: {_in_words(error)}") from error
         return report
 
 
 def held(env: gymnasium.Env, *, seed: int) -> Iterator[Check]:
-    """A table or dynamics of an environment, held to its steps.
+    """Whether steps of an environment contradict its table or dynamics.
 
     Args:
-        env: an instance that nobody else needs.
+        env: an instance for this alone.
         seed: of the walk.
     """
     for kind, why, steps in claims(env, numpy_stream(seed, "claims")):
@@ -184,18 +184,18 @@ def held(env: gymnasium.Env, *, seed: int) -> Iterator[Check]:
 
 
 def why_not(setup: Setup, *, seconds: float = 0.4) -> str:
-    """Why snapshots of an environment cannot be believed, in the words of `check_model`; empty where nothing was found.
+    """Why snapshots of an environment cannot be trusted, in the words of `check_model`; empty where nothing was found.
 
     The checks `chance`, `restore` and `untouched` with a few short walks and a long one; their length is such that all
-    takes about these seconds, and two steps where one takes long. What the environment raises on the way is no answer:
-    it is told where it stops a training.
+    takes about these seconds, and at least two steps. An error of the environment is no reason: it is reported when it
+    stops a training.
     """
     try:
         _nothing_beside(setup)
         longest = int(np.clip(seconds / (_STEPS_IN_ALL * _seconds_of_a_step(setup)), 2, _LONG_LENGTH))
         few = setup.actions[: max(2, min(longest, _ACTIONS_TRIED))]
         short = replace(setup, longest=longest, actions=few)
-        # Making one may take long: where all are alike one walks, one draws and one walks again, in turn.
+        # Making an instance may take long: where all are alike three take turns, one for each part of a check.
         three = itertools.cycle([setup.make() for _ in range(3)]) if setup.alike else None
         many, turns = (_WALKS_APART, short) if three is None else (_SHORT_WALKS, replace(short, make=three.__next__))
         for count, length in ((many, min(longest, _SHORT_LENGTH)), (1, longest)):
@@ -213,7 +213,7 @@ def why_not(setup: Setup, *, seconds: float = 0.4) -> str:
 
 
 def _seconds_of_a_step(setup: Setup) -> float:
-    """With its snapshot: the least of a few, which is least disturbed by what else the machine does."""
+    """Of a step with its snapshot: the smallest of a few times, which other processes have disturbed least."""
     env, times = setup.fresh(), []
     for _ in range(_TIMED_STEPS):
         begin = time.perf_counter()
@@ -225,32 +225,32 @@ def _seconds_of_a_step(setup: Setup) -> float:
 
 
 def _check(name: str, check: Callable[[], str], *, needed: bool = True) -> Check:
-    """The answer of one check; whatever the environment raises is an answer too."""
+    """The result of one check; an error of the environment fails it."""
     try:
         return Check(name, needed, True, check())
     except BaseException as error:
-        return Check(name, needed, False, str(error) if isinstance(error, _Missing) else _told(error))
+        return Check(name, needed, False, str(error) if isinstance(error, _Missing) else _in_words(error))
 
 
-def _told(error: BaseException) -> str:
-    """What is wrong; Ctrl-C is the user's, and raised again."""
+def _in_words(error: BaseException) -> str:
+    """The text of an error; Ctrl-C of the user is raised again."""
     if isinstance(error, KeyboardInterrupt):
         raise error
     return text_of(error)
 
 
 def _answers(setup: Setup, walks: Sequence[Walk], tried: _Tried) -> str:
-    """Ask a model for some actions in each state."""
+    """Query a model for some actions in each state."""
     model = setup.model()
     state_N = torch.tensor([model.number(walk.start) for walk in walks]).repeat_interleave(_ACTIONS_TRIED)
     action_N = torch.from_numpy(setup.random.integers(len(setup.actions), size=len(state_N)))
     random_N = model.is_random(state_N, action_N)
     tried.random_share = float(random_N.double().mean())
-    return f"{len(random_N)} (state, action) asked, {tried.random_share:.0%} of them decided by chance"
+    return f"{len(random_N)} (state, action) queried, {tried.random_share:.0%} of them decided by chance"
 
 
 def _nothing_beside(setup: Setup) -> str:
-    """A look for what a subclass remembers beside that which its family's snapshots hold."""
+    """Whether a subclass has attributes that change and are not in the snapshots of its family."""
     env, known = setup.fresh(), setup.adapter.restored
     if known is None or type(env).__module__.split(".")[0] in ("gymnasium", "ale_py"):
         return ""
@@ -276,7 +276,7 @@ def _restore(walks: Sequence[Walk], repeated: Sequence[Walk]) -> str:
 
 
 def _merge(walks: Sequence[Walk], repeated: Sequence[Walk]) -> str:
-    """The snapshots of those walks that went on the same."""
+    """Whether walks that went on the same have the same snapshots."""
     pairs = [(walk, other) for walk, other in zip(walks, repeated, strict=True) if walk.seen == other.seen]
     off = sum((walk.start.key, *walk.states) != (other.start.key, *other.states) for walk, other in pairs)
     if off:
@@ -288,7 +288,7 @@ def _merge(walks: Sequence[Walk], repeated: Sequence[Walk]) -> str:
 
 
 def _chance(setup: Setup, walks: Sequence[Walk]) -> str:
-    """A look for generators that a search does not own, and what another key changes."""
+    """Whether steps use generators other than the one that the key seeds; and how often another key matters."""
     env = setup.fresh()
     if name := _own_generator(env):
         raise _Missing(f"attribute {name} is a generator of its own: draw from self.np_random only")
@@ -323,7 +323,7 @@ def _own_generator(env: Any) -> str:
 
 
 def _held(value: Any) -> list[tuple[Any, Any]]:
-    """The names and values that something consists of; spaces have generators, but none that a step draws from."""
+    """The names and values of which an object consists; not of spaces, whose generators no step uses."""
     if isinstance(value, dict):
         return list(value.items())
     if isinstance(value, list | tuple):
@@ -332,13 +332,13 @@ def _held(value: Any) -> list[tuple[Any, Any]]:
 
 
 def _stable_key(setup: Setup, env: Any) -> bytes | None:
-    """The key of a snapshot; None if another one, taken at once, has another."""
+    """The key of a snapshot; None if a second one of the same state has another key."""
     key = setup.adapter.get_state(env).key
     return key if setup.adapter.get_state(env).key == key else None
 
 
 def _untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
-    """Two real environments live the same life; one is searched from."""
+    """Whether two equal real environments stay equal when a search starts from one of them."""
     real, twin = setup.make(), setup.make()
     seed, actions = setup.number(), [setup.action() for _ in range(2 * length)]
     for env in (real, twin):
@@ -351,8 +351,8 @@ def _untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
         state_N = frontier_N[:width].repeat_interleave(len(setup.actions))
         action_N = torch.arange(len(setup.actions)).repeat(len(frontier_N[:width]))
         key_N = draw_keys(len(state_N), generator=stream(seed, "untouched", level))
-        drawn = model.sample(state_N, action_N, key_N=key_N)
-        frontier_N = drawn.next_state_N[drawn.discount_N > 0].unique()
+        sampled = model.sample(state_N, action_N, key_N=key_N)
+        frontier_N = sampled.next_state_N[sampled.discount_N > 0].unique()
         after.add((_stable_key(setup, real), repr(generator_state(real))))
     if after != {before}:
         raise _Missing("a search changes the real environment: instances share something, or get_state changes its own")
@@ -367,7 +367,7 @@ def _untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
 
 
 def _cost(setup: Setup, walks: Sequence[Walk]) -> Cost:
-    """Each part of a call on its own, on one thread."""
+    """The times of the parts of a call, on one thread."""
     env = setup.fresh()
     times = []
     for n in range(_TIMED_CALLS):

@@ -1,4 +1,4 @@
-"""Is what a model was written for what runs? A table or an adapter belongs to the `step` and `reset` of one class."""
+"""Whether an environment runs the code that a model was written for: the `step` and `reset` of one class."""
 
 import dis
 import functools
@@ -11,11 +11,11 @@ _NO_MATTER = frozenset({"render", "close", "render_mode", "metadata", "_np_rando
 
 
 def overridden(env: Any, family: type, methods: tuple[str, ...] = ("step", "reset")) -> str:
-    """What an unwrapped environment does otherwise than a class that it is an instance of, in these methods or in what
-    they use of it (but to render): "step is overridden by Shaped"; empty where nothing is.
+    """Which of these methods, or of the attributes that they use (except for rendering), an unwrapped environment does
+    not have from `family`, a class among its bases: "step is overridden by Shaped"; empty where it has all.
 
-    Overridden is what a class that is not among the bases of `family` defines, and a method that is set on the
-    instance.
+    An attribute is overridden if a class that is not among the bases of `family` defines it, or if it is a method that
+    is set on the instance.
     """
     strangers = [cls for cls in type(env).__mro__ if cls not in family.__mro__]
     for name in _used_by(family, methods):
@@ -28,7 +28,7 @@ def overridden(env: Any, family: type, methods: tuple[str, ...] = ("step", "rese
 
 def origin(env: Any, attribute: str) -> type:
     """The class that an attribute of an environment belongs to: the most derived one that sets it, or whose `step`
-    reads it. The class of the instance itself where none does, for then it was set from outside."""
+    reads it. Where none does it was set from outside, and belongs to the class of the instance."""
     return next((cls for cls in type(env).__mro__ if _writes(cls, attribute)), type(env))
 
 
@@ -46,12 +46,12 @@ def _writes(cls: type, attribute: str) -> bool:
 
 @functools.cache
 def _used_by(family: type, methods: tuple[str, ...]) -> tuple[str, ...]:
-    """These methods and every name of the class that their code mentions, or the code of what it mentions."""
+    """These methods, and all attributes of the class that their code uses, directly or through each other."""
     found, entrances = dict[str, None](), (*methods, *_ALWAYS)
     waiting = [*entrances]
     while waiting:
         name = waiting.pop(0)
-        # All holders, for `super().reset` runs those of the bases too.
+        # Those of all bases, because `super().reset` runs them too.
         holders = [vars(cls)[name] for cls in family.__mro__ if cls is not object and name in vars(cls)]
         if name in found or name in _NO_MATTER or not (holders or name in entrances):
             continue

@@ -1,4 +1,4 @@
-"""Tables of transitions that environments publish, and whether they are theirs."""
+"""Tables of transitions that environments publish, and whether these are what the environments do."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,7 +24,7 @@ _STARTS = "initial_state_distrib"
 
 
 def publishes_table(env: gymnasium.Env) -> bool:
-    """Whether there is an `mdp` or something called P."""
+    """Whether an environment has an `mdp` or an attribute P."""
     base: Any = env.unwrapped
     try:
         return isinstance(getattr(base, "mdp", None), TabularMDP) or getattr(base, "P", None) is not None
@@ -33,19 +33,20 @@ def publishes_table(env: gymnasium.Env) -> bool:
 
 
 def table_of(env: gymnasium.Env, *, gamma: float, generator: np.random.Generator) -> tuple[TabularMDP, bool]:
-    """The MDP that an environment in its wrappers publishes (`publishes_table`) and keeps to; and whether its start
-    distribution is known, or counted in 1,000 resets because the environment declares none.
+    """The MDP that an environment in its wrappers publishes (`publishes_table`), if its steps do not contradict it; and
+    whether its start distribution is known, or counted in 1,000 resets because the environment declares none.
 
-    What wrappers make of actions and rewards is in the table: an outcome pays f(r), and r(s, a) is the mean of that.
+    Transforms of actions and rewards by wrappers are part of the table: an outcome has the reward f(r), and r(s, a) is
+    the mean of that.
 
     Args:
-        env: an instance that nobody else needs; it is walked in.
+        env: an instance for this alone; it is stepped.
         gamma: discount of a P table; ours carry their own.
         generator: of the walk.
 
     Raises:
-        MissingModel: its table is none, or was not written for this `step` and `reset`, has other states or
-            actions than the spaces, or is contradicted by a step of a short walk.
+        MissingModel: P is no table, or it was not written for this `step` and `reset`, has other states or actions than
+            the spaces, or is contradicted by a step of a short walk.
     """
     base: Any = env.unwrapped
     name, transforms = env_name(env), transforms_of(env)
@@ -76,7 +77,7 @@ def table_of(env: gymnasium.Env, *, gamma: float, generator: np.random.Generator
 
 
 def _published(env: gymnasium.Env, gamma: float, transforms: Transforms, generator: np.random.Generator) -> TabularMDP:
-    """The MDP of a table P, through wrappers; MissingModel if it is no such table."""
+    """The MDP of a table P with the transforms of wrappers; MissingModel if it is no such table."""
     base: Any = env.unwrapped
     if getattr(base, "fickle_passenger", False):
         raise MissingModel(f"the table P of {env_name(env)} is not used: it lacks what a fickle passenger draws")
@@ -108,14 +109,14 @@ def _published(env: gymnasium.Env, gamma: float, transforms: Transforms, generat
 
 
 def _position(base: Any, action: Any) -> int:
-    """The position of an action of the environment inside in its table."""
+    """The position in the table of an action of the environment inside its wrappers."""
     if not isinstance(base.action_space, gymnasium.spaces.Discrete):
         raise MissingModel(f"a table numbers actions from 0 on; those of {env_name(base)} are {base.action_space}")
     return int(action) - int(base.action_space.start)
 
 
 def _transformed(mdp: TabularMDP, positions: Sequence[int], transforms: Transforms) -> TabularMDP:
-    """With actions in another order, and what becomes of the rewards, each paid whatever outcome is drawn."""
+    """The MDP with its actions in this order and transformed rewards, which are those of all outcomes of an action."""
     if not (transforms.actions or transforms.rewards):
         return mdp
     order, old = torch.tensor(positions), mdp.outcomes

@@ -1,4 +1,4 @@
-"""Between which numbers rewards lie, as far as someone has said so, and what follows for values."""
+"""The range of rewards that a user or an environment declares, and the bounds of values that follow."""
 
 import math
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ import numpy as np
 from pgts_torch.errors import ModelMismatch, PgtsError
 
 _SLACK = 1e-6
-"""In units of a bound: by how much a reward may be outside of it, for it may have been stored in float32."""
+"""In units of a bound: by how much a reward may be outside of it, because it may have been stored in float32."""
 
 
 @final
 @dataclass(frozen=True)
 class RewardRange:
-    """A promise that every reward of a single step lies in [low, high], to which all are held."""
+    """A declaration that every reward of a single step lies in [low, high]; one outside is an error."""
 
     low: float
     high: float
@@ -26,7 +26,7 @@ class RewardRange:
 
     @classmethod
     def of(cls, given: Any) -> "RewardRange":
-        """Of two numbers; PgtsError if these are none."""
+        """The range between two numbers; PgtsError if these are none."""
         try:
             low, high = map(float, given)
         except (TypeError, ValueError):
@@ -36,7 +36,7 @@ class RewardRange:
         return cls(low, high)
 
     def values(self, gamma: float) -> tuple[float, float]:
-        """The least and the most that a state can be worth (`value_range`)."""
+        """The lowest and the highest value that a state can have (`value_range`)."""
         return value_range(self._wide, gamma)
 
     def check(self, reward_N: Any) -> None:
@@ -52,12 +52,12 @@ class RewardRange:
 
     @property
     def _wide(self) -> tuple[float, float]:
-        """What is let pass. 0 stays 0: costs never add up to a gain."""
+        """The range with its slack. 0 stays 0, so that costs alone cannot have a positive sum."""
         return self.low - _SLACK * abs(self.low), self.high + _SLACK * abs(self.high)
 
 
 def value_range(reward_range: tuple[float, float], gamma: float) -> tuple[float, float]:
-    """What a state can be worth if all rewards are in [low, high] and nothing is earned after an end:
+    """The values that a state can have if all rewards are in [low, high], and 0 after an end:
 
     min(0, low) / (1 - gamma)  to  max(0, high) / (1 - gamma),        infinite where gamma is 1, 0 where it is 0 / 0
     """

@@ -1,4 +1,4 @@
-"""What an environment says of one step, in the forms in which environments say it."""
+"""Rewards, discounts and observations of a step, in all forms in which environments return them."""
 
 import contextlib
 from decimal import Decimal

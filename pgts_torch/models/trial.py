@@ -1,4 +1,4 @@
-"""Models that claim to be an environment, held to its steps for a moment before they are believed."""
+"""A short trial of models that claim to be an environment: do its steps contradict them?"""
 
 import contextlib
 import math
@@ -18,37 +18,37 @@ from pgts_torch.models.tabular import TabularModel, tabular_truth
 from pgts_torch.tabular.mdp import TabularMDP
 
 _GAMMA = 0.5
-"""Any discount serves where an end is to be told from going on."""
+"""Only an end, of discount 0, has to differ from it."""
 
 _STEPS, _LONGEST_EPISODE, _RESETS = 400, 40, 1000
 _SECONDS = 0.3
-"""After which a trial ends in a slow environment, though never before its first step."""
+"""After these a trial ends in a slow environment, though never before its first step."""
 
 
 def table_contradiction(
     mdp: TabularMDP, env: gymnasium.Env, gamma: float, generator: np.random.Generator, *, seconds: float = _SECONDS
 ) -> tuple[str, int]:
-    """The first thing in a short random walk that cannot be by a table, empty where there is none; and how many steps
-    were held to it.
+    """The first thing in a short random walk that a table rules out, empty where there is none; and how many steps were
+    compared.
 
     Starts must have positive probability, and each step must be an outcome that has (`TabularModel.outcome_of`).
 
     Args:
-        env: an instance that nobody else needs, in the wrappers that the table is meant to hold for.
+        env: an instance for this alone, in the wrappers that the table is meant for.
         gamma: discount of a step that names none.
     """
 
-    def state_of(shown: Any) -> int:
-        if not _is_state(shown, mdp.num_states):
-            raise _NoState(f"it shows {shown!r}, which is none of the states 0 to {mdp.num_states - 1}")
-        return int(shown)
+    def state_of(seen: Any) -> int:
+        if not _is_state(seen, mdp.num_states):
+            raise _NoState(f"it shows {seen!r}, which is none of the states 0 to {mdp.num_states - 1}")
+        return int(seen)
 
     def began(state: int) -> None:
         if mdp.start_S[state] == 0:
             raise _NoState(f"it starts in state {state}, which has probability 0 there")
 
     try:
-        return _denied(TabularModel(mdp), _walk(env, gamma, generator, state_of, began, seconds))
+        return _contradiction(TabularModel(mdp), _walk(env, gamma, generator, state_of, began, seconds))
     except _NoState as off:
         return str(off), 0
 
@@ -60,21 +60,21 @@ def dynamics_contradiction(
     there is none; and how many steps were compared.
 
     Args:
-        model: of its own, for it numbers the states that are met.
-        env: an instance that nobody else needs, in the wrappers that the dynamics are meant to hold for.
+        model: for this alone: it numbers the states of the walk.
+        env: an instance for this alone, in the wrappers that the dynamics are meant for.
     """
     numbers = _walk(env, model.gamma, generator, lambda _: int(model.roots([env])), lambda _: None, seconds)
-    return _denied(model, numbers)
+    return _contradiction(model, numbers)
 
 
 def claims(env: gymnasium.Env, generator: np.random.Generator) -> Iterator[tuple[str, str, int]]:
-    """What claims to be an environment, "table" or "dynamics", with what is found of it as above.
+    """The models that claim to be an environment, "table" or "dynamics", each with its contradiction as above.
 
     Args:
-        env: an instance that nobody else needs. What is inside its wrappers is held to its table.
+        env: an instance for this alone. Its table is compared with the environment inside its wrappers.
     """
     base: Any = env.unwrapped
-    with contextlib.suppress(PgtsError):  # what is called P is no table
+    with contextlib.suppress(PgtsError):  # the attribute P is no table
         mdp = tabular_truth(base, gamma=_GAMMA)
         yield "table", *table_contradiction(mdp, base, _GAMMA, generator, seconds=math.inf)
     if (kind := dynamics_of(env)) is not None:
@@ -83,10 +83,10 @@ def claims(env: gymnasium.Env, generator: np.random.Generator) -> Iterator[tuple
 
 
 def counted_starts(env: gymnasium.Env, num_states: int, generator: np.random.Generator) -> Float[np.ndarray, "S"]:
-    """How often each state came first in up to 1,000 seeded resets, as shares.
+    """The share of up to 1,000 seeded resets in which each state was the start.
 
     Raises:
-        ValueError: it began with what is no state.
+        ValueError: a start is no state.
     """
     counts, until = np.zeros(num_states), time.monotonic() + _SECONDS
     for _ in range(_RESETS):
@@ -100,15 +100,15 @@ def counted_starts(env: gymnasium.Env, num_states: int, generator: np.random.Gen
 
 
 class _NoState(Exception):
-    """Something was shown that is no state, or no start."""
+    """An observation is no state, or a start that has no probability."""
 
 
 _Step = tuple[int, int, float, float, int]
 """State, number of the action, reward, discount and next state."""
 
 
-def _denied(model: ExactModel, steps: Iterator[_Step]) -> tuple[str, int]:
-    """The first step that a model denies, in words, and how many steps there were."""
+def _contradiction(model: ExactModel, steps: Iterator[_Step]) -> tuple[str, int]:
+    """The first step that contradicts a model, in words, and how many steps there were."""
     columns = list(zip(*steps, strict=True))
     if not columns:
         return "", 0
@@ -132,19 +132,19 @@ def _walk(
     began: Callable[[int], None],
     seconds: float,
 ) -> Iterator[_Step]:
-    """Random episodes, up to where the environment raises: that is no contradiction, and is told where it stops a
+    """Random episodes, up to an error of the environment: that is no contradiction, and is reported when it stops a
     training."""
     until, taken, named = time.monotonic() + seconds, 0, names_discounts(env)
     try:
         while taken < _STEPS and (time.monotonic() < until or taken == 0):
-            shown, _ = env.reset(seed=_seed(generator))
-            state = state_of(shown)
+            seen, _ = env.reset(seed=_seed(generator))
+            state = state_of(seen)
             began(state)
             for _ in range(_LONGEST_EPISODE):
                 action = int(generator.integers(env.action_space.n))  # type: ignore[attr-defined]
-                shown, reward, terminated, truncated, info = env.step(action)
+                seen, reward, terminated, truncated, info = env.step(action)
                 discount = 0.0 if terminated else discount_of(info, gamma, named=named)
-                before, state = state, state_of(shown)
+                before, state = state, state_of(seen)
                 yield before, action, number_of("reward", reward), discount, state
                 taken += 1
                 if terminated or truncated or time.monotonic() > until:
@@ -155,8 +155,8 @@ def _walk(
         return
 
 
-def _is_state(shown: Any, num_states: int) -> bool:
-    array = np.asarray(shown)
+def _is_state(seen: Any, num_states: int) -> bool:
+    array = np.asarray(seen)
     return array.ndim == 0 and array.dtype.kind in "iu" and 0 <= int(array) < num_states
 
 

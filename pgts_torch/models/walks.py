@@ -1,4 +1,4 @@
-"""Random walks in simulators, recorded to the bit, and walked again from a restored state."""
+"""Random walks in simulators, recorded bit for bit, and repeated from a restored state."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ class Setup:
     """What all checks share.
 
     make: makes an instance without wrappers.   actions: of the environment inside them.
-    longest: the most steps before a continuation begins, or before a state is restored that was met elsewhere.
-    alike: whether new instances are; else each state is restored in one of its own.
+    longest: the most steps before a walk is recorded, or before a state of another instance is restored.
+    alike: whether new instances are alike; else each state is restored in an instance of its own.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Walk:
-    """A continuation: where it began, the key of its draws, what was done, what was seen and which states were met."""
+    """A recorded walk: its start, the key of its chance, its actions, what was seen and the keys of its states."""
 
     start: Snapshot
     key: int
@@ -57,7 +57,7 @@ class Walk:
 
 
 def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
-    """Continuations that nothing interrupts, from states at random steps of random episodes."""
+    """Walks without a restored state in between, from states at random steps of random episodes."""
     env = setup.fresh()
     walks = []
     for _ in range(count):
@@ -67,7 +67,7 @@ def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
 
 
 def _go_somewhere(setup: Setup, env: Any) -> None:
-    """To a random step of an episode, by steps alone: the episode is made up to its end, and once more up to there."""
+    """Go to a random step of an episode without restoring a state: find its end, and repeat it up to that step."""
     seed, actions, over = setup.number(), list[Any](), False
     env.reset(seed=seed)
     while not over and len(actions) < setup.longest:
@@ -77,12 +77,12 @@ def _go_somewhere(setup: Setup, env: Any) -> None:
     env.reset(seed=seed)
     for action in actions[: int(setup.random.integers(len(actions)))]:
         _, _, terminated, truncated, _ = env.step(action)
-        if terminated or truncated:  # reset did not heed the seed
+        if terminated or truncated:  # the same seed and actions have led elsewhere
             env.reset(seed=seed)
 
 
 def walk_on(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
-    """What these actions give from here on, up to an end."""
+    """Record these actions from the present state, up to an end."""
     start = setup.adapter.get_state(env)
     setup.adapter.seed(env, key)
     seen, states = [], []
@@ -101,13 +101,13 @@ def again(setup: Setup, env: Any, walk: Walk) -> Walk:
 
 
 def _seen(env: gymnasium.Env, observation: Any, reward: Any, terminated: Any, truncated: Any) -> bytes:
-    """A step as an agent sees it, to the bit."""
-    shown = as_declared(env.observation_space, observation)
-    return bits((shown, number_of("reward", reward), bool(terminated), bool(truncated)))
+    """The bits of a step as an agent sees it."""
+    declared = as_declared(env.observation_space, observation)
+    return bits((declared, number_of("reward", reward), bool(terminated), bool(truncated)))
 
 
 def bits(value: Any) -> bytes:
-    """Every bit of an observation and what comes with it."""
+    """Every bit of an observation, or of a step."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}".encode() + value.tobytes()
     if isinstance(value, dict):
@@ -118,8 +118,8 @@ def bits(value: Any) -> bytes:
 
 
 def replays(setup: Setup, walks: Sequence[Walk]) -> list[Walk]:
-    """Each walk again, in an instance that came to the end of an episode first, and has walked another one just
-    before: what a snapshot lacks is then as different as can be."""
+    """Repeat each walk in an instance that was at the end of an episode, and then in another walk: anything that a
+    snapshot lacks is then likely to differ."""
     env, repeated = _at_the_end(setup), list[Walk]()
     for walk in walks:
         repeated.append(again(setup, env if setup.alike else _at_the_end(setup), walk))
@@ -127,7 +127,7 @@ def replays(setup: Setup, walks: Sequence[Walk]) -> list[Walk]:
 
 
 def _at_the_end(setup: Setup) -> Any:
-    """A new instance in which an episode is over, or long."""
+    """A new instance at the end of an episode, or late in one."""
     env = setup.fresh()
     for _ in range(setup.longest):
         _, _, terminated, truncated, _ = env.step(setup.action())
@@ -137,7 +137,7 @@ def _at_the_end(setup: Setup) -> Any:
 
 
 def live(env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
-    """What an agent sees that takes these actions; a new episode starts where one ends."""
+    """The bits that an agent sees as it takes these actions; where an episode ends a new one starts."""
     seen = []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)

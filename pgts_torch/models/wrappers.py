@@ -28,17 +28,17 @@ _HARMLESS = (
 """Wrappers that have a `step` of their own and change neither observations nor rewards. Subclasses may."""
 
 _HOOKS = {ActionWrapper: "action", ObservationWrapper: "observation", RewardWrapper: "reward", gymnasium.Wrapper: ""}
-"""What a wrapper transforms that leaves `step` and `reset` as they are in this base class of Gymnasium."""
+"""What a wrapper transforms whose `step` and `reset` are those of this base class of Gymnasium."""
 
 _TRIED_STEPS, _SECONDS = 60, 0.2
-"""How long wrappers are tried out."""
+"""How long the trial of wrappers is."""
 
 
 @dataclass(frozen=True)
 class Transforms:
-    """What the wrappers of an environment make of actions, rewards and observations, each a function of this one alone.
+    """What the wrappers of an environment make of actions, rewards and observations, each a function of that value.
 
-    actions: from the outside.   rewards, observations: from the inside.
+    actions: the outermost wrapper's function first.   rewards, observations: the innermost one's first.
     """
 
     actions: tuple[Callable[[Any], Any], ...] = ()
@@ -46,20 +46,20 @@ class Transforms:
     observations: tuple[Callable[[Any], Any], ...] = ()
 
     def action(self, action: Any) -> Any:
-        """What an action becomes on its way to the environment inside."""
+        """The action of the environment inside its wrappers."""
         return _through(self.actions, action)
 
     def reward(self, reward: Any) -> Any:
-        """What a reward of the environment inside becomes."""
+        """The reward outside of the wrappers."""
         return _through(self.rewards, reward)
 
     def observation(self, observation: Any) -> Any:
-        """What an observation of the environment inside becomes."""
+        """The observation outside of the wrappers."""
         return _through(self.observations, observation)
 
 
 def wrappers_of(env: gymnasium.Env) -> list[gymnasium.Wrapper]:
-    """The wrappers around an environment, from the outside."""
+    """The wrappers around an environment, the outermost first."""
     found = []
     while isinstance(env, gymnasium.Wrapper):
         found.append(env)
@@ -68,10 +68,10 @@ def wrappers_of(env: gymnasium.Env) -> list[gymnasium.Wrapper]:
 
 
 def transforms_of(env: gymnasium.Env) -> Transforms:
-    """What the wrappers of an environment transform, read from how they are written (`check_transforms` tries it out).
+    """The transforms of the wrappers of an environment, by their classes (`check_transforms` compares them with steps).
 
     Raises:
-        MissingModel: a wrapper has a `step` or a `reset` of its own, and is none that is known to change nothing.
+        MissingModel: a wrapper has a `step` or a `reset` of its own, and is not known to change nothing.
     """
     hooks: dict[str, list[Callable[[Any], Any]]] = {"action": [], "reward": [], "observation": []}
     for wrapper in wrappers_of(env):
@@ -84,15 +84,15 @@ def transforms_of(env: gymnasium.Env) -> Transforms:
 
 
 def check_transforms(env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Generator) -> None:
-    """Hold what the wrappers transform to their steps: the same whenever it is asked for, in whatever state the
-    environment is, and nothing that they remember changes by it.
+    """Check in a random walk that the transforms of wrappers have no memory and use no chance: the same value is
+    transformed alike in any state, and no attribute of a wrapper changes.
 
     Args:
-        env: an instance that nobody else needs; it is walked in.
-        actions: its actions, as its outermost wrapper takes them; those of a large set are drawn from.
+        env: an instance for this alone; it is stepped.
+        actions: its actions, as its outermost wrapper takes them, from which those of the walk are sampled.
 
     Raises:
-        MissingModel: as `transforms_of` does, or a wrapper is caught having a memory, or drawing.
+        MissingModel: as `transforms_of` does, or a wrapper has a memory, or uses chance.
     """
     transforms, hooked = transforms_of(env), [wrapper for wrapper in wrappers_of(env) if _kind(wrapper)]
     if not hooked:
@@ -104,8 +104,8 @@ def check_transforms(env: gymnasium.Env, actions: Sequence[Any], generator: np.r
         if any(name.startswith(f"{type(wrapper).__name__}.") for name in changed):
             raise refusal(env, wrapper, "which remembers something from step to step")
     # The environment is in another state by now, and the wrappers have been used in between.
-    for (taken, observation, reward), (action, shown, paid) in zip(raw, seen, strict=True):
-        if fingerprint(transforms.observation(observation)) != fingerprint(shown):
+    for (taken, observation, reward), (action, outside, paid) in zip(raw, seen, strict=True):
+        if fingerprint(transforms.observation(observation)) != fingerprint(outside):
             raise refusal(env, _with("observation", hooked), "which makes different things of the same observation")
         if action is None:
             continue
@@ -122,7 +122,7 @@ _Seen = tuple[Any, Any, Any]
 def _walk(
     env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Generator
 ) -> tuple[list[_Seen], list[_Seen]]:
-    """A random walk, as the environment inside its wrappers sees it, and as one outside does."""
+    """A random walk, as recorded inside the wrappers and outside of them."""
     base, until = cast(Any, env.unwrapped), time.monotonic() + _SECONDS
     raw, seen, inside = list[_Seen](), list[_Seen](), False
 
@@ -147,11 +147,11 @@ def _walk(
         over = True
         for _ in range(_TRIED_STEPS):
             if over:
-                shown, _ = env.reset(seed=int(generator.integers(2**31)))
-                seen.append(copy.deepcopy((None, shown, None)))
+                observation, _ = env.reset(seed=int(generator.integers(2**31)))
+                seen.append(copy.deepcopy((None, observation, None)))
             action = actions[int(generator.integers(len(actions)))]
-            shown, paid, terminated, truncated, _ = env.step(action)
-            seen.append(copy.deepcopy((action, shown, paid)))
+            observation, paid, terminated, truncated, _ = env.step(action)
+            seen.append(copy.deepcopy((action, observation, paid)))
             over = terminated or truncated
             if time.monotonic() > until:
                 break
@@ -162,7 +162,7 @@ def _walk(
 
 
 def _kind(wrapper: gymnasium.Wrapper) -> str | None:
-    """What a wrapper transforms, by the name of the method that does; empty: nothing; None: nobody knows."""
+    """The name of the method that makes the transform of a wrapper; empty: it changes nothing; None: unknown."""
     own, cls = vars(wrapper).keys() & {"step", "reset"}, type(wrapper)
     if own or cls in _HARMLESS:
         return None if own else ""

@@ -55,7 +55,7 @@ def test_a_usable_environment_is_told_in_a_table_with_exit_code_0(capsys):
     assert [line.split()[:2] for line in lines if line.split()[1:2] == ["yes"]] == [
         [name, "yes"] for name in ("answers", "restore", "merge", "chance", "untouched", "table")
     ]
-    assert lines[-1] == "CliffWalking-v1 can serve as a model: its outcomes can be listed"
+    assert lines[-1] == "CliffWalking-v1 can serve as a model: its outcomes can be enumerated"
 
 
 @pytest.mark.parametrize(("kwargs", "states"), [([], 100), (["--kwargs", '{"size": 4, "traps": []}'], 16)])

@@ -63,7 +63,7 @@ def test_a_faithful_simulator_is_usable(env, is_random):
     assert all(check.passed for check in report.checks), report.verdict
     assert report.usable
     assert (report.random_share > 0) == is_random
-    assert report.verdict.endswith("search it by `sampled`" if is_random else "its outcomes can be listed")
+    assert report.verdict.endswith("search it by `sampled`" if is_random else "its outcomes can be enumerated")
     assert report.cost is not None
     assert min(report.cost.restore, report.cost.step, report.cost.snapshot, report.cost.bytes) > 0
     assert report.cost.call == report.cost.restore + report.cost.step + report.cost.snapshot

@@ -462,7 +462,7 @@ REFUSALS = {
     "Corridor has no spec to make another instance from: give a function": lambda: SimulatorModel(
         Corridor(), gamma=1.0
     ),
-    "the actions of Box.* cannot be listed: give some, as grid_actions": lambda: SimulatorModel(
+    "the actions of Box.* cannot be enumerated: give some, as grid_actions": lambda: SimulatorModel(
         "Pendulum-v1", gamma=1.0
     ),
     "Discrete.2. is no bounded Box": lambda: grid_actions(spaces.Discrete(2), 2),
