@@ -82,6 +82,6 @@ def lines(seeds: list[int], *, short: bool, only: list[str]) -> Iterator[str]:
 
 
 def table(seeds: list[int], *, short: bool, only: list[str]) -> None:
-    """Print the table, a line as soon as it is known. Short: two seeds, few steps. Only: see `defaults_tables`."""
+    """Print the table, a line as soon as it is known. Short: few steps. Only: see `defaults_tables`."""
     for line in lines(seeds, short=short, only=only):
         print(line, flush=True)

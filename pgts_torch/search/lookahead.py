@@ -70,7 +70,7 @@ class Lookahead:
         1 - confidence; of a larger p the rest, at most f, lies between l and u. So this part is exact with one level.
         Without a range these bounds are infinite.
 
-        Measured on random MDPs with two outcomes of each action (`benchmarks/coverage.py`, docs/benchmarks.md), 95 %:
+        Measured on random MDPs with two outcomes of each action (`benchmarks/intervals.py`, docs/benchmarks.md), 95 %:
         with one level they hold the truth at least so often for C = 2, 4, 8 and 16. They hold it less often over more
         levels, where maxima over samples make q too high and `bias_BA` sees a part of that, most among tied actions;
         and where few of many outcomes carry most of a value and none of these was drawn while others differ. What the

@@ -1,6 +1,6 @@
 """How often do the intervals of a sampled lookahead hold T^m Q?
 
-    python benchmarks/coverage.py [--quick]
+    python benchmarks/intervals.py [--quick]
 
 Random MDPs of 12 states and 2 actions in which every action has two outcomes, a likely and an unlikely one. Leaf values
 are those of a random policy (values), or 0 and the highest, so that what is drawn is a Bernoulli variable (prizes). The
