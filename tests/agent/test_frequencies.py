@@ -82,8 +82,8 @@ def test_true_probabilities_are_never_called_wrong_and_e_is_as_seldom_large_as_i
             "sequential tests of true probabilities",
             runs=runs,
             stopped=0,
-            evidence_above_20=int(reached),
-            of_at_most=runs // 20,
+            runs_with_evidence_above_20=int(reached),
+            expected_at_most=runs // 20,
         )
 
 
