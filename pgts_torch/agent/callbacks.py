@@ -1,4 +1,4 @@
-"""What `PGTS.learn` can be told to do after its iterations."""
+"""Callbacks of `PGTS.learn`: evaluation during training, early stop, and the best model."""
 
 import math
 from collections.abc import Mapping
@@ -15,30 +15,30 @@ from pgts_torch.errors import PgtsError, check_count
 
 @dataclass(frozen=True)
 class Evaluated:
-    """An evaluation, and the environment steps of training before it."""
+    """An evaluation during training, after `env_steps` environment steps."""
 
     env_steps: int
     evaluation: Evaluation
 
     @property
     def mean(self) -> float:
-        """The mean return of its episodes, undiscounted."""
+        """The mean undiscounted return of its episodes."""
         return self.evaluation.episodic_return.mean
 
 
 @final
 class EvalCallback:
-    """Evaluates the policy now and then, in copies of its own: training goes on as if it had not been there.
+    """Evaluates the policy every so many environment steps, in environments of its own: training is not affected.
 
-    It does so after an iteration that completes another `every` environment steps since the training began.
+    It evaluates after each iteration in which the number of environment steps passes a multiple of `every`.
 
     Args:
-        every: environment steps from one evaluation to the next; an iteration that makes more is followed by one.
+        every: environment steps from one evaluation to the next; after a longer iteration there is one evaluation.
         episodes: of one evaluation.
-        deterministic: take the most probable action, else draw from pi.
-        seed: of the episodes, the same in all evaluations: they differ by the policy alone.
-        best_path: where the model is saved whenever the mean return is higher than ever; None: nowhere.
-        stop_at_return: the training ends once the mean return is at least this; None: it does not.
+        deterministic: take the most probable action; else sample from pi.
+        seed: of the episodes, the same in all evaluations, so that they differ by the policy alone.
+        best_path: where the model is saved whenever the mean return is the highest so far; None: nowhere.
+        stop_at_return: training ends once the mean return is at least this; None: it does not.
 
     Raises:
         PgtsError: an option out of range, or a file at `best_path` that is no saved model.
@@ -70,7 +70,7 @@ class EvalCallback:
         self.best: Evaluated | None = None
 
     def __call__(self, algorithm: PGTS, iteration: Iteration) -> bool:
-        """Whether training may go on."""
+        """Evaluate if it is due. Return whether training goes on."""
         now = algorithm.num_env_steps
         if now // self.every == (now - iteration.experience.num_steps) // self.every:
             return True
@@ -87,24 +87,24 @@ class EvalCallback:
         return evaluate(algorithm, episodes=self.episodes, deterministic=self.deterministic, seed=self.seed)
 
     def forget(self) -> None:
-        """All evaluations so far: the next one is the best."""
+        """Remove all evaluations so far, so that the next one is the best."""
         self.history, self.best = [], None
 
     def state_dict(self) -> dict[str, Any]:
-        """The evaluations so far, as plain values."""
-        return {"history": [asdict(made) for made in self.history]}
+        """Return the evaluations so far, as plain values."""
+        return {"history": [asdict(evaluated) for evaluated in self.history]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over what `state_dict` gave."""
-        for made in state["history"]:
-            check_count("env_steps", made["env_steps"])
-        self.history = [Evaluated(made["env_steps"], _evaluation(**made["evaluation"])) for made in state["history"]]
-        self.best = max(self.history, key=lambda made: made.mean, default=None)
+        """Load what `state_dict` returned."""
+        for saved in state["history"]:
+            check_count("env_steps", saved["env_steps"])
+        self.history = [Evaluated(saved["env_steps"], _evaluation(**saved["evaluation"])) for saved in state["history"]]
+        self.best = max(self.history, key=lambda evaluated: evaluated.mean, default=None)
 
 
-def _evaluation(episodes: int, **scores: Mapping[str, Any]) -> Evaluation:
+def _evaluation(episodes: int, **saved: Mapping[str, Any]) -> Evaluation:
     check_count("episodes", episodes)
-    made = {name: Score(**score) for name, score in scores.items()}
-    if not all(isinstance(score.mean, float) for score in made.values()):
+    scores = {name: Score(**score) for name, score in saved.items()}
+    if not all(isinstance(score.mean, float) for score in scores.values()):
         raise PgtsError("a mean is no number")
-    return Evaluation(episodes, made["episodic_return"], made["discounted_return"], made["episodic_length"])
+    return Evaluation(episodes, scores["episodic_return"], scores["discounted_return"], scores["episodic_length"])

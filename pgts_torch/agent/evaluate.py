@@ -1,4 +1,4 @@
-"""How good a policy is, by episodes that nothing is learned from."""
+"""Evaluate a policy by episodes that are not trained on."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from pgts_torch.models.environments import close_environments
 from pgts_torch.seeding import SharedGenerators, stream
 
 UNLIMITED_LENGTH = 1000
-"""Longest episode where the environment sets no time limit."""
+"""The length at which episodes are cut off where the environment has no time limit."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Score:
 
     @classmethod
     def of(cls, value_B: Float[Tensor, "B"]) -> Self:
-        """Of one value for each episode."""
+        """The score of one value for each episode."""
         count = len(value_B)
         if count == 1:
             return cls(float(value_B), None)
@@ -39,7 +39,10 @@ class Score:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Episodes under the environment's own time limit: sums of rewards, discounted sums, and lengths."""
+    """Scores of episodes under the environment's own time limit.
+
+    episodic_return: sums of rewards.   discounted_return: discounted sums.   episodic_length: in steps.
+    """
 
     episodes: int
     episodic_return: Score
@@ -48,16 +51,16 @@ class Evaluation:
 
 
 def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed: int = 0) -> Evaluation:
-    """Run the policy in fresh copies of its environment.
+    """Run the policy in new environments of its kind, side by side. Training is not affected.
 
     Args:
         episodes: how many, at least 1.
-        deterministic: take the most probable action, else draw from pi.
-        seed: of these episodes alone; training is not touched.
+        deterministic: take the most probable action; else sample from pi.
+        seed: of these episodes alone.
 
     Raises:
-        PgtsError: episodes is below 1; no others of its environments can be made (`EnvSource.make`); or the environment
-            failed, naming step and seeds.
+        PgtsError: episodes is below 1; no more environments of this kind can be made (`EnvSource.make`); or the
+            environment failed, naming step and seeds.
 
     Warns:
         UserWarning: an environment raised an error in `close`.
@@ -92,7 +95,7 @@ class Greedy(Policy):
         self.num_actions = policy.num_actions
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
-        """1 for the most probable action, 0 for the others."""
+        """The one-hot probabilities of the most probable action."""
         best_N = self.policy.probs(observation_N).argmax(-1)
         return torch.nn.functional.one_hot(best_N, self.num_actions).double()
 

@@ -1,4 +1,4 @@
-"""What happens in an environment, held to the model that a lookahead asks about it."""
+"""Checks the steps of an environment against the model that a lookahead queries."""
 
 import math
 import warnings
@@ -19,23 +19,23 @@ from pgts_torch.models.tabular import TabularModel
 from pgts_torch.seeding import numpy_stream
 
 Mode = Literal["error", "warn", "off"]
-"""What comes of a contradiction: it stops the training, it is said and counted, or nobody looks for it."""
+"""What a contradiction does: it stops training; it is a warning and is counted; or steps are not checked."""
 
-_SHARE = 1 / 64
-"""Of the steps that a simulator was not asked about by the lookahead it is asked about so many."""
+_QUERY_PROB = 1 / 64
+"""The probability that a simulator is queried about a step that the lookahead has not queried."""
 
 _FALSE_ALARM = 1e-9
 """The probability that a right table is ever called wrong in a run."""
 
 _KINDS = "steps", "starts"
-"""Whose frequencies are held."""
+"""The probabilities that are tested: of outcomes and of start states."""
 
 ENOUGH = math.log(len(_KINDS) * len(MARGINS) / _FALSE_ALARM)
-"""The log E from which on frequencies are called wrong: all tests of a run share the probability of a false alarm."""
+"""The log E from which on probabilities are called wrong; `_FALSE_ALARM` is split between all tests of a run."""
 
 _WAY_OUT = (
-    "One of the two is wrong, and a lookahead would be: mend it, give another model, or train without one (depth 0 and "
-    "the estimator 'sampled'); with model_check 'warn' (search.model_check) training goes on"
+    "One of the two is wrong, and so would be a lookahead: correct it, give another model, or train without one (depth "
+    "0 and the estimator 'sampled'); with model_check 'warn' (search.model_check) training goes on"
 )
 
 
@@ -44,24 +44,25 @@ _COLUMNS = "state_TB", "action_TB", "reward_TB", "discount_TB", "next_state_TB"
 
 @final
 class ModelCheck:
-    """Holds each step of the environment to its model, and their frequencies to the probabilities that it lists.
+    """Checks each step of the environment against its model, and how often outcomes happen against its probabilities.
 
-    Only models that claim to be the environment are held (`Model.exact`). Steps must be among the outcomes of positive
-    probability and episodes must begin in possible states (`ExactModel.hold`): tables and dynamics are held to all
-    steps, simulators to those that the lookahead has asked about already and to one in 64 of the others, drawn from a
-    stream of their own. What a simulator only draws cannot be held, which is said once. Frequencies are held to tables
-    (`Frequencies`); an event whose probability is off by more than 2 % is a contradiction, a smaller difference is
-    said. All of this is false of a right model with a probability below 1e-9 in a run of any length.
+    Only models that claim to be the environment are checked (`Model.exact`). Each step must be an outcome of positive
+    probability and each episode must begin in a possible state (`ExactModel.outcome_of`). Tables and dynamics are checked by
+    all steps, simulators by those that the lookahead has queried already and by one in 64 of the others, sampled from a
+    stream of its own. Where a simulator only samples outcomes its steps cannot be checked, which is a warning, once.
+    The probabilities of tables are tested (`Frequencies`): an event whose probability is wrong by more than 0.02 is a
+    contradiction, a smaller difference a warning. The probability of calling a right model wrong is below 1e-9, in a
+    run of any length.
 
     contradictions: how many there have been.
-    model_calls: how often the model was asked for the check alone; the lookahead's calls do not include them.
+    model_calls: the queries made for this check alone; the calls of the lookahead do not include them.
 
     Args:
-        world: whose model is held.
+        world: the environments and their model.
         mode: "error", "warn" or "off".
-        is_asked: whether a lookahead asks the model; else nothing is held.
-        seed: of the drawn steps.
-        ranks: that train together; they stop together.
+        is_asked: whether a lookahead queries the model; else nothing is checked.
+        seed: for the sample of steps.
+        ranks: the processes that train together; a contradiction stops all of them.
     """
 
     def __init__(self, world: World, *, mode: Mode, is_asked: bool, seed: int, ranks: Ranks) -> None:
@@ -82,60 +83,60 @@ class ModelCheck:
                 self._frequencies["starts"] = Frequencies(world.mdp.start_S.unsqueeze(0))
 
     @property
-    def is_held(self) -> bool:
-        """Whether there is a model that claims to be the environment, and it is looked at."""
+    def is_active(self) -> bool:
+        """Whether steps are checked: the model claims to be the environment, is queried, and `mode` is not "off"."""
         return self._model is not None
 
     def __call__(self, experience: Rollout, iteration: int) -> None:
-        """Hold the episodes of an iteration to the model.
+        """Check the episodes of an iteration against the model.
 
         Args:
             experience: of all ranks, after the lookahead from its states.
-            iteration: names the stream that drawn steps come from.
+            iteration: its number, which names the stream for the sample of steps.
 
         Raises:
             ModelMismatch: the environment contradicts its model, with the mode "error". In all ranks.
         """
         if self._model is None:
             return
-        told = self._ranks.gather("what the model denies", lambda: self._hold(experience, iteration))
-        # What is cheap is held by every rank to all steps, the rest to those of its part.
-        for each in told[:1] if self._model.is_cheap else told:
+        results = self._ranks.gather("model check", lambda: self._check_steps(experience, iteration))
+        # Cheap models are checked by every rank against all steps, with the same result; others in parts.
+        for each in results[:1] if self._model.is_cheap else results:
             self.model_calls += each.calls
-            if each.drawn:
-                self._say("drawn", self._only_drawn())
-            if each.denied:
-                self._contradicted("steps", each.story, each.denied)
+            if each.samples_only:
+                self._warn("drawn", self._samples_only())
+            if each.contradictions:
+                self._contradicted("steps", each.text, each.contradictions)
         if isinstance(self._model, TabularModel):
-            self._hold_starts(experience.state_TB[0].cpu().numpy())
-            self._hold_frequencies()
+            self._check_starts(experience.state_TB[0].cpu().numpy())
+            self._check_frequencies()
 
-    def _hold(self, experience: Rollout, iteration: int) -> "_Told":
-        """What comes of this rank's part of the steps; those of tables are handed to the test of their frequencies."""
+    def _check_steps(self, experience: Rollout, iteration: int) -> "_Result":
+        """Check this rank's part of the steps; outcomes of tables are added to the test of their probabilities."""
         model, query_N = self._model, None
         assert model is not None
-        # Tables and dynamics cut no episode off, so whether one went on says nothing about them.
+        # Tables and dynamics have no time limit, so whether an episode went on cannot contradict them.
         happened = _steps(experience, follows="alive_TB" if model.is_cheap else "follows_TB")
         if not model.is_cheap:
             if self._ranks.size > 1:
                 mine = self._ranks.part(torch.from_numpy(np.unique(happened.state_N))).numpy()
                 happened = happened.part(np.isin(happened.state_N, mine))
             random = numpy_stream(self._seed, "iteration", iteration, "model check", *self._ranks.names)
-            query_N = random.random(len(happened.state_N)) < _SHARE
+            query_N = random.random(len(happened.state_N)) < _QUERY_PROB
         steps_before = model.simulator_steps
-        held_N = model.outcome_of(happened, query_N=query_N)
-        calls, agrees = model.simulator_steps - steps_before, not len(held_N) or held_N.min() >= 0
+        outcome_N = model.outcome_of(happened, query_N=query_N)
+        calls, agrees = model.simulator_steps - steps_before, not len(outcome_N) or outcome_N.min() >= 0
         if isinstance(model, TabularModel) and self._frequencies["steps"].has_chance:
-            known = slice(None) if agrees else held_N >= 0
-            self._frequencies["steps"].observe(model.rows(happened)[known], held_N[known])
+            known = slice(None) if agrees else outcome_N >= 0
+            self._frequencies["steps"].observe(model.rows(happened)[known], outcome_N[known])
         if agrees:
-            return _Told(calls)
-        denied = np.flatnonzero(held_N == CONTRADICTED)
-        story = self._denied(happened.part(denied[:1])) if len(denied) else ""
-        return _Told(calls, len(denied), story, bool((held_N == RANDOM).any()))
+            return _Result(calls)
+        wrong = np.flatnonzero(outcome_N == CONTRADICTED)
+        text = self._contradiction(happened.part(wrong[:1])) if len(wrong) else ""
+        return _Result(calls, len(wrong), text, bool((outcome_N == RANDOM).any()))
 
-    def _denied(self, one: Happened) -> str:
-        """A step that the model denies, and what it says."""
+    def _contradiction(self, one: Happened) -> str:
+        """The message about a step that is none of the model's outcomes."""
         model = self._model
         assert model is not None
         state, action, reward, discount, next_state, follows = (column.item() for column in vars(one).values())
@@ -146,14 +147,14 @@ class ModelCheck:
             f"gave {happened}; the {model.kind} says {model.outcomes_text(state, action)}. {_WAY_OUT}"
         )
 
-    def _only_drawn(self) -> str:
+    def _samples_only(self) -> str:
         return (
-            f"{self._name} decides some steps by chance, and its {self._kind} lists no outcomes of them: whether these "
-            "steps can be, and how often, is not checked"
+            f"{self._name} has random steps whose outcomes its {self._kind} does not enumerate: whether these steps "
+            "are possible, and with which probability, is not checked"
         )
 
-    def _hold_starts(self, start_B: np.ndarray) -> None:
-        """Whether episodes begin where the table says they can."""
+    def _check_starts(self, start_B: np.ndarray) -> None:
+        """Check that episodes begin in states of positive start probability."""
         possible_B = self._is_start_S[start_B]
         if (known := self._frequencies.get("starts")) is not None and known.has_chance:
             known.observe(np.zeros_like(start_B)[possible_B], start_B[possible_B])
@@ -164,23 +165,23 @@ class ModelCheck:
             rule = f"the start distribution of its {self._kind} has {self._is_start_S.sum()} states without it"
             self._contradicted("starts", f"{self._name} contradicts its {self._kind}: {began}; {rule}. {_WAY_OUT}", 1)
         else:
-            self._say(
+            self._warn(
                 "starts",
-                f"{self._name}: {began}, in which none of the resets began that the start distribution was counted "
-                "from: what is said of J speaks of other starts",
+                f"{self._name}: {began}, which was not among the resets that the start distribution was estimated "
+                "from: values of J are for other start states",
             )
 
-    def _hold_frequencies(self) -> None:
-        """Whether outcomes and starts are as frequent as the table says. The same in all ranks."""
+    def _check_frequencies(self) -> None:
+        """Check the evidence against the probabilities of outcomes and starts. The same in all ranks."""
         for what, frequencies in self._frequencies.items():
-            kind, (surely, perhaps) = f"frequencies of {what}", frequencies.log_evidence
-            if surely >= ENOUGH and kind not in self._said:
+            kind, (beyond_margin, any_error) = f"frequencies of {what}", frequencies.log_evidence
+            if beyond_margin >= ENOUGH and kind not in self._said:
                 self._contradicted(kind, f"{self._unlikely(what)}. {_WAY_OUT}", 1)
-            elif perhaps >= ENOUGH and surely < 0:  # bets on more than the margin have lost
-                self._say(kind, f"{self._unlikely(what)}; probabilities are off, but not by 2 %, as far as is known")
+            elif any_error >= ENOUGH and beyond_margin < 0:  # bets on an error beyond the margin have lost
+                self._warn(kind, f"{self._unlikely(what)}; the probabilities are wrong, but by less than 0.02 so far")
 
     def _unlikely(self, what: str) -> str:
-        """What is more or less frequent than listed, in the row with most evidence of its own."""
+        """The message about the outcome whose frequency contradicts its probability most."""
         model = self._model
         assert isinstance(model, TabularModel)
         worst = self._frequencies[what].worst()
@@ -195,18 +196,19 @@ class ModelCheck:
             f"{worst.seen} cases ({worst.happened / worst.seen:.4g}); the {self._kind} says {worst.listed:.4g}"
         )
 
-    def _contradicted(self, kind: str, story: str, count: int) -> None:
+    def _contradicted(self, kind: str, text: str, count: int) -> None:
+        """Count contradictions, and raise or warn as `mode` says."""
         self.contradictions += count
         if self.mode == "error":
-            raise ModelMismatch(story)
-        self._say(kind, story)
+            raise ModelMismatch(text)
+        self._warn(kind, text)
 
-    def _say(self, kind: str, story: str) -> None:
-        """A warning, once for each kind, from the rank that speaks for all."""
+    def _warn(self, kind: str, text: str) -> None:
+        """Warn once for each kind, in rank 0 only."""
         if kind not in self._said:
             self._said.append(kind)
             if self._ranks.leads:
-                warnings.warn(story, stacklevel=4)
+                warnings.warn(text, stacklevel=4)
 
     @property
     def _name(self) -> str:
@@ -218,7 +220,7 @@ class ModelCheck:
         return self._model.kind
 
     def state_dict(self) -> dict[str, Any]:
-        """What a later check goes on from: tensors on the CPU and plain values."""
+        """Return the counters, the warnings given and the evidence: tensors on the CPU and plain values."""
         frequencies = {what: each.state_dict() for what, each in self._frequencies.items()}
         return {
             "contradictions": self.contradictions,
@@ -228,7 +230,7 @@ class ModelCheck:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave; what the saved check did not count begins anew."""
+        """Load what `state_dict` returned; frequencies that the saved check did not count begin empty."""
         self.contradictions, self.model_calls = state["contradictions"], state["model_calls"]
         self._said = list(state["said"])
         for what, each in self._frequencies.items():
@@ -237,18 +239,22 @@ class ModelCheck:
 
 
 @dataclass(frozen=True)
-class _Told:
-    """Of the steps that a rank held to the model: how many calls it took, how many are denied, the first of them, and
-    whether some are only drawn."""
+class _Result:
+    """The result of checking the steps of a rank.
+
+    calls: of the simulator.
+    contradictions: the number of steps that are no outcome of the model.   text: the message about the first of them.
+    samples_only: whether there are steps whose outcomes the model only samples.
+    """
 
     calls: int
-    denied: int = 0
-    story: str = ""
-    drawn: bool = False
+    contradictions: int = 0
+    text: str = ""
+    samples_only: bool = False
 
 
 def _steps(experience: Rollout, *, follows: str) -> Happened:
-    """The steps that were made, without padding; `follows` names the column that says whether the episode went on."""
+    """The steps of all episodes, without padding; `follows` names the column that says whether the episode went on."""
     alive_V = experience.alive_TB.cpu().numpy().reshape(-1)
     columns = [getattr(experience, name).cpu().numpy().reshape(-1) for name in (*_COLUMNS, follows)]
     at = np.flatnonzero(alive_V)

@@ -24,7 +24,7 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
         "search/depth": float(iteration.depth),
         "search/model_calls": float(algorithm.num_model_calls),
     }
-    if algorithm.model_check.is_held:
+    if algorithm.model_check.is_active:
         tags["model/contradictions"] = float(algorithm.model_check.contradictions)
     if iteration.look is not None:
         tags |= {

@@ -187,7 +187,7 @@ def test_the_tables_and_dynamics_that_come_along_agree_with_their_environments(e
     policy = "mlp" if env == "MountainCar-v0" else None
     model = PGTS(env, depth=1, policy=policy, **{**SMALL, "num_envs": 16})
     model.learn(500)
-    assert model.model_check.is_held
+    assert model.model_check.is_active
     assert model.model_check.contradictions == 0
 
 
@@ -300,7 +300,7 @@ def test_with_sampled_advantages_nothing_is_held():
     for env in real(model):
         env.lie = pays_after(0, 0.25)
     model.learn(100)
-    assert not model.model_check.is_held
+    assert not model.model_check.is_active
 
 
 @pytest.mark.parametrize("env", ["FrozenLake-v1", "CartPole-v1", Restored])
@@ -336,7 +336,7 @@ def test_repeated_actions_are_held_by_single_steps():
 
 def test_what_a_simulator_only_draws_cannot_be_held_which_is_said_once():
     model = PGTS(lambda: Restored(slip=0.3), depth=1, policy="mlp", **{**SMALL, "num_envs": 32})
-    with pytest.warns(UserWarning, match="lists no outcomes of them.*is not checked") as said:
+    with pytest.warns(UserWarning, match="outcomes its simulator does not enumerate.*is not checked") as said:
         model.learn(400)
     assert len(said) == 1
     assert model.model_check.contradictions == 0

@@ -56,9 +56,9 @@ def test_what_needs_a_bound_is_refused_where_there_is_none(wanted):
         walking(**wanted)
     with pytest.raises(PgtsError, match="gamma is 1, with which rewards may add up without limit"):
         walking(**wanted, reward_range=(0, 1), gamma=1.0)
-    with pytest.raises(PgtsError, match="action_repeat is 2, and repeated actions bound nothing"):
+    with pytest.raises(PgtsError, match="action_repeat is 2, and values of repeated actions have no bound"):
         walking(**wanted, action_repeat=2)
-    with pytest.raises(PgtsError, match="where outcomes are drawn nothing bounds"):
+    with pytest.raises(PgtsError, match="search that samples outcomes gives no upper bound"):
         PGTS("pgts/Ladder-v0", **wanted, search="sampled")
     walking(**wanted, reward_range=(0, 1))
     walking(**wanted, reward_range=(-1, 0), gamma=1.0, prize=0.0, toll=1.0)
