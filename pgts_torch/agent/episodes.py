@@ -1,4 +1,4 @@
-"""One episode of each copy of an environment."""
+"""One episode in each of several environments, step by step."""
 
 from typing import Any, final
 
@@ -20,38 +20,38 @@ from pgts_torch.models.steps import (
 
 @final
 class Episodes:
-    """Copies of an environment, from a fresh reset on.
+    """One episode in each environment, from a reset on.
 
-    A copy whose episode is over rests where copies can be stepped one by one; else it starts again, and what it does
-    then is of no interest.
+    An environment whose episode is over is not stepped any more where environments can be stepped one by one (a plain
+    `SyncVectorEnv`); else it is reset, and its further steps are ignored.
 
-    observation: what the copies show.
+    observation: the latest observation of each environment.
 
     Args:
-        env: copies in `AutoresetMode.DISABLED`.
-        gamma: discount of a step that ends no episode; where an environment has `metadata["discounts"] = True`, only of
-            one that names none in `info["discount"]`.
-        seeds: of each copy.
+        env: environments in `AutoresetMode.DISABLED`.
+        gamma: discount of a step that does not end the episode. An environment with `metadata["discounts"] = True` may
+            name another one in `info["discount"]`.
+        seeds: one for the reset of each environment.
     """
 
     def __init__(self, env: VectorEnv, *, gamma: float, seeds: list[int]) -> None:
         self._env, self._gamma, self._seeds = env, gamma, seeds
         self._one_by_one = isinstance(env, SyncVectorEnv) and type(env).step is SyncVectorEnv.step
-        self._named_B = [names_discounts(one) for one in (env.envs if isinstance(env, SyncVectorEnv) else [env])]
+        self._names_discounts = [names_discounts(e) for e in (env.envs if isinstance(env, SyncVectorEnv) else [env])]
         self._over_B = np.zeros(env.num_envs, dtype=bool)
         self._reward_B = np.zeros(env.num_envs)
-        self._stepping: int | None = None
+        self._stepping: int | None = None  # the index of the environment whose step is running
         self.observation: Any = env.reset(seed=seeds)[0]  # type: ignore[arg-type]  # or one seed for all
         self._each = list(iterate(env.observation_space, self.observation)) if self._one_by_one else []
 
     def step(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rewards, discounts and whether an episode was truncated; they mean nothing where it was over before.
+        """Take one step. Return rewards, discounts and truncations; they have no meaning outside `alive_B`.
 
         Args:
-            alive_B: the episodes that go on.
+            alive_B: the episodes that are not over.
 
         Raises:
-            NotFinite: a reward or a discount is not, or a reward is too large to be learned from.
+            NotFinite: a reward or a discount is not finite, or a reward is too large to be learned from.
             PgtsError: a reward is not one number, or a discount is not in [0, 1].
         """
         step = self._step_alive if self._one_by_one else self._step_all
@@ -64,31 +64,33 @@ class Episodes:
             self._env.reset(options={"reset_mask": self._over_B})
         self.observation, rewards, terminated_B, truncated_B, info = self._env.step(action_B)
         self._over_B = terminated_B | truncated_B
-        # Which copies have named a discount.
-        named_B = info.get("_discount", "discount" in info) if all(self._named_B) else False
+        # info["_discount"] is True where an environment has named a discount in this step.
+        named_B = info.get("_discount", "discount" in info) if all(self._names_discounts) else False
         discount_B = np.where(terminated_B, 0.0, np.where(named_B, info.get("discount", 0.0), self._gamma))
         check_discounts(discount_B)
         return rewards_of(rewards, self._env.num_envs), discount_B, truncated_B
 
     def _step_alive(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert isinstance(self._env, SyncVectorEnv)
-        copies, space = self._env.envs, self._env.single_observation_space
-        reward_B, discount_B = np.zeros((2, len(copies)))
+        envs, space = self._env.envs, self._env.single_observation_space
+        reward_B, discount_B = np.zeros((2, len(envs)))
         self._reward_B = reward_B
-        truncated_B = np.zeros(len(copies), dtype=bool)
+        truncated_B = np.zeros(len(envs), dtype=bool)
         for b in alive_B.nonzero()[0]:
             self._stepping = int(b)
-            self._each[b], reward, terminated, truncated_B[b], info = copies[b].step(action_B[b])
+            self._each[b], reward, terminated, truncated_B[b], info = envs[b].step(action_B[b])
             reward_B[b] = number_of("reward", reward)
-            discount_B[b] = 0.0 if terminated else discount_of(info, self._gamma, named=self._named_B[b])
+            discount_B[b] = 0.0 if terminated else discount_of(info, self._gamma, named=self._names_discounts[b])
         self._stepping = None
-        rows: Any = create_empty_array(space, n=len(copies))
+        rows: Any = create_empty_array(space, n=len(envs))
         self.observation = concatenate(space, self._each, rows)
         return reward_B, discount_B, truncated_B
 
     def blame(self, error: BaseException) -> tuple[list[int], BaseException]:
-        """The seeds of the copies that an error may come from; and the error, or what is wrong with the one copy that
-        it comes from."""
+        """Return the seeds of the environments that may have caused an error, and the error.
+
+        Where a single environment has returned something invalid, these are its seed and the error that says so.
+        """
         if self._stepping is not None:
             return [self._seeds[self._stepping]], error
         space = self._env.single_observation_space

@@ -47,9 +47,10 @@ class ModelCheck:
     """Checks each step of the environment against its model, and how often outcomes happen against its probabilities.
 
     Only models that claim to be the environment are checked (`Model.exact`). Each step must be an outcome of positive
-    probability and each episode must begin in a possible state (`ExactModel.outcome_of`). Tables and dynamics are checked by
-    all steps, simulators by those that the lookahead has queried already and by one in 64 of the others, sampled from a
-    stream of its own. Where a simulator only samples outcomes its steps cannot be checked, which is a warning, once.
+    probability (`ExactModel.outcome_of`) and each episode must begin in a possible state. Tables and dynamics are
+    checked by all steps, simulators by those that the lookahead has queried already and by one in 64 of the others,
+    sampled from a stream of its own. Where a simulator only samples outcomes its steps cannot be checked, which is a
+    warning.
     The probabilities of tables are tested (`Frequencies`): an event whose probability is wrong by more than 0.02 is a
     contradiction, a smaller difference a warning. The probability of calling a right model wrong is below 1e-9, in a
     run of any length.

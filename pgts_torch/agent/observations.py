@@ -1,4 +1,4 @@
-"""What a policy sees of an environment, as tensors."""
+"""Observations of an environment as tensors, the inputs of policies and critics."""
 
 from typing import Any, final
 
@@ -15,11 +15,11 @@ from pgts_torch.models.snapshots import env_name
 
 @final
 class Observations:
-    """What a policy sees of an environment whose observations are numbers, vectors or images.
+    """Makes tensors of the observations of an environment: numbers, vectors or images.
 
     Args:
-        env: copies of it.
-        key: which part of dictionary observations is meant.
+        env: the environments.
+        key: the entry of dictionary observations that is used.
 
     Raises:
         PgtsError: dictionary observations without a key, a key that they do not have, or another kind of space.
@@ -30,18 +30,18 @@ class Observations:
         if isinstance(space, spaces.Dict):
             known = ", ".join(map(str, space.keys()))
             if key is None:
-                raise PgtsError(f"{what} are dictionaries of {known}: set observation_key, which part a policy sees")
+                raise PgtsError(f"{what} are dictionaries of {known}: set observation_key to the one to learn from")
             if key not in space.spaces:
                 raise PgtsError(f"{what} have no part {key!r}; they have {known}")
             space = space[key]
         elif key is not None:
             raise PgtsError(f"{what} are {space}; they have no part {key!r}")
         if not isinstance(space, spaces.Discrete | spaces.Box):
-            raise PgtsError(f"{what} are {space}; a policy sees numbers, vectors or images")
+            raise PgtsError(f"{what} are {space}; a policy takes numbers, vectors or images")
         self.space, self.key, self.device = space, key, device
 
     def part(self, observation: Any) -> Any:
-        """The part of an observation that is meant."""
+        """The entry of a dictionary observation that is used; other observations are returned as they are."""
         return observation if self.key is None else observation[self.key]
 
     def encode(self, observation: Any) -> Tensor:
@@ -49,7 +49,7 @@ class Observations:
         return self.encode_part(self.part(observation))
 
     def encode_part(self, part: Any) -> Tensor:
-        """The same, of the part that is meant."""
+        """As `encode`, from the result of `part`."""
         if isinstance(self.space, spaces.Discrete):
             return states_of(part, int(self.space.n)).to(self.device)
         try:
@@ -65,7 +65,7 @@ class Observations:
 
 
 def states_of(observation: Any, num_states: int) -> Int[Tensor, "..."]:
-    """Observations that are numbers below `num_states`."""
+    """Observations of a discrete space as int64 states; PgtsError unless they are integers below `num_states`."""
     state = np.asarray(observation)
     if not np.issubdtype(state.dtype, np.integer):
         raise PgtsError(f"observation is of {state.dtype}; states are integers")

@@ -20,10 +20,10 @@ T = TypeVar("T")
 @final
 @dataclass(frozen=True)
 class Ranks:
-    """All processes of a training, seen from the one with the number `rank`, counted from 0.
+    """The `size` processes that train one policy together, as seen from process number `rank`, counted from 0.
 
-    Each makes its part of the episodes and of the lookahead, and learns from the whole. So all hold the same policy,
-    bit for bit, and the update is that of one process that has made all of it.
+    Each collects its part of the episodes and computes its part of the lookahead, and all learn from the whole batch.
+    So all have the same policy, bit for bit, and the update is that of a single process with the same batch.
     """
 
     rank: int = 0
@@ -31,94 +31,98 @@ class Ranks:
 
     @property
     def leads(self) -> bool:
-        """Whether this process writes, and speaks for all."""
+        """Whether this is the process that writes files and prints messages."""
         return self.rank == 0
 
     @property
     def names(self) -> tuple[str | int, ...]:
-        """What the names of its own streams end in; nothing where it is alone."""
+        """The suffix of the names of this process's own random streams; empty for a single process."""
         return () if self.size == 1 else ("rank", self.rank)
 
     def count(self, total: int) -> int:
-        """How many of `total` things are its part."""
+        """The size of this process's part of `total` items."""
         return total // self.size + (self.rank < total % self.size)
 
     def part(self, x_N: Tensor) -> Tensor:
-        """Its part of rows that all have: neighbours, because their searches meet. It may be empty."""
+        """This process's part of rows that all processes have; it may be empty.
+
+        Parts are contiguous, because the searches from neighbouring states share nodes.
+        """
         return x_N.tensor_split(self.size)[self.rank]
 
     def draws(self, seed: int, number: int, device: torch.device) -> "Draws":
-        """What iteration `number` draws from."""
+        """The random generators of iteration `number`."""
         names = ("iteration", number)
         own = stream(seed, *names, *self.names, device=device)
         common = own if self.size == 1 else stream(seed, *names, "common", device=device)
         return Draws(seed, number, (*names, *self.names), own, common)
 
     def gather(self, what: str, make: Callable[[], T]) -> list[T]:
-        """What `make` gives in each process, in the order of ranks. All processes must ask for the same.
+        """Return the results of `make` in all processes, in the order of ranks. All processes must call it alike.
 
         Args:
-            what: names it, so that processes that ask for different things are noticed.
-            make: gives something that pickles, its tensors on the CPU.
+            what: the name of this exchange; processes that are at different exchanges get an error.
+            make: returns something that pickles, its tensors on the CPU.
 
         Raises:
-            PgtsError: from `make`, in whichever process: the same one in all, with the `rank` where it happened; or
-                the processes ask for different things.
+            PgtsError: `make` has raised it in some process; all raise the same error, whose `rank` is that of the
+                process where it happened. Or the processes are at different exchanges.
             RankLost: a process is gone.
         """
         if self.size == 1:
             return [make()]
-        answer, mine = None, None
+        result, own_error = None, None
         try:
-            answer = make()
+            result = make()
         except PgtsError as error:
-            mine = error
-        sent = pickle.dumps((what, answer, mine))
-        told: list[Any] = [None] * self.size
+            own_error = error
+        sent = pickle.dumps((what, result, own_error))
+        received: list[Any] = [None] * self.size
         try:
-            distributed.all_gather_object(told, sent)
+            distributed.all_gather_object(received, sent)
         except RuntimeError as error:
             raise RankLost(f"rank {self.rank} of {self.size} has lost another one, asking for {what}") from error
-        answers = []
-        for rank, (other, answer, mistake) in enumerate(map(pickle.loads, told)):
+        results = []
+        for rank, (other, result, failed) in enumerate(map(pickle.loads, received)):
             if other != what:
-                raise PgtsError(f"rank {self.rank} asks for {what}, rank {rank} for {other}: they have parted ways")
-            if mistake is not None:
-                mistake = mine if rank == self.rank and mine is not None else mistake
-                mistake.rank = rank
-                raise mistake
-            answers.append(answer)
-        return answers
+                raise PgtsError(f"rank {self.rank} asks for {what}, rank {rank} for {other}: they are out of step")
+            if failed is not None:
+                # its own error object has the traceback, which the pickled one lacks
+                failed = own_error if rank == self.rank and own_error is not None else failed
+                failed.rank = rank
+                raise failed
+            results.append(result)
+        return results
 
     def total(self, count: int, policy: Mapping[str, Any]) -> int:
-        """The sum of what all ranks have counted; PgtsError if they hold different policies."""
+        """The sum of `count` over all ranks; PgtsError if their policies differ."""
         if self.size == 1:
             return count
-        told = self.gather("policies", lambda: (count, checksum(policy)))
-        if len({each for _, each in told}) > 1:
-            raise PgtsError("the ranks hold different policies: do they run on different hardware or versions?")
-        return sum(each for each, _ in told)
+        received = self.gather("policies", lambda: (count, checksum(policy)))
+        if len({policy_sum for _, policy_sum in received}) > 1:
+            raise PgtsError("the ranks have different policies: do they run on different hardware or versions?")
+        return sum(each for each, _ in received)
 
     def together(self, what: str, make: Callable[[], T]) -> T:
-        """What `make` gives in this process, if it fails in none; otherwise as `gather`. It need not pickle."""
+        """Return the result of `make` in this process, if it fails in none. It need not pickle. Raises as `gather`."""
         made: list[T] = []
         self.gather(what, lambda: made.append(make()))
         return made[0]
 
     def first(self, what: str, make: Callable[[], T]) -> T:
-        """What `make` gives in rank 0, which alone calls it; otherwise as `gather`."""
-        answers: list[Any] = self.gather(what, lambda: make() if self.leads else None)
-        return answers[0]
+        """Return the result of `make` in rank 0; no other rank calls it. Raises as `gather`."""
+        results: list[Any] = self.gather(what, lambda: make() if self.leads else None)
+        return results[0]
 
 
 @final
 @dataclass(frozen=True)
 class Draws:
-    """What an iteration draws from: generators of streams that are named by (seed, "iteration", number).
+    """The random generators of an iteration, from streams named by (seed, "iteration", number).
 
-    names: the streams of this process for its part of the work begin so.
-    own: for its part of the work.
-    common: for what all processes do alike; of one alone it is `own`.
+    names: the prefix of the names of this process's own streams.
+    own: for its part of the episodes and of the lookahead.
+    common: for what all processes do alike; the same object as `own` in a single process.
     """
 
     seed: int
@@ -128,12 +132,12 @@ class Draws:
     common: torch.Generator
 
     def search(self) -> torch.Generator:
-        """For a search, the same for all of an iteration."""
+        """A new generator for a search; all searches of an iteration get the same random numbers."""
         return stream(self.seed, "iteration", self.number, "search", device=self.own.device)
 
 
 def present_ranks() -> Ranks:
-    """Those of the default process group of torch.distributed; one alone where there is none."""
+    """The ranks of the default process group of torch.distributed; a single process where there is none."""
     if not (distributed.is_available() and distributed.is_initialized()):
         return Ranks()
     return Ranks(distributed.get_rank(), distributed.get_world_size())
@@ -141,16 +145,16 @@ def present_ranks() -> Ranks:
 
 @contextmanager
 def joined_ranks(device: str) -> Iterator[Ranks]:
-    """The processes that torchrun has started, as the default process group while the context lasts; one alone where
-    it has started none.
+    """Join the processes that torchrun has started in the default process group while the context lasts.
 
-    What they exchange, episodes and values, lies in host memory: the backend is gloo on every device.
+    Without torchrun it is a single process. The backend is gloo on every device, because what is exchanged, episodes
+    and values, is in host memory.
 
     Args:
         device: where they compute; "cuda" is the GPU of the local rank.
 
     Raises:
-        PgtsError: a machine has fewer GPUs than processes that want one each.
+        PgtsError: a machine has fewer GPUs than processes, and "cuda" is asked for.
     """
     if not (distributed.is_available() and distributed.is_torchelastic_launched()):
         yield Ranks()
@@ -158,7 +162,7 @@ def joined_ranks(device: str) -> Iterator[Ranks]:
     distributed.init_process_group("gloo")
     try:
         ranks = present_ranks()
-        # They meet here: who leaves while another one still connects breaks that connection.
+        # Wait for all: a process that leaves while another one still connects breaks that connection.
         ranks.gather("a device", _take_gpu if device == "cuda" else lambda: None)
         yield ranks
     finally:
@@ -173,7 +177,7 @@ def _take_gpu() -> None:
 
 
 def checksum(state: Any, start: int = 0) -> int:
-    """Of all tensors in nested mappings. It tells states apart, but protects nobody from malice."""
+    """CRC32 of all tensors in nested mappings. It detects differences, not deliberate changes."""
     if isinstance(state, Tensor):
         return zlib.crc32(state.detach().cpu().contiguous().numpy().tobytes(), start)
     if isinstance(state, Mapping):

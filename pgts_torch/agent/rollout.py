@@ -1,4 +1,4 @@
-"""Experience: what a policy does in an environment, or in a model of it."""
+"""Rollouts: episodes of a policy in an environment, or in a model of it."""
 
 import warnings
 from collections.abc import Callable
@@ -26,7 +26,8 @@ StateWeight = Literal["occupancy", "visits", "uniform"]
 @final
 @dataclass(frozen=True)
 class FixedHorizon:
-    """Every episode runs for `length` steps or until it terminates; a visit counts by its discounts so far."""
+    """Every episode runs for `length` steps or until it terminates; a visit has the product of the discounts before it
+    as its weight."""
 
     length: int = 100
 
@@ -36,24 +37,24 @@ class FixedHorizon:
 
     @property
     def limit(self) -> int:
-        """The most steps of an episode."""
+        """The largest number of steps of an episode."""
         return self.length
 
     def survival(self, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
-        """What one unit of weight is worth after a step of this discount: the discount."""
+        """The factor of the weight after a step of this discount: the discount."""
         return discount_B.double()
 
     def check_end(self, num_alive: int) -> None:
-        """Episodes may be alive at the limit."""
+        """Do nothing: episodes may be alive at the limit."""
 
 
 @final
 @dataclass(frozen=True)
 class GeometricHorizon:
-    """After each step an episode goes on with probability gamma; every visit counts fully.
+    """After each step an episode goes on with the probability gamma; every visit has weight 1.
 
-    So visits are an unbiased sample of d^pi, and undiscounted sums of rewards one of v^pi. `max_length` is a guard
-    against processes that never end (gamma = 1): reaching it is an error.
+    So visits are an unbiased sample of d^pi, and undiscounted sums of rewards are unbiased estimates of v^pi. Reaching
+    `max_length` is an error: it guards against episodes that never end (gamma = 1).
     """
 
     max_length: int = 100_000
@@ -64,11 +65,11 @@ class GeometricHorizon:
 
     @property
     def limit(self) -> int:
-        """The most steps of an episode."""
+        """The largest number of steps of an episode."""
         return self.max_length
 
     def survival(self, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
-        """What one unit of weight is worth after a step of this discount: 1 with that probability, else 0."""
+        """The factor of the weight after a step of this discount: 1 with the discount as its probability, else 0."""
         uniform_B = torch.rand(discount_B.shape, generator=generator, dtype=torch.float64, device=generator.device)
         return (uniform_B.to(discount_B.device) < discount_B).double()
 
@@ -76,7 +77,7 @@ class GeometricHorizon:
         """PgtsError if episodes are alive at the limit."""
         if num_alive:
             raise PgtsError(
-                f"an episode outlived max_length = {self.max_length} steps of the geometric horizon; is gamma 1?"
+                f"an episode is longer than max_length = {self.max_length} of the geometric horizon; is gamma 1?"
             )
 
 
@@ -85,15 +86,14 @@ Horizon = FixedHorizon | GeometricHorizon
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """B episodes, step by step; where an episode is over, its row is padded and `alive_TB` is False.
+    """B episodes of at most T steps. After the end of an episode its rows are padding and `alive_TB` is False.
 
-    observation_UB: what the policy saw before each of the T steps, and what it would have seen after the last: U = T +
-        1.
+    observation_UB: the observations before each of the T steps and after the last: U = T + 1.
     reward_TB: in reward units.   discount_TB: of the transition itself, 0 where it terminated.
-    weight_TB: what a visit counts for in the occupancy: the product of the discounts before it (fixed horizon) or 1
+    weight_TB: the weight of a visit in the occupancy: the product of the discounts before it (fixed horizon) or 1
         (geometric horizon); 0 where the episode is over.
-    survival_TB: what one later unit of weight is worth now: weight_{t+1} = weight_t * survival_t.
-    state_UB: the states in which this was seen, which a lookahead may start from; None where no model knows them.
+    survival_TB: the factor from one weight to the next: weight_{t+1} = weight_t * survival_t.
+    state_UB: the states of these observations, which a lookahead may start from; None where there is no model.
     """
 
     observation_UB: Shaped[Tensor, "U B ..."]
@@ -107,24 +107,24 @@ class Rollout:
 
     @property
     def observation_V(self) -> Shaped[Tensor, "V ..."]:
-        """What the policy saw in each of the V = `num_steps` visits, in the order of `alive_TB`."""
+        """The observation of each of the V = `num_steps` visits, in the order of `alive_TB`."""
         return self.observation_UB[:-1][self.alive_TB]
 
     @property
     def state_TB(self) -> Int[Tensor, "T B"]:
-        """The states before each step. Only where a model knows them."""
+        """The states before each step. Only with a model."""
         assert self.state_UB is not None
         return self.state_UB[:-1]
 
     @property
     def next_state_TB(self) -> Int[Tensor, "T B"]:
-        """The states after each step. Only where a model knows them."""
+        """The states after each step. Only with a model."""
         assert self.state_UB is not None
         return self.state_UB[1:]
 
     @property
     def num_steps(self) -> int:
-        """Transitions made, padding not counted."""
+        """The number of steps, without padding."""
         return int(self.alive_TB.sum())
 
     @property
@@ -133,14 +133,14 @@ class Rollout:
 
     @property
     def follows_TB(self) -> Bool[Tensor, "T B"]:
-        """Whether the next row goes on with the same episode."""
+        """Whether the next row is another step of the same episode."""
         return torch.cat([self.alive_TB[1:], torch.zeros_like(self.alive_TB[:1])])
 
     def values(self, v: Callable[[Tensor], Tensor]) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
-        """v(s_t) and v(s_{t+1}); where the episode is over, they mean nothing. Each visit, and each end, is asked once.
+        """Return v(s_t) and v(s_{t+1}); they have no meaning where the episode is over.
 
         Args:
-            v: the values of observations.
+            v: returns the values of observations; called once, with each visit and each end of an episode.
         """
         needed_UB = torch.cat([self.alive_TB[:1], self.alive_TB])
         v_UB = torch.zeros_like(needed_UB, dtype=self.reward_TB.dtype)
@@ -148,14 +148,14 @@ class Rollout:
         return v_UB[:-1], v_UB[1:]
 
     def returns(self) -> Float[Tensor, "B"]:
-        """Weighted reward of each episode: an estimate of J^pi, unbiased for the geometric horizon."""
+        """The weighted sum of rewards of each episode: an estimate of J^pi, unbiased for the geometric horizon."""
         return (self.weight_TB * self.reward_TB).sum(0)
 
     def visits(self, state_weight: StateWeight) -> tuple[Int[Tensor, "N"], Float[Tensor, "N"]]:
-        """The distinct visited states, ascending, and w(s) of each.
+        """Return the distinct visited states, ascending, and the weight w(s) of each.
 
         occupancy:  mean over episodes of sum_t weight_t 1(s_t = s), an estimate of d^pi(s)    [PGTS Sec. 2]
-        visits:     share of s among all visits
+        visits:     fraction of all visits that are to s
         uniform:    1
         """
         states, row_V = self._distinct
@@ -167,7 +167,7 @@ class Rollout:
 
     @property
     def first_observation_N(self) -> Shaped[Tensor, "N ..."]:
-        """What the policy saw at the first visit of each distinct state, in the order of `visits`."""
+        """The observation at the first visit to each distinct state, in the order of `visits`."""
         states, row_V = self._distinct
         visit_V = torch.arange(len(row_V), device=row_V.device)
         first_N = torch.full_like(states, len(row_V)).scatter_reduce_(0, row_V, visit_V, "amin")
@@ -175,11 +175,11 @@ class Rollout:
 
     @cached_property
     def _distinct(self) -> tuple[Int[Tensor, "N"], Int[Tensor, "V"]]:
-        """The distinct visited states, ascending, and which of them each visit was to."""
+        """The distinct visited states, ascending, and the index among them of the state of each visit."""
         return self.state_TB[self.alive_TB].unique(return_inverse=True)
 
     def visit_weight(self, state_weight: StateWeight) -> Float[Tensor, "V"]:
-        """What each single visit adds to w(s), in the order of `alive_TB`; with "uniform" each counts 1."""
+        """The weight that each visit adds to w(s), in the order of `alive_TB`; with "uniform" it is 1."""
         weight_V = self.weight_TB[self.alive_TB]
         if state_weight == "occupancy":
             return weight_V / self.num_episodes
@@ -195,29 +195,32 @@ def rollout(
     names: tuple[str | int, ...],
     generator: torch.Generator,
 ) -> Rollout:
-    """One episode in each environment of a world, from a fresh reset.
+    """Run one episode in each environment of a world, from a reset.
 
-    What happens is a function of (seed, names), the policy and nothing else: the environment is seeded anew, and so are
-    for the time being the generators that it may share with the whole process (`SharedGenerators`), which is said.
+    The episodes are a function of (seed, names), `generator` and the policy alone. Environments are seeded, and while
+    they run so are the generators of the whole process (`SharedGenerators`), in case they use these.
 
     Args:
-        world: its environments; with a model also the states are kept, from which a lookahead may start.
-        seed, names: the environment's own stream.
-        generator: draws actions and the geometric horizon.
+        world: the environments; where it has a model the rollout has states, which a lookahead may start from.
+        seed, names: the stream that the environments are seeded from.
+        generator: for actions and the geometric horizon.
 
     Raises:
-        PgtsError: an episode outlived `max_length` of the geometric horizon; or the environment raised an error or
-            answered with something that is not a number, naming environment, step and seed.
+        PgtsError: an episode is longer than `max_length` of the geometric horizon; or the environment raised an error
+            or returned something that is not a number; the message names environment, step and seed.
+
+    Warns:
+        UserWarning: an environment uses the generators of the whole process, once for each world.
     """
     if world.draws_its_own:
         return _episodes(world, policy, horizon, seed=seed, names=names, generator=generator)
     with SharedGenerators(seed, *names) as shared:
         made = _episodes(world, policy, horizon, seed=seed, names=names, generator=generator)
-    if shared.drawn and not world.noticed:
-        world.noticed = True
+    if shared.drawn and not world.warned:
+        world.warned = True
         warnings.warn(
-            f"{env_name(world.env)} draws from the generator of {shared.drawn[0]}, which the whole process shares: it "
-            "is seeded for each iteration and put back afterwards; better draw from self.np_random",
+            f"{env_name(world.env)} uses the generator of {shared.drawn[0]}, which the whole process shares: it is "
+            "seeded for each iteration and restored afterwards; better use self.np_random",
             stacklevel=3,
         )
     return made
@@ -243,7 +246,7 @@ def _episodes(
         reads = [model_world.read(episodes.observation, observations[-1])] if model_world else []
     except BaseException as error:
         raise _failure(env, "at the start", *episodes.blame(error)) from error
-    # What is small stays in numpy until the end: on tensors of a few numbers, each operation costs several times more.
+    # numpy until the end, because operations on a few numbers cost several times more in torch
     alive_B, weight_B = np.ones(env.num_envs, dtype=bool), np.ones(env.num_envs)
     rows: list[tuple[np.ndarray, ...]] = []
     while len(rows) < horizon.limit and alive_B.any():
@@ -292,30 +295,32 @@ def simulated_returns(
     first_action_B: Int[Tensor, "B"] | None = None,
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, "B"], int]:
-    """The weighted reward of one episode in the model from each given state, and how many steps they took together.
+    """Run one episode in the model from each state. Return their weighted sums of rewards, and their steps in total.
 
-    The first action is given or the policy's own. Episodes that are over cost nothing more.
+    Args:
+        first_action_B: the first actions; None: they are sampled from the policy as well.
 
     Raises:
-        PgtsError: an episode outlived `max_length` of the geometric horizon, or a discount is outside [0, 1].
+        PgtsError: an episode is longer than `max_length` of the geometric horizon, or a discount is outside [0, 1].
     """
     returns_B = torch.zeros(len(state_B), dtype=torch.float64, device=state_B.device)
     row_N, state_N, weight_N = torch.arange(len(state_B), device=state_B.device), state_B, torch.ones_like(returns_B)
     action_N = policy.sample(state_B, generator=generator) if first_action_B is None else first_action_B
     num_steps = 0
     for _ in range(horizon.limit):
-        drawn = model.sample(state_N, action_N, key_N=draw_keys(len(state_N), generator=generator))
-        if bool((off_N := ~((drawn.discount_N >= 0) & (drawn.discount_N <= 1))).any()):
+        sampled = model.sample(state_N, action_N, key_N=draw_keys(len(state_N), generator=generator))
+        if bool((off_N := ~((sampled.discount_N >= 0) & (sampled.discount_N <= 1))).any()):
             n = int(torch.nonzero(off_N)[0, 0])
             raise PgtsError(
                 f"the model's discount of state {int(state_N[n])} and action {int(action_N[n])} is "
-                f"{float(drawn.discount_N[n])}; it must be in [0, 1]"
+                f"{float(sampled.discount_N[n])}; it must be in [0, 1]"
             )
-        returns_B[row_N] += weight_N * drawn.reward_N
+        returns_B[row_N] += weight_N * sampled.reward_N
         num_steps += len(row_N)
-        weight_N = weight_N * horizon.survival(drawn.discount_N, generator)
+        weight_N = weight_N * horizon.survival(sampled.discount_N, generator)
+        # from here on only the episodes that are not over
         alive_N = weight_N > 0
-        row_N, state_N, weight_N = row_N[alive_N], drawn.next_state_N[alive_N], weight_N[alive_N]
+        row_N, state_N, weight_N = row_N[alive_N], sampled.next_state_N[alive_N], weight_N[alive_N]
         if len(row_N) == 0:
             break
         action_N = policy.sample(state_N, generator=generator)

@@ -1,4 +1,4 @@
-"""The episodes of an iteration: each process makes its part of them, and all have the whole."""
+"""Collect the episodes of an iteration: each process runs its part of them, and all get the whole batch."""
 
 from functools import partial
 from typing import Any
@@ -16,11 +16,11 @@ _COLUMNS = ("action_TB", "reward_TB", "discount_TB", "alive_TB", "weight_TB", "s
 
 
 def visit(world: World, policy: Policy, horizon: Horizon, draws: Draws, ranks: Ranks) -> Rollout:
-    """The episodes of a policy in the environments of all ranks, side by side; all ranks number their states alike.
+    """Run one episode of the policy in each environment of all ranks. All ranks number the states of the batch alike.
 
     Args:
-        world: of this rank. Where numbers of states last one iteration only, they begin anew.
-        draws: of the iteration.
+        world: of this rank. Its states are numbered from 0 again, unless they keep their numbers.
+        draws: the random generators of the iteration.
 
     Raises:
         PgtsError, RankLost: as `rollout` and `Ranks.gather`.
@@ -38,13 +38,13 @@ def visit(world: World, policy: Policy, horizon: Horizon, draws: Draws, ranks: R
     observation_UB = torch.cat([_extended(part["observations"], length) for part in parts], 1).to(world.device)
     state_UB = None
     if isinstance(world, ModelWorld):
-        world.reset_numbers()  # those of this rank alone make room for those that all ranks have in common
+        world.reset_numbers()  # this rank's own numbers are replaced by those that all ranks have in common
         state_UB = torch.cat([_extended(_adopted(world, part), length) for part in parts], 1)
     return Rollout(observation_UB, **columns, state_UB=state_UB)
 
 
 def _sent(world: World, made: Rollout) -> dict[str, Any]:
-    """Episodes as another process can take them."""
+    """The episodes of this rank as a dict that pickles, with states in a form that another rank can number."""
     columns = {name: getattr(made, name).cpu() for name in _COLUMNS}
     if isinstance(world, ModelWorld) and made.state_UB is not None:
         columns["states"] = world.export(made.state_UB.flatten())
@@ -52,15 +52,15 @@ def _sent(world: World, made: Rollout) -> dict[str, Any]:
 
 
 def _adopted(world: ModelWorld, part: dict[str, Any]) -> Int[Tensor, "U B"]:
-    """The states of some episodes, by the numbers of this process."""
+    """The states of another rank's episodes, as numbered in this process."""
     return world.adopt(part["states"]).view(len(part["alive_TB"]) + 1, -1)
 
 
 def _extended(x_UB: Tensor, length: int) -> Tensor:
-    """With its last row repeated, to the end of episodes of so many steps."""
+    """Repeat the last row until there are `length` + 1 rows."""
     return torch.cat([x_UB, x_UB[-1:].expand(length + 1 - len(x_UB), *x_UB.shape[1:])])
 
 
 def _padded(column_TB: Tensor, length: int) -> Tensor:
-    """With rows of zeros: nobody is alive there."""
+    """Append rows of zeros until there are `length` rows; `alive_TB` is False there."""
     return torch.cat([column_TB, column_TB.new_zeros(length - len(column_TB), column_TB.shape[1])])

@@ -1,6 +1,6 @@
-"""What an agent acts in: environments, what a policy sees of them, and the states that a lookahead may start from.
+"""The environments that an agent acts in, their observations as tensors, and their states as a model numbers them.
 
-A lookahead speaks of states, which are numbers; policies and critics speak of observations. A `ModelWorld` translates.
+Searches take states, which are integers; policies and critics take observations. A `ModelWorld` translates.
 """
 
 from abc import ABC, abstractmethod
@@ -26,24 +26,24 @@ from pgts_torch.tabular.mdp import TabularMDP
 
 
 class World:
-    """Environments to act in, and what a policy sees of them. This is all that experience without a lookahead needs.
+    """Environments and their observations as tensors: all that is needed for rollouts without a lookahead.
 
-    num_actions: of the discrete action set.
-    observation_space: of what a policy sees.
-    noticed: whether it has been said that the environment draws from the generators of the whole process.
-    model: what a lookahead may ask; None: nothing.
-    mdp: the exact truth, where there is one.
+    num_actions: A.
+    observation_space: of what `encode` returns.
+    warned: whether the warning was given that the environments use the random generators of the whole process.
+    model: what a lookahead may query; None: there is no model.
+    mdp: the exact MDP, where it is known.
     start_S: the start distribution mu over all states; None where it is known from episodes only.
-    reward_range: what rewards of single steps are held to; None: nothing.
+    reward_range: the bounds that rewards of single steps are checked against; None: they are not checked.
 
     Args:
         env: the environments, with discrete actions.
         gamma: discount of a step that names none.
-        observation_key: which part of dictionary observations a policy sees.
-        device: where observations and states live.
+        observation_key: the entry of dictionary observations that is used.
+        device: where observations and states are.
     """
 
-    noticed: bool = False
+    warned: bool = False
     model: Model | None = None
     mdp: TabularMDP | None = None
     start_S: Float[Tensor, "S"] | None = None
@@ -63,30 +63,30 @@ class World:
         self.observation_space = self.observations.space
 
     def encode(self, observation: Any) -> Tensor:
-        """What a policy sees, from what an environment says: one observation, or rows of them.
+        """Return one observation of an environment, or rows of them, as the tensor that a policy takes.
 
         Raises:
-            PgtsError: observations that this environment cannot make, or that are not numbers.
+            PgtsError: it is not in the observation space of this environment, or not finite.
         """
         return self.observations.encode(observation)
 
     def of(self, env: VectorEnv) -> "World":
-        """Other environments of the same kind, to act in only; what training says of them is not said once more."""
+        """A world without a model for other environments of the same kind; warnings are not repeated in it."""
         world = World(env, gamma=self.gamma, observation_key=self.observations.key, device=self.device)
-        world.noticed = True
+        world.warned = True
         return world
 
     def promise(self, reward_range: RewardRange) -> None:
-        """Hold episodes, table and model to a range of rewards.
+        """Check rewards of episodes, table and model against a range, and bound values by it.
 
         Raises:
-            ModelMismatch: the table has others.
-            PgtsError: the model repeats actions, whose rewards are sums of several, and whose values bound nothing.
+            ModelMismatch: the table has a reward outside of it.
+            PgtsError: the model repeats actions, so that its rewards are sums of several.
         """
         if self.model is not None and self.model.action_repeat > 1:
             raise PgtsError(
-                f"reward_range is given and action_repeat is {self.model.action_repeat}: no bound of values "
-                "follows where actions are repeated; leave one of the two out"
+                f"reward_range is given and action_repeat is {self.model.action_repeat}: it does not bound values "
+                "where actions are repeated; leave one of the two out"
             )
         if self.mdp is not None:
             happens_SAK = self.mdp.outcomes.prob_NAK > 0
@@ -97,15 +97,15 @@ class World:
 
     @cached_property
     def draws_its_own(self) -> bool:
-        """Whether the environments are known to draw from no generators but their own."""
+        """Whether the environments are known to use random generators of their own only."""
         each = self.env.envs if isinstance(self.env, SyncVectorEnv) else [self.env]
         return all(map(draws_its_own, each))
 
 
 class ModelWorld(World, ABC):
-    """Environments whose states a model knows, by number: a lookahead may start wherever they are.
+    """Environments with a model that numbers their states, so that a lookahead can start from any of them.
 
-    model: what the lookahead asks.
+    model: what the lookahead queries.
     keeps_numbers: whether a state keeps its number from one iteration to the next.
     """
 
@@ -114,41 +114,41 @@ class ModelWorld(World, ABC):
 
     @abstractmethod
     def read(self, observation: Any, encoded_B: Tensor) -> Shaped[Tensor, "B ..."]:
-        """What the states that the environments are in now are told apart by.
+        """Return the current state of each environment, in the form that `numbers` takes.
 
         Args:
-            observation: what they have just said.
-            encoded_B: the same, as a policy sees it.
+            observation: the latest observation of the environments.
+            encoded_B: the same, as returned by `encode`.
         """
 
     @abstractmethod
     def numbers(self, read_N: Shaped[Tensor, "N ..."]) -> Int[Tensor, "N"]:
-        """The numbers of states that were read. Many at once cost little more than a few."""
+        """Return the numbers of states that `read` has returned. Many at once cost little more than a few."""
 
     @abstractmethod
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """What a policy sees of numbered states."""
+        """Return the observations of numbered states, as a policy takes them."""
 
     @abstractmethod
     def export(self, state_N: Int[Tensor, "N"]) -> Any:
-        """What another process needs to know these states; it pickles."""
+        """Return a description of these states that pickles, for `adopt` in another process."""
 
     @abstractmethod
     def adopt(self, exported: Any) -> Int[Tensor, "N"]:
-        """The numbers of states that another process has exported. After `reset_numbers` they are the same in all
-        processes that adopt the same states in the same order."""
+        """Return the numbers of states that another process has exported. After `reset_numbers` they are the same in
+        all processes that adopt the same states in the same order."""
 
     @abstractmethod
     def reset_numbers(self) -> None:
-        """Number states from 0 on, as those of a new iteration, unless they keep their numbers."""
+        """Number states from 0 again, unless they keep their numbers."""
 
 
 @final
 class TabularWorld(ModelWorld):
-    """An environment with a transition table: the observation is the state.
+    """Environments with a transition table: the observation is the state.
 
     Args:
-        env: copies of it.
+        env: the environments.
         mdp: the table.
         starts_known: whether the start distribution of the table is that of the environment; False: it was
             estimated from resets.
@@ -170,37 +170,37 @@ class TabularWorld(ModelWorld):
         return self.model.num_states, self.num_actions
 
     def read(self, observation: Any, encoded_B: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
-        """The observations, which are the states."""
+        """The observations, because they are the states."""
         return encoded_B
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
-        """The observations."""
+        """The observations, because they are the states."""
         return read_N
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """The state."""
+        """The states, because they are the observations."""
         return state_N
 
     def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """The states."""
+        """The states, on the CPU."""
         return state_N.cpu()
 
     def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
-        """These."""
+        """The exported states; their numbers are the same in all processes."""
         return exported.to(self.device)
 
     def reset_numbers(self) -> None:
-        """A state keeps its number."""
+        """Do nothing, because states keep their numbers."""
 
 
 @final
 class SimulatedWorld(ModelWorld):
-    """An environment that can be restored from snapshots: these are the states.
+    """Environments that can be restored from snapshots. A state is the number of a snapshot.
 
     Args:
-        env: copies of it, each an environment of its own.
+        env: the environments, as single ones.
         model: a simulator of the same environment.
-        observation_key: which part of dictionary observations a policy sees.
+        observation_key: the entry of dictionary observations that is used.
     """
 
     def __init__(
@@ -216,40 +216,40 @@ class SimulatedWorld(ModelWorld):
         self._envs = env.envs
 
     def read(self, observation: Any, encoded_B: Tensor) -> Int[Tensor, "B"]:
-        """The number of a snapshot of each environment."""
+        """Take a snapshot of each environment and return their numbers."""
         return self.model.roots(self._envs, iterate(self.env.observation_space, observation)).to(self.device)
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
-        """These."""
+        """The numbers that `read` has returned."""
         return read_N
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """What the simulator showed in these states."""
+        """The observations that the simulator made in these states."""
         return self.observations.encode_part(self.model.observations(state_N))
 
     def export(self, state_N: Int[Tensor, "N"]) -> tuple[list[Any], Tensor]:
-        """What the simulator knows of each distinct state; and which of these each state is."""
+        """The snapshot and observation of each distinct state, and the index of each state among these."""
         distinct, index_N = state_N.unique(return_inverse=True)
         return self.model.export(distinct), index_N.cpu()
 
     def adopt(self, exported: tuple[list[Any], Tensor]) -> Int[Tensor, "N"]:
-        """New numbers, or those of equal snapshots."""
-        known, index_N = exported
-        return self.model.adopt(known).to(self.device)[index_N.to(self.device)]
+        """The numbers of the exported snapshots: new ones, or those of equal snapshots."""
+        snapshots, index_N = exported
+        return self.model.adopt(snapshots).to(self.device)[index_N.to(self.device)]
 
     def reset_numbers(self) -> None:
-        """All snapshots are dropped: there are more with every search, and few of them return."""
+        """Drop all snapshots: every search adds some, and few states are met again."""
         self.model.clear()
 
 
 @final
 class DynamicsWorld(ModelWorld):
-    """An environment whose dynamics are written in torch: the states are its vectors, read from each copy.
+    """Environments whose dynamics are written in torch. A state is the number of a vector, read from the environment.
 
     Args:
-        env: copies of it, each an environment of its own.
-        model: its dynamics.
-        observation_key: which part of dictionary observations a policy sees, which only wrappers make of vectors.
+        env: the environments, as single ones.
+        model: their dynamics.
+        observation_key: the entry of dictionary observations that is used, where a wrapper makes dictionaries.
     """
 
     def __init__(self, env: SyncVectorEnv, model: ClassicModel, *, observation_key: str | None = None) -> None:
@@ -258,15 +258,15 @@ class DynamicsWorld(ModelWorld):
         self._envs = env.envs
 
     def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B D"]:
-        """The vector of each environment."""
+        """The state vector of each environment."""
         return self.model.vectors(self._envs)
 
     def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
-        """Equal vectors have one number."""
+        """The numbers of state vectors; equal vectors have the same number."""
         return self.model.number(read_N)
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """What the environment shows in these states, through its wrappers."""
+        """The observations in these states, as the wrappers of the environment change them."""
         inner_NO = self.model.observe(self.model.states(state_N))
         if not self.model.transforms.observations:
             return inner_NO
@@ -274,13 +274,13 @@ class DynamicsWorld(ModelWorld):
         return self.observations.encode_part(np.array(rows, self.observations.space.dtype))
 
     def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """The vectors."""
+        """The state vectors, on the CPU."""
         return self.model.states(state_N).cpu()
 
     def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
-        """New numbers, or those of equal vectors."""
+        """The numbers of the exported vectors: new ones, or those of equal vectors."""
         return self.numbers(exported.to(self.device))
 
     def reset_numbers(self) -> None:
-        """All states are dropped: hardly one of them returns."""
+        """Drop all states, because hardly any is met again."""
         self.model.clear()

@@ -190,7 +190,7 @@ def test_policies_that_differ_are_noticed():
 
     assert (
         on_ranks(2, mistake)
-        == ["the ranks hold different policies: do they run on different hardware or versions?"] * 2
+        == ["the ranks have different policies: do they run on different hardware or versions?"] * 2
     )
 
 
@@ -240,8 +240,8 @@ def test_ranks_that_ask_for_different_things_say_so():
         return str(caught.value)
 
     first, second = on_ranks(2, mistake)
-    assert first == "rank 0 asks for wine, rank 1 for bread: they have parted ways"
-    assert second == "rank 1 asks for bread, rank 0 for wine: they have parted ways"
+    assert first == "rank 0 asks for wine, rank 1 for bread: they are out of step"
+    assert second == "rank 1 asks for bread, rank 0 for wine: they are out of step"
 
 
 def test_an_evaluation_is_made_once_for_all(tmp_path):

@@ -84,7 +84,7 @@ def test_one_seed_gives_the_same_bits_the_users_generators_go_on_and_it_is_said_
     if where == "init":
         assert said == [[], []]
     else:
-        assert all(len(each) == 1 and f"draws from the generator of {module}, which" in each[0] for each in said)
+        assert all(len(each) == 1 and f"uses the generator of {module}, which" in each[0] for each in said)
 
 
 def test_an_environment_that_draws_its_own_is_not_accused():
