@@ -1,4 +1,4 @@
-"""How deep an iteration looks ahead, what it sees there, and what may be missing to the optimum."""
+"""The choice of the lookahead's depth in an iteration: fixed, or the smallest that improves the policy enough."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, final
@@ -15,13 +15,13 @@ from pgts_torch.search.lookahead import Lookahead, check_finite
 
 
 class Chosen(NamedTuple):
-    """The lookahead of an iteration.
+    """The lookahead of an iteration, at the depth chosen.
 
     depth: m.
     look: (T^m Q)(s, .) at the visited states.
     gap_N: max_a (T^m Q)(s, a) - v(s) >= 0 there.
     certificate: an upper bound on J* - J^pi.
-    is_enough: whether it is at most `stop_at`, so that the policy may stay as it is.
+    is_enough: whether the certificate is at most `stop_at`, so that the policy needs no further update.
     """
 
     depth: int
@@ -33,9 +33,9 @@ class Chosen(NamedTuple):
 
 @final
 class DepthChoice:
-    """Looks m steps ahead from the visited states: to a fixed depth m, or to the smallest one that sees enough.
+    """Computes the lookahead from the visited states at a fixed depth m, or at the smallest that finds a large gap.
 
-    A policy that is far from stationary at depth m deserves no deeper look. So depths are tried in order, until
+    A policy that is far from stationary at depth m needs no deeper lookahead. So depths are tried in order, until
 
         sum_s d(s) g_m(s) > tolerance * sum_s d(s) (v_hat(s) - v(s)),        g_m(s) = max_a (T^m Q)(s, a) - v(s)
 
@@ -43,10 +43,10 @@ class DepthChoice:
 
     Args:
         look: the lookahead.
-        certificates: bounds from what it has queried.
-        depths: that are tried, in this order; of a fixed depth one.
-        tolerance: which share of what may be missing a lookahead must see to be deep enough.
-        stop_at: how much may be missing where training ends; None: nothing ends it.
+        certificates: upper bounds from the outcomes that it has queried.
+        depths: the depths that are tried, in this order; a single one if it is fixed.
+        tolerance: the fraction of the bound that the gap must exceed for a depth to be chosen.
+        stop_at: training ends once the certificate is at most this; None: it does not.
     """
 
     def __init__(
@@ -62,15 +62,16 @@ class DepthChoice:
         self.depths, self.tolerance, self.stop_at = depths, tolerance, stop_at
 
     def __call__(self, experience: Rollout, pi_NA: Float[Tensor, "N A"], draws: Draws) -> Chosen:
-        """The lookahead from the distinct visited states.
+        """Return the lookahead from the distinct visited states.
 
         Args:
             experience: episodes of the policy.
-            pi_NA: the policy in the states, ascending.
-            draws: of the iteration; all its searches see the same samples, so that their differences are not noise.
+            pi_NA: the policy in these states, ascending.
+            draws: the random generators of the iteration; all its searches get the same samples, so that their
+                differences are not noise.
 
         Raises:
-            NotFinite: v(s) = <pi(.|s), Q(s, .)> is not.
+            NotFinite: v(s) = <pi(.|s), Q(s, .)> is not finite.
         """
         state_N, occupancy_N = experience.visits("occupancy")
         shallow = self.look.in_parts(state_N, 0, draws.search())

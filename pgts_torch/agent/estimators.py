@@ -1,4 +1,4 @@
-"""What each action is worth above the policy, at the states that it visits: the batch that an update moves it by."""
+"""Estimators of advantages at visited states: they return the batch that an update is computed from."""
 
 import math
 from abc import ABC, abstractmethod
@@ -18,34 +18,34 @@ from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.tabular.ascent import centred
 
 _ROUNDINGS = 16
-"""So many roundings of the largest lookahead value make a difference that means nothing."""
+"""Differences of lookahead values up to so many rounding errors of the largest one count as 0."""
 
 
 class Estimator(ABC):
     """Estimates advantages from episodes of a policy and a critic.
 
-    comes_first: whether it needs the critic as it was before it learns from these episodes.
+    comes_first: whether it is called before the critic is fitted to these episodes.
     """
 
     comes_first: bool
 
     @abstractmethod
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
-        """The advantages of the policy that made these episodes.
+        """Return the advantages of the policy that collected these episodes.
 
         Args:
-            draws: of the iteration.
+            draws: the random generators of the iteration.
         """
 
 
 @final
 class LookaheadEstimator(Estimator):
-    """Of all actions, by a lookahead from the distinct visited states: (T^m Q)(s, a) - <pi, T^m Q>.
+    """Advantages of all actions, by a lookahead from the distinct visited states: (T^m Q)(s, a) - <pi, T^m Q>(s).
 
     Args:
-        look: the lookahead of the policy that made the episodes.
-        choose: how deep it goes.
-        weight: what a state counts for.
+        look: the lookahead of the policy that collected the episodes.
+        choose: chooses its depth.
+        weight: the weights of states in the update.
     """
 
     comes_first = False
@@ -70,20 +70,20 @@ class LookaheadEstimator(Estimator):
         )
 
     def _rounding(self, look: Lookahead) -> float:
-        """Differences of lookahead values that rounding explains, in reward units."""
+        """The largest difference of lookahead values that rounding may have caused, in reward units."""
         eps = max(torch.finfo(dtype).eps for dtype in (look.q_BA.dtype, self._look.critic.dtype))
         return _ROUNDINGS * eps * float(look.q_BA[look.q_BA.isfinite()].abs().amax())
 
 
 @final
 class SampledEstimator(Estimator):
-    """Of the actions taken, from what came of them, as in PPO and A2C (`gae`): a row for each visit.
+    """Advantages of the actions taken, from the rewards after them, as in PPO and A2C (`gae`): a row for each visit.
 
     Args:
-        policy: that made the episodes.
-        critic: of earlier episodes; what it knows of these would be what came of the very actions.
+        policy: that collected the episodes.
+        critic: fitted to earlier episodes; fitted to these, its values would depend on the actions taken.
         lambda_: in [0, 1].
-        weight: what a visit counts for.
+        weight: the weights of visits in the update.
     """
 
     comes_first = True

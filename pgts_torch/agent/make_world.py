@@ -1,10 +1,10 @@
-"""Which world an environment gets: the first model that was written for it, and that a short trial does not contradict.
+"""Choose the model of an environment: the first of these that applies to it and that a short trial does not contradict.
 
-    table       `models.published.table_of`       transitions that the environment publishes
-    dynamics    `models.classic`                known in torch
+    table       `models.published.table_of`     transitions that the environment publishes
+    dynamics    `models.classic`                written in torch
     simulator   `models.simulator`              restored from snapshots
 
-A model that is not used is refused with a reason; where none is left the reasons are the message.
+A model that does not apply is refused with a reason; where none is left the reasons are the message.
 """
 
 import itertools
@@ -42,7 +42,7 @@ from pgts_torch.tabular.mdp import check_gamma
 _NO_MODEL_NEEDED = "; or take depth 0 and the estimator 'sampled', which need no model"
 
 DEFAULT_GAMMA = 0.99
-"""Discount of an environment that carries none."""
+"""Discount where neither the caller nor the environment names one."""
 
 
 def make_world(
@@ -55,45 +55,42 @@ def make_world(
     action_repeat: int = 1,
     device: torch.device | str,
 ) -> World:
-    """The world of an environment: what can be asked about it decides.
-
-    A transition table makes it tabular; else its dynamics are asked if they are known in torch; else snapshots make it
-    simulated. It has no model where none is needed and there is no table.
+    """Make the world of an environment, with the first model of table, dynamics and simulator that applies to it.
 
     Args:
-        source: what `num_envs` environments are made from, unless it was given some.
+        source: makes `num_envs` environments, unless it was given a VectorEnv.
         gamma: discount; None: the environment's own (pgts/*), else 0.99.
-        observation_key: which part of dictionary observations a policy sees.
-        plain: whether a world without a model will do: then snapshots are not taken.
+        observation_key: the entry of dictionary observations that is used.
+        plain: whether no model is needed: then only a table is looked for, and without one the world has no model.
         action_repeat: how often an action is taken in one outcome of the model (`TensorModel`).
 
     Raises:
-        PgtsError: the environment does not exist, or is none that an agent can act in; or actions are to be repeated
-            in a table, or where there is no model.
-        MissingModel: it has no model, and needs one; the message says why each is not used.
+        PgtsError: the environment does not exist, or no agent can act in it; or actions are to be repeated in a table,
+            or without a model.
+        MissingModel: a model is needed and none applies; the message says why, for each.
     """
     env = source.make(num_envs) if source.given is None else source.given
     discount = DEFAULT_GAMMA if gamma is None else gamma
     check_gamma(discount)
-    sought = _Sought(source, env, discount, observation_key, action_repeat, torch.device(device))
+    request = _Request(source, env, discount, observation_key, action_repeat, torch.device(device))
     with SharedGenerators(0, "models"):
-        world, reasons = _first_model(sought, (_table,) if plain else (_table, _dynamics, _simulator))
+        world, reasons = _first_model(request, (_table,) if plain else (_table, _dynamics, _simulator))
     if world is not None:
         return world
     if not plain:
         raise MissingModel("; ".join(reversed(reasons)) + _NO_MODEL_NEEDED)
     if name := _normalizing_wrapper(env):
         raise PgtsError(
-            f"{env_name(env)} is wrapped in {name}, whose running statistics no evaluation shares and no file "
-            "keeps: leave it out, and set normalize of the network or normalize_returns of the critic"
+            f"{env_name(env)} is wrapped in {name}, whose running statistics are neither saved nor used in "
+            "evaluations: leave it out, and set normalize of the network or normalize_returns of the critic"
         )
     _check_single(action_repeat, "without a model")
     return World(env, gamma=discount, observation_key=observation_key, device=device)
 
 
 @dataclass(frozen=True)
-class _Sought:
-    """What a model is sought for."""
+class _Request:
+    """The environments that a model is looked for, and its options."""
 
     source: EnvSource
     env: VectorEnv
@@ -108,17 +105,17 @@ class _Sought:
 
     @cached_property
     def random(self) -> np.random.Generator:
-        """Of everything that is tried out: the same each time, and nobody else's."""
+        """The generator of all trials, with a seed of its own."""
         return numpy_stream(0, "make_world")
 
     @property
     def envs(self) -> SyncVectorEnv:
-        """The environments, each of which can be looked into."""
+        """The environments, as a vector of single ones."""
         assert isinstance(self.env, SyncVectorEnv)
         return self.env
 
     def fresh(self, k: int = 0) -> gymnasium.Env:
-        """A new instance, as environment k is; no state of those that are trained in is touched."""
+        """A new environment like number k. Trials use these, so that the training environments are not changed."""
         return self.source.like(k)
 
     @cached_property
@@ -127,74 +124,72 @@ class _Sought:
 
     @cached_property
     def new(self) -> gymnasium.Env:
-        """One that is only looked at."""
+        """A new environment whose attributes are read; it is never stepped."""
         return self.fresh()
 
     @cached_property
     def others(self) -> list[set[str]]:
-        """The attributes in which each environment differs from a new instance, in whatever state it is."""
-        held = attributes(self.new)
-        return [different(held, attributes(env)) for env in self.envs.envs]
+        """For each environment, the attributes in which it differs from a new one."""
+        expected = attributes(self.new)
+        return [different(expected, attributes(env)) for env in self.envs.envs]
 
     @cached_property
     def own_to_each(self) -> frozenset[str]:
-        """The attributes in which new instances differ; more of them are made only where the environments do."""
+        """The attributes in which new environments differ from each other; computed only if `others` finds any."""
         return frozenset(own_to_each(self.fresh)) if any(self.others) else frozenset()
 
 
 def _first_model(
-    sought: _Sought, candidates: tuple[Callable[[_Sought], ModelWorld | None], ...]
+    request: _Request, candidates: tuple[Callable[[_Request], ModelWorld | None], ...]
 ) -> tuple[ModelWorld | None, list[str]]:
-    """The world of the first model that is not refused, and why those before it were."""
-    env, reasons = sought.env, list[str]()
+    """Return the world of the first model that applies (None: no model does), and why those before it do not."""
+    env, reasons = request.env, list[str]()
     if type(env) is TabularVectorEnv:
-        _check_single(sought.action_repeat, "in a table")
-        return TabularWorld(env, env.mdp, device=sought.device), []
+        _check_single(request.action_repeat, "in a table")
+        return TabularWorld(env, env.mdp, device=request.device), []
     if type(env) is not SyncVectorEnv:
-        return None, [f"{sought.name} is a VectorEnv that nothing looks into; a simulator needs a SyncVectorEnv"]
+        return None, [f"{request.name} is a VectorEnv of unknown kind; a simulator needs a SyncVectorEnv"]
     try:
-        _check_wrappers(sought)
-        _check_alike(sought)
+        _check_wrappers(request)
+        _check_alike(request)
     except MissingModel as missing:
         return None, [str(missing)]
     for candidate in candidates:
         try:
-            if (world := candidate(sought)) is not None:
+            if (world := candidate(request)) is not None:
                 return world, reasons
         except MissingModel as missing:
             reasons.append(str(missing))
     return None, reasons
 
 
-def _check_wrappers(sought: _Sought) -> None:
-    """MissingModel unless the wrappers change nothing, or single answers, each by itself."""
-    if transforms_of(sought.envs.envs[0]) == Transforms():
+def _check_wrappers(request: _Request) -> None:
+    """MissingModel unless the wrappers change nothing but single observations and rewards, without a memory."""
+    if transforms_of(request.envs.envs[0]) == Transforms():
         return
-    with _told_where_it_stops_a_training():
-        check_transforms(sought.fresh(), sought.actions, sought.random)
+    with _environment_errors_ignored():
+        check_transforms(request.fresh(), request.actions, request.random)
 
 
-def _check_alike(sought: _Sought) -> None:
-    """MissingModel if an environment, in whatever state it is, is not what making another one gives: a model is made of
-    that."""
-    if any(kinds_of(env) != kinds_of(sought.new) for env in sought.envs.envs):
-        raise MissingModel(f"the environments of {sought.name} are of different classes, and a model is of one of them")
-    if not any(sought.others):
+def _check_alike(request: _Request) -> None:
+    """MissingModel if an environment differs from a new one, of which a model would be made; its state may differ."""
+    if any(kinds_of(env) != kinds_of(request.new) for env in request.envs.envs):
+        raise MissingModel(f"the environments of {request.name} are of different classes; a model needs all of one")
+    if not any(request.others):
         return
-    envs, found = sought.envs.envs, None
-    with _told_where_it_stops_a_training():
-        new = itertools.repeat(sought.new)
-        found = unlike(envs, new, sought.fresh(), sought.random, apart=sought.own_to_each)
+    envs, found = request.envs.envs, None
+    with _environment_errors_ignored():
+        new = itertools.repeat(request.new)
+        found = unlike(envs, new, request.fresh(), request.random, apart=request.own_to_each)
     if found is not None:
         raise MissingModel(
-            f"environment {found.number} of {sought.name} has {found.what}, and a model is of all: make them alike"
+            f"environment {found.number} of {request.name} has {found.what}; one model must fit all: make them alike"
         )
 
 
 @contextmanager
-def _told_where_it_stops_a_training() -> Iterator[None]:
-    """What an environment raises while it is tried is no verdict on a model: a training is where it is told, with step
-    and seed."""
+def _environment_errors_ignored() -> Iterator[None]:
+    """Ignore errors that the environment raises in a trial, because training reports them with step and seed."""
     try:
         yield
     except (MissingModel, KeyboardInterrupt):
@@ -203,79 +198,79 @@ def _told_where_it_stops_a_training() -> Iterator[None]:
         return
 
 
-def _table(sought: _Sought) -> TabularWorld | None:
-    """The table that an environment publishes; None where it shows no numbers, or publishes nothing."""
-    discrete = isinstance(sought.env.single_observation_space, spaces.Discrete)
-    if sought.observation_key is not None or not discrete or not publishes_table(sought.envs.envs[0]):
+def _table(request: _Request) -> TabularWorld | None:
+    """The world of a published table; None where there is none, or observations are not its states."""
+    discrete = isinstance(request.env.single_observation_space, spaces.Discrete)
+    if request.observation_key is not None or not discrete or not publishes_table(request.envs.envs[0]):
         return None
-    if own := sought.own_to_each & {"P", "mdp", "initial_state_distrib"}:
+    if own := request.own_to_each & {"P", "mdp", "initial_state_distrib"}:
         raise MissingModel(
-            f"each instance of {sought.name} has its own {min(own)}, so that no table holds for all: make them alike"
+            f"each instance of {request.name} has its own {min(own)}, and one table must fit all: make them alike"
         )
-    mdp, starts_known = table_of(sought.fresh(), gamma=sought.gamma, generator=sought.random)
-    _check_single(sought.action_repeat, "in a table")
+    mdp, starts_known = table_of(request.fresh(), gamma=request.gamma, generator=request.random)
+    _check_single(request.action_repeat, "in a table")
     if not starts_known:
         warnings.warn(
-            f"{sought.name} has a table P and no initial_state_distrib: its start distribution is counted in up to "
-            "1,000 resets",
+            f"{request.name} has a table P and no initial_state_distrib: its start distribution is estimated from up "
+            "to 1,000 resets",
             stacklevel=4,
         )
-    return TabularWorld(sought.env, mdp, starts_known=starts_known, device=sought.device)
+    return TabularWorld(request.env, mdp, starts_known=starts_known, device=request.device)
 
 
-def _dynamics(sought: _Sought) -> DynamicsWorld | None:
-    """The dynamics of classic control in torch; None elsewhere."""
-    env = sought.envs.envs[0]
+def _dynamics(request: _Request) -> DynamicsWorld | None:
+    """The world of classic control's dynamics in torch; None for other environments."""
+    env = request.envs.envs[0]
     kind = next((kind for kind in CLASSIC if type(env.unwrapped) is kind.env_class), None)
     if kind is None:
         return None
-    if why := kind.obstacle(env) or _own(sought, kind.constants):
+    if why := kind.obstacle(env) or _own(request, kind.constants):
         raise MissingModel(f"the dynamics in torch of {kind.env_class.__name__} are not used: {why}")
-    env = sought.fresh()
-    if why := dynamics_contradiction(kind(env, gamma=sought.gamma), env, sought.random)[0]:
+    env = request.fresh()
+    if why := dynamics_contradiction(kind(env, gamma=request.gamma), env, request.random)[0]:
         raise MissingModel(f"the dynamics in torch of {kind.env_class.__name__} are not used: {why}")
-    model = kind(env, gamma=sought.gamma, action_repeat=sought.action_repeat, device=sought.device)
-    return DynamicsWorld(sought.envs, model, observation_key=sought.observation_key)
+    model = kind(env, gamma=request.gamma, action_repeat=request.action_repeat, device=request.device)
+    return DynamicsWorld(request.envs, model, observation_key=request.observation_key)
 
 
-def _simulator(sought: _Sought) -> SimulatedWorld:
-    """A simulator that is restored from snapshots."""
-    key, env = sought.observation_key, sought.envs.envs[0]
+def _simulator(request: _Request) -> SimulatedWorld:
+    """The world of a simulator that is restored from snapshots; MissingModel where it cannot be."""
+    key, env = request.observation_key, request.envs.envs[0]
     adapter = adapter_for(env)
-    if adapter.restored is not None and (why := _own(sought, sought.own_to_each)):
-        raise MissingModel(f"{sought.name} cannot be restored: {why}, which is in no snapshot")
+    if adapter.restored is not None and (why := _own(request, request.own_to_each)):
+        raise MissingModel(f"{request.name} cannot be restored: {why}, which is in no snapshot")
     others = itertools.count()
     setup = Setup(
-        sought.name,
-        lambda: sought.fresh(next(others)).unwrapped,
+        request.name,
+        lambda: request.fresh(next(others)).unwrapped,
         adapter,
         base_actions(env),
-        sought.random,
-        alike=not sought.own_to_each,
+        request.random,
+        alike=not request.own_to_each,
     )
     if why := why_not(setup):
-        raise MissingModel(f"{sought.name} cannot serve as a model: {why}")
+        raise MissingModel(f"{request.name} cannot serve as a model: {why}")
     model = SimulatorModel(
-        sought.fresh,
-        gamma=sought.gamma,
-        action_repeat=sought.action_repeat,
+        request.fresh,
+        gamma=request.gamma,
+        action_repeat=request.action_repeat,
         adapter=adapter,
         observe=None if key is None else lambda observation: observation[key],
-        device=sought.device,
+        device=request.device,
     )
-    return SimulatedWorld(sought.envs, model, observation_key=key, device=sought.device)
+    return SimulatedWorld(request.envs, model, observation_key=key, device=request.device)
 
 
 def _normalizing_wrapper(env: VectorEnv) -> str:
-    """The name of a wrapper that normalises by running statistics of its own; empty where there is none."""
+    """The name of a wrapper that normalises by running statistics; empty where there is none."""
     around = wrappers_of(env.envs[0]) if isinstance(env, SyncVectorEnv) else []
     kinds = NormalizeObservation, NormalizeReward
     return next((type(wrapper).__name__ for wrapper in around if isinstance(wrapper, kinds)), "")
 
 
-def _own(sought: _Sought, names: Iterable[str]) -> str:
-    """Which of these attributes each instance has its own of."""
-    own = sought.own_to_each.intersection(names)
+def _own(request: _Request, names: Iterable[str]) -> str:
+    """A reason that names one of these attributes in which new environments differ; empty where there is none."""
+    own = request.own_to_each.intersection(names)
     return f"each instance has its own {min(own)}" if own else ""
 
 

@@ -1,4 +1,4 @@
-"""The lookahead of a policy: a search with its critic at the leaves, which processes can make in parts."""
+"""The lookahead of a policy: a search with the critic's values at the leaves, which several processes can share."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,11 +24,11 @@ class PolicyLookahead:
     """(T^m Q)(s, .) at states of a model, with the critic's estimate of Q^pi or v^pi at the leaves.
 
     Args:
-        world: says what policy and critic see of a state.
-        policy: whose probabilities a tree search may start from.
-        critic: of this policy.
-        search: how the lookahead is made.
-        ranks: the processes that can make it together.
+        world: gives the observations of states, for policy and critic.
+        policy: gives the prior of a tree search.
+        critic: gives the values of this policy.
+        search: computes the lookahead.
+        ranks: the processes that can share it.
     """
 
     def __init__(self, world: ModelWorld, policy: Policy, critic: Critic, search: Search, ranks: Ranks) -> None:
@@ -36,11 +36,11 @@ class PolicyLookahead:
         self._leaves = {f"{critic.target}_leaf": self._leaf, "prior": self._prior}
 
     def __call__(self, state_N: Int[Tensor, "N"], depth: int, generator: torch.Generator) -> Lookahead:
-        """From all these states, in this process alone."""
+        """Return the lookahead from all these states, computed in this process."""
         return self.search(state_N, depth=depth, generator=generator, **self._leaves)
 
     def in_parts(self, state_N: Int[Tensor, "N"], depth: int, generator: torch.Generator) -> Lookahead:
-        """From states that all ranks have, each of which looks from its part of them.
+        """Return the lookahead from states that all ranks have; each rank computes its part of them.
 
         Raises:
             PgtsError, RankLost: as `Ranks.gather`.
@@ -54,7 +54,7 @@ class PolicyLookahead:
         return _moved(_joined([part for part in parts if part is not None]), state_N.device)
 
     def restart(self) -> None:
-        """Forget what was learned of states that have lost their numbers since."""
+        """Reset the search before an iteration in which states are numbered anew."""
         if not self.world.keeps_numbers:
             self.search.reset()
 
@@ -74,7 +74,7 @@ def _moved(look: Lookahead, device: torch.device | str) -> Lookahead:
 
 
 def _joined(parts: Sequence[Lookahead]) -> Lookahead:
-    """One lookahead from the roots of all."""
+    """One lookahead from the roots of all parts, in their order."""
 
     def rows(name: str) -> Any:
         columns = [getattr(part, name) for part in parts]

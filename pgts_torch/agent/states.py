@@ -1,4 +1,4 @@
-"""Saved states taken over: all of one, and only what the part that takes it over would have written itself."""
+"""Load saved states strictly: a state is accepted only if the part that loads it would save the same state again."""
 
 import math
 from collections.abc import Callable, Mapping, Set
@@ -10,7 +10,7 @@ from torch import Tensor
 from pgts_torch.errors import PgtsError
 
 NO_STATE = (KeyError, TypeError, ValueError, AttributeError, IndexError, RuntimeError, OverflowError)
-"""What code that reads plain values raises where they are of another form."""
+"""The errors that code raises on plain values of an unexpected form."""
 
 
 def take_over(
@@ -22,21 +22,21 @@ def take_over(
     has_bounds: bool = False,
     is_all: bool = True,
 ) -> None:
-    """Have a part of a model take over its saved state.
+    """Load the saved state of a part of a model, and check that all of it was understood.
 
-    What a checksum does not tell is whether the state is one at all. So each number must be finite, the part says what
-    it cannot be (its shapes and ranges), and in the end the part must give the same state that it was given.
+    A checksum does not show that a state is valid. So each number must be finite, the part checks shapes and ranges
+    while it loads, and afterwards its own state must equal the saved one.
 
     Args:
-        name: of the part, as it stands in what is saved.
+        name: of the part, as in the saved state.
         state: what was saved.
-        load: takes it over.
-        own: gives the state that the part is in.
-        has_bounds: numbers in it may be infinite.
-        is_all: all of the state is taken over.
+        load: loads a state into the part.
+        own: returns the current state of the part.
+        has_bounds: whether numbers in it may be infinite.
+        is_all: whether all of it is loaded; else the part may have another state afterwards.
 
     Raises:
-        PgtsError: it is no state of this part; what stands in its way is named, and the part is in some state.
+        PgtsError: it is no state of this part; the message says why. The part may have loaded some of it.
     """
     _check_plain(name, state, has_bounds=has_bounds or not is_all)
     try:
@@ -52,7 +52,7 @@ def take_over(
 
 
 def check_keys(name: str, state: Any, keys: set[str], *, others: Set[str] = frozenset()) -> None:
-    """PgtsError unless it is a dict with these keys, perhaps some of these others, and no more."""
+    """PgtsError unless `state` is a dict with all of `keys`, any of `others`, and no more."""
     if not isinstance(state, Mapping):
         raise PgtsError(f"{name} is a {type(state).__name__}; it must be a dict of {', '.join(sorted(keys))}")
     if missing := keys - set(state):
@@ -62,7 +62,7 @@ def check_keys(name: str, state: Any, keys: set[str], *, others: Set[str] = froz
 
 
 def _check_plain(name: str, value: Any, depth: int = 0, *, has_bounds: bool = False) -> None:
-    """PgtsError where something in nested plain values is not finite, or no plain value."""
+    """PgtsError unless all nested values are plain and all numbers finite (`has_bounds`: not NaN)."""
     if depth > 20:
         raise PgtsError(f"the saved state of {name} is nested too deeply")
     if isinstance(value, Tensor):
@@ -82,7 +82,7 @@ def _check_plain(name: str, value: Any, depth: int = 0, *, has_bounds: bool = Fa
 
 
 def _difference(name: str, saved: Any, now: Any) -> str:
-    """The first place in which two states differ, and how; empty where they are alike in every bit."""
+    """A message about the first difference between two states; empty where they are equal bit for bit."""
     if type(saved) is not type(now):
         return f"{name} is a {type(saved).__name__}; it must be a {type(now).__name__}"
     if isinstance(saved, Tensor):

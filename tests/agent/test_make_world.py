@@ -152,7 +152,7 @@ def test_a_table_without_starts_takes_them_from_resets_and_says_so():
         world = world_of(lambda: Cells(row_of_cells()))
     assert exact.optimal(world.mdp).J == pytest.approx(0.9 ** (N - 2), rel=1e-12)
     assert world.start_S is None
-    with pytest.warns(UserWarning, match="start distribution is counted"):
+    with pytest.warns(UserWarning, match="start distribution is estimated"):
         spread = world_of(lambda: Cells(row_of_cells(), begins=3))
     # 1,000 resets: 5 standard errors of a share of 1/3 are 0.075.
     assert spread.mdp.start_S[:3].tolist() == pytest.approx([1 / 3] * 3, abs=0.075)

@@ -51,7 +51,7 @@ def walking(**arguments) -> PGTS:
 @pytest.mark.parametrize("wanted", [{"stop_at": 0.1}, {"depth": "adaptive"}, {"depth": "adaptive", "stop_at": 0.1}])
 def test_what_needs_a_bound_is_refused_where_there_is_none(wanted):
     with pytest.raises(
-        PgtsError, match=r"(stop_at is 0.1|depth is adaptive), for which .* set reward_range \(env.reward"
+        PgtsError, match=r"(stop_at is 0.1|depth is adaptive), which needs .* set reward_range \(env.reward"
     ):
         walking(**wanted)
     with pytest.raises(PgtsError, match="gamma is 1, with which rewards may add up without limit"):

@@ -421,7 +421,7 @@ def test_a_model_is_refused_where_a_wrapper_repeats_actions_at_random():
 
 @pytest.mark.parametrize("wrapper", [gymnasium.wrappers.NormalizeObservation, gymnasium.wrappers.NormalizeReward])
 def test_statistics_that_no_evaluation_would_share_are_refused(wrapper):
-    mistake = f"CartPole-v1 is wrapped in {wrapper.__name__}, whose running statistics no evaluation shares"
+    mistake = f"CartPole-v1 is wrapped in {wrapper.__name__}, whose running statistics are neither saved"
     with pytest.raises(PgtsError, match=mistake):
         world_of(lambda: wrapper(gymnasium.make("CartPole-v1")), plain=True)
 
