@@ -1,4 +1,4 @@
-"""The data and the text behind `pgts check-model`: whether an environment can serve as a model, and what is missing."""
+"""The data and the text behind `pgts check-model`: whether an environment can serve as a model, and if not, why."""
 
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -17,8 +17,10 @@ _WIDTH = 79
 
 @dataclass(frozen=True)
 class Table:
-    """The answer where an environment cannot be restored and need not be, for its transitions are known; and whether
-    its steps agree with them."""
+    """The answer for an environment that publishes its transitions, so that it need not be restored.
+
+    checks: whether its steps agree with the table.
+    """
 
     env: str
     num_states: int
@@ -28,19 +30,24 @@ class Table:
 
     @property
     def usable(self) -> bool:
-        """Whether it can be a model."""
+        """Whether the table can serve as a model."""
         return all(check.passed for check in self.checks)
 
     @property
     def verdict(self) -> str:
-        """What it is, and what is said of its steps."""
+        """The answer as a sentence, with the details of its checks."""
         size = f"{self.env}: a table of {self.num_states} states and {self.num_actions} actions"
-        said = "; ".join(check.detail for check in self.checks)
-        return f"{size}, {'no snapshot is needed' if self.usable else 'which cannot serve as a model'}; {said}"
+        details = "; ".join(check.detail for check in self.checks)
+        return f"{size}, {'no snapshot is needed' if self.usable else 'which cannot serve as a model'}; {details}"
 
 
 def answer(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Report | Table:
-    """What `check_model` finds of an id and the arguments of `gymnasium.make`, on one thread."""
+    """Return the report of `check_model` on an environment, or of its table where it publishes one; on one thread.
+
+    Args:
+        env_id, kwargs: the arguments of `gymnasium.make`.
+        seed: of the trials.
+    """
     torch.set_num_threads(1)
     source = EnvSource.of(env_id, kwargs=kwargs)
     try:
@@ -55,12 +62,12 @@ def answer(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Report | Tab
 
 
 def to_json(report: Report | Table) -> dict[str, Any]:
-    """All that is in a report, and what follows from it."""
+    """Return a report as JSON values, with `usable` and `verdict`."""
     return asdict(report) | {"usable": report.usable, "verdict": report.verdict}
 
 
 def describe(report: Report | Table) -> str:
-    """The report for people: at most 79 columns."""
+    """Return a report as text of at most 79 columns."""
     if isinstance(report, Table):
         return textwrap.fill(report.verdict, _WIDTH, break_on_hyphens=False)
     return "\n".join(_lines(report))

@@ -1,4 +1,4 @@
-"""The data behind `pgts evaluate`: what a run has left, measured."""
+"""The data behind `pgts evaluate`: evaluate the last checkpoint of a run."""
 
 from pathlib import Path
 
@@ -10,11 +10,11 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.checkpoint import MODEL_FILE, newest
 
 KINDS = {"deterministic": True, "sampled": False}
-"""How actions are taken: the most probable one, or drawn from pi."""
+"""The kinds of evaluation: with the most probable actions (True), or with sampled ones."""
 
 
 def evaluate_run(run: str | Path, *, episodes: int, seed: int, trust_imports: bool = False) -> dict[str, Evaluation]:
-    """Evaluate the last checkpoint of a run: greedily and by drawing actions from the policy."""
+    """Evaluate the last checkpoint of a run, with greedy and with sampled actions."""
     torch.set_num_threads(1)
     algorithm = PGTS.load(last_checkpoint(Path(run)), trust_imports=trust_imports)
     return {
@@ -24,7 +24,7 @@ def evaluate_run(run: str | Path, *, episodes: int, seed: int, trust_imports: bo
 
 
 def last_checkpoint(run: Path) -> Path:
-    """The model in the newest intact checkpoint of a run folder; PgtsError if there is none."""
+    """Return the path of the model in the newest intact checkpoint of a run folder; PgtsError if there is none."""
     found = newest(run)
     if found is None:
         raise PgtsError(f"{run} holds no checkpoint; it must be the folder of a run")

@@ -1,4 +1,4 @@
-"""What a tabular policy does and what it is worth, as one picture."""
+"""Pictures of a tabular policy and its values."""
 
 from typing import Literal
 
@@ -14,21 +14,23 @@ from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
 
 FEW = 20
-"""Up to so many states have room for large numbers."""
+"""Up to so many states values are written in a large font, and all states are numbered."""
 
 MOST_OUTLINED = 20
-"""More outlines than this would hide what they are around."""
+"""Start states are not outlined where there are more of them."""
 
 NUMBER_WIDTH = 0.45
-"""Inches that a probability needs."""
+"""The width of a probability in inches."""
 
 DIRECTIONS = {"left": (-1, 0), "right": (1, 0), "up": (0, 1), "down": (0, -1)}
 
 
 def policy_picture(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], *, title: str = "") -> Figure:
-    """v^pi as colours over the states of `mdp.shape`, and pi beside it: arrows where actions are directions of a
-    two-dimensional layout, else one column of probabilities a state. Start states are outlined, states that pi does not
-    visit are pale."""
+    """Return a figure of v^pi, as colours over the states laid out as `mdp.shape`, and of pi beside it.
+
+    Where actions are directions in a two-dimensional layout pi is drawn as arrows, else as a column of probabilities
+    for each state. Start states are outlined, states that pi does not visit are pale.
+    """
     evaluation = exact.evaluate(mdp, pi_SA)
     rows, columns = mdp.shape
     wide = columns > 3 * rows
@@ -42,7 +44,7 @@ def policy_picture(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], *, title: str =
 
 
 def single_pictures(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> tuple[Figure, Figure]:
-    """The two halves of `policy_picture`, v^pi and pi, each for itself and without a title."""
+    """Return the two halves of `policy_picture`, v^pi and pi, as separate figures without titles."""
     evaluation = exact.evaluate(mdp, pi_SA)
     rows, columns = mdp.shape
     size = (min(max(5, 2 + 0.7 * columns), 12), 2.5) if columns > 3 * rows else (5.5, 4.5)
@@ -119,7 +121,7 @@ def _draw_arrows(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, visited_S: Tensor) 
 
 
 def _draw_columns(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, *, width: float) -> None:
-    """`width`: of the picture, in inches."""
+    """Draw pi as a column of probabilities for each state; `width`: of the figure, in inches."""
     image = axes.imshow(pi_SA.T.numpy(), cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     axes.figure.colorbar(image, ax=axes, label="probability")
     axes.set_yticks(range(mdp.num_actions), mdp.action_names)
@@ -135,7 +137,7 @@ def _draw_columns(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, *, width: float) -
 
 
 def _draw_marks(axes: Axes, mdp: TabularMDP) -> None:
-    """Start states outlined, unless every state is one or they are many."""
+    """Outline the start states, unless all states or more than `MOST_OUTLINED` are."""
     columns = mdp.shape[1]
     starts = torch.nonzero(mdp.start_S).flatten().tolist()
     if len(starts) < mdp.num_states and len(starts) <= MOST_OUTLINED:

@@ -1,4 +1,4 @@
-"""The data and the text behind `pgts stationary`: which policies tree search cannot improve, and how bad they are."""
+"""The data and the text behind `pgts stationary`: how many policies are in Pi^m, and how low their returns are."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -14,19 +14,19 @@ from pgts_torch.tabular.mdp import start_distribution
 from pgts_torch.tabular.stationary_sets import NEVER
 
 ALL_ROWS = 30
-"""A table of more depths shows only those at which Pi^m changes."""
+"""Tables of more depths than this leave out depths at which Pi^m does not change."""
 
 BAR = 40
-"""Characters of the longest bar."""
+"""The length of the longest bar in characters."""
 
 
 @dataclass(frozen=True)
 class DepthRow:
-    """What is known of Pi^m for m = depth.
+    """The stationary set Pi^m for m = depth.
 
-    count: |Pi^m| among the deterministic policies.   worst_return: b^m.   lack: J* - b^m.
-    value_bound, reachable_bound, closed_form_bound: what J* - b^m cannot exceed, without knowing Pi^m
-    (docs/theory.md, Prop. 3 and Cor. 1); infinite where they say nothing.
+    count: |Pi^m| among the deterministic policies.   worst_return: b^m, the lowest return in Pi^m.   lack: J* - b^m.
+    value_bound, reachable_bound, closed_form_bound: upper bounds on J* - b^m that are computed without Pi^m
+    (docs/theory.md, Prop. 3 and Cor. 1); infinite where they do not apply.
     """
 
     depth: int
@@ -40,9 +40,9 @@ class DepthRow:
 
 @dataclass(frozen=True)
 class Counts:
-    """How many policies are in the stationary sets of one MDP, and how bad they are.
+    """The sizes and lowest returns of the stationary sets of an MDP.
 
-    escape_depths: how many policies leave Pi^m first at each depth; `NEVER` stands for the optimal ones.
+    escape_depths: by depth m, the number of policies that are in Pi^(m-1) and not in Pi^m; `NEVER`: the optimal ones.
     sufficient_depth: the smallest M with Pi^M = Pi^inf.
     depths: a row for each depth 0 .. M.
     """
@@ -57,20 +57,20 @@ class Counts:
 
 
 def answer(what: str, **options: Any) -> Counts:
-    """The counts of the MDP that `make` builds from the same arguments, on one thread."""
+    """Return the counts of the MDP that `make` builds from the same arguments, on one thread."""
     torch.set_num_threads(1)
     return count_policies(make(what, **options))
 
 
 def make(what: str, **options: Any) -> TabularMDP:
-    """The MDP that `pgts stationary` names.
+    """Build the MDP that the arguments of `pgts stationary` name.
 
     Args:
         what: ladder, tightrope, random, grid, deep_sea, or the path of a file that `TabularMDP.load_npz` reads.
-        options: of the command, without those that were not given.
+        options: those of the command that were given.
 
     Raises:
-        PgtsError: it has more policies than are enumerated, or something about it is wrong.
+        PgtsError: it has too many policies to enumerate, or an option or the file is wrong.
     """
     if options.get("start") == "uniform":
         options["start"] = None
@@ -90,10 +90,10 @@ def make(what: str, **options: Any) -> TabularMDP:
 
 
 def count_policies(mdp: TabularMDP) -> Counts:
-    """Enumerate the deterministic policies and hold the bounds beside the truth, for each depth 0 .. M.
+    """Enumerate the deterministic policies, and compute b^m and its bounds for each depth 0 .. M.
 
     Raises:
-        PgtsError: there are too many policies, or one has no value.
+        PgtsError: there are too many policies, or the values of one are not finite.
     """
     sets = stationary_sets.enumerate_sets(mdp)
     M, worst_SA = sets.sufficient_depth, stationary.worst_policy(mdp)
@@ -115,7 +115,7 @@ def count_policies(mdp: TabularMDP) -> Counts:
 
 
 def to_json(counts: Counts) -> dict[str, Any]:
-    """The counts in the types of JSON: a bound that says nothing is null, the optimal policies escape at "never"."""
+    """Return the counts as JSON values: infinite bounds are null, the escape depth of optimal policies is "never"."""
     answer = asdict(counts)
     answer["escape_depths"] = {_depth_name(depth): count for depth, count in counts.escape_depths.items()}
     for row in answer["depths"]:
@@ -124,7 +124,7 @@ def to_json(counts: Counts) -> dict[str, Any]:
 
 
 def describe(counts: Counts) -> str:
-    """The counts as tables within 80 columns."""
+    """Return the counts as tables within 80 columns."""
     return "\n".join(_lines(counts))
 
 
@@ -136,7 +136,7 @@ def _from_file(path: Path, options: dict[str, Any]) -> TabularMDP:
 
 
 def _size(options: dict[str, Any], default: int, num_actions: int, num_states: Callable[[int], int]) -> int:
-    """The option n; PgtsError, with the largest size that is none, if it gives more policies than are enumerated."""
+    """Return the option n; PgtsError, with the largest n that is possible, if there are too many policies."""
     n = options.pop("n", default)
     try:
         stationary_sets.check_enumerable(num_states(n), num_actions)

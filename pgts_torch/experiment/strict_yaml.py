@@ -1,7 +1,7 @@
-"""YAML 1.2 as plain data with the line of each value, and without anything that surprises.
+"""Read a subset of YAML 1.2 as plain data, with the line of each value.
 
 Anchors, aliases, tags, directives, several documents, duplicate keys and deep nesting are refused: a configuration
-needs none of them, and each has a way to mean something else than it says, or to never end.
+needs none of them, and each can be misread or make parsing take for ever.
 """
 
 import io
@@ -27,17 +27,17 @@ from ruamel.yaml.events import (
 from ruamel.yaml.nodes import ScalarNode
 
 MAX_DEPTH = 32
-"""How deep mappings and sequences may nest."""
+"""The largest depth to which mappings and sequences may nest."""
 
 _TOO_DEEP = f"values are nested more than {MAX_DEPTH} deep"
 _DEEP = re.compile(rf"(?:[\[{{][ \t\r\n]*){{{MAX_DEPTH + 1}}}")
-"""So many brackets in a row cost the parser seconds before it says what they are."""
+"""So many brackets in a row would cost the parser seconds, so they are refused before."""
 
 KeyPath = tuple[str, ...]
 
 
 class YamlMistake(Exception):
-    """The text cannot be read at all: why, and in which line (counted from 1; None where there is no line)."""
+    """The text cannot be read: the reason, and the line (counted from 1; None where it is unknown)."""
 
     def __init__(self, reason: str, line: int | None) -> None:
         super().__init__(reason)
@@ -50,9 +50,9 @@ class Document:
 
     Args:
         value: None, bool, int, float, str, and lists and dicts of them; the keys of dicts are text.
-        line: where each key stands, by its path; keys inside sequences are left out.
-        text: each scalar as it was written.
-        mistakes: (line, reason) of what is wrong although the rest can be read.
+        line: the line of each key, by its path; keys inside sequences are left out.
+        text: the text of each scalar as it was written, by its path.
+        mistakes: (line, reason) of each mistake after which the rest could still be read.
     """
 
     value: Any
@@ -62,16 +62,16 @@ class Document:
 
 
 def parse(text: str) -> Document:
-    """The one document in `text`; an empty text is None.
+    """Return the single document in `text`; the value of an empty text is None.
 
     Raises:
-        YamlMistake: the text is not YAML, or more of YAML than this reads.
+        YamlMistake: the text is not YAML, or uses features of YAML that are refused.
     """
     return _Reader().document(text)
 
 
 def dump(value: Any) -> str:
-    """`value` as YAML in ASCII that `parse` reads back unchanged."""
+    """Return `value` as YAML in ASCII that `parse` reads back unchanged."""
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False
     yaml.allow_unicode = False
@@ -83,7 +83,7 @@ def dump(value: Any) -> str:
 
 
 class _Reader:
-    """Builds a document from the events of the parser, which cannot recurse and expands nothing."""
+    """Builds a document from the parser's events, which expand no aliases and are made without recursion."""
 
     def __init__(self) -> None:
         self._yaml = YAML(typ="safe", pure=True)
@@ -104,7 +104,7 @@ class _Reader:
         return Document(value, self._line, self._text, tuple(self._mistakes))
 
     def _events(self, text: str) -> Iterator[Event]:
-        """The parser's events; YamlMistake at the first that is more of YAML than a configuration needs."""
+        """Yield the parser's events; YamlMistake at the first feature of YAML that is refused."""
         for number, line in enumerate(text.splitlines(), start=1):
             if line.startswith("%"):
                 raise YamlMistake("directives (%) are not allowed; the text is read as YAML 1.2", number)
@@ -135,7 +135,7 @@ class _Reader:
         return value
 
     def _value(self, event: Event, events: Iterator[Event], path: KeyPath | None, depth: int) -> Any:
-        """The value that starts with `event`. `path` is None inside sequences."""
+        """Return the value that starts with `event`. `path` is None inside sequences."""
         if isinstance(event, ScalarEvent):
             if path is not None:
                 self._text[path] = event.value
@@ -164,7 +164,7 @@ class _Reader:
         return mapping
 
     def _scalar(self, event: ScalarEvent) -> Any:
-        """None, bool, int or float where YAML 1.2 says so, else the text; dates stay text."""
+        """Return None, bool, int or float by the rules of YAML 1.2, else the text; dates stay text."""
         tag = str(self._yaml.resolver.resolve(ScalarNode, event.value, event.implicit)).rpartition(":")[2]
         node = ScalarNode(tag, event.value)
         try:
@@ -183,7 +183,7 @@ class _Reader:
 
 
 def _until_end(events: Iterator[Event]) -> Iterator[Event]:
-    """The events up to the end of the collection that is open now."""
+    """Yield the events up to the end of the current collection."""
     for event in events:
         if isinstance(event, CollectionEndEvent):
             return

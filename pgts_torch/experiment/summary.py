@@ -1,4 +1,4 @@
-"""What a finished run came to, for programs and for people."""
+"""The summary of a finished run, as data and as text."""
 
 import textwrap
 from collections.abc import Mapping
@@ -18,21 +18,21 @@ _ENDINGS: dict[EndedBy, str] = {
 
 @dataclass(frozen=True)
 class Summary:
-    """What a finished run came to.
+    """The results of a finished run.
 
-    J, J_optimal: exact return of the trained policy and of the best one; None where nothing exact is known.
-    depth: m, the largest if it was adaptive.
-    search: how the lookahead was made, and why where it chose that itself.
-    stationarity_gap: max over visited states of the exact g_m; None likewise.
-    certificate: an upper bound on J* - J^pi; None: there is none. A proof is one of the trained policy, an estimate
-        is that of the last iteration, before its update.
+    J, J_optimal: exact return of the trained policy and of an optimal one; None where the exact MDP is not known.
+    depth: m; the largest if it was adaptive.
+    search: the kind of search, with a reason where it was chosen automatically.
+    stationarity_gap: max over visited states of the exact g_m; None where the exact MDP is not known.
+    certificate: an upper bound on J* - J^pi; None: there is none. If it is a proof, it is for the trained policy; an
+        estimate is for the policy before the last update.
     certificate_is_proved: whether it is a proof: the start distribution is known, the critic exact and the model the
-        environment. If not, it is as far right as the critic is at the start states.
-    certificate_confidence: 1 where all start states are known, else the probability with which all certificates of the
-        run hold over the starts that were drawn, as far as the critic is right.
-    ended_by: what ended the training: the certificate came down to `search.stop_at`, greedy episodes reached
-        `eval.stop_at_return`, or neither before `total_steps`.
-    notes: what the user should know of a run that learned little (`experiment.advice`).
+        environment. If not, it is right up to the critic's error at the start states.
+    certificate_confidence: 1 where all start states are known; else the probability that all certificates of the run
+        hold, over the sampled start states and up to the critic's error.
+    ended_by: why training ended: the certificate is at most `search.stop_at`, greedy episodes return at least
+        `eval.stop_at_return`, or `total_steps` are done.
+    notes: advice to the user where the run learned little (`experiment.advice`).
     parts: the classes of policy, critic and update, also where the environment chose them.
     """
 
@@ -58,7 +58,7 @@ class Summary:
 
 
 def from_json(content: Mapping[str, Any]) -> Summary:
-    """The summary that a run has left as JSON; TypeError or KeyError if it is of another form."""
+    """Return the summary in the JSON of a run; TypeError or KeyError if it is of another form."""
     evaluations = {kind: _evaluation(content[kind]) for kind in ("deterministic", "sampled")}
     return Summary(**{**content, **evaluations, "notes": tuple(content.get("notes", ()))})
 
@@ -69,30 +69,30 @@ def _evaluation(content: Mapping[str, Any]) -> Evaluation:
 
 
 def describe(summary: Summary) -> str:
-    """The summary as a person reads it, within 80 columns."""
+    """Return the summary as text within 80 columns."""
     return "\n".join(f"{name:<28}{_folded(name, value)}" for name, value in rows(summary).items())
 
 
 def _folded(name: str, value: str) -> str:
-    """Long values on several lines; a path stays whole."""
+    """Wrap a long value into several lines, except for a path."""
     return value if name == "run folder" else textwrap.fill(value, 50).replace("\n", "\n" + 28 * " ")
 
 
 def rows(summary: Summary) -> dict[str, str]:
-    """What `describe` says, by name."""
+    """Return the rows of `describe`, by name."""
     rows: dict[str, str] = {}
     if summary.J is not None and summary.J_optimal is not None:
-        share = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 <= summary.J else ""
+        ratio = f" ({summary.J / summary.J_optimal:.1%} of the optimum)" if summary.J_optimal > 0 <= summary.J else ""
         rows |= {
-            "return of the policy, J": f"{summary.J:.4g}{share}",
+            "return of the policy, J": f"{summary.J:.4g}{ratio}",
             "optimal return, J*": f"{summary.J_optimal:.4g}",
             f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
         }
     if summary.certificate is not None:
         confidence = summary.certificate_confidence
-        drawn = "" if confidence == 1 else f" with {confidence:.0%} over the starts,"
-        told = "proved" if summary.certificate_is_proved else f"an estimate:{drawn} as far as the critic is right"
-        rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({told})"
+        sampled = "" if confidence == 1 else f" with {confidence:.0%} over the starts,"
+        trust = "proved" if summary.certificate_is_proved else f"an estimate:{sampled} as far as the critic is right"
+        rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({trust})"
     ended = _ENDINGS[summary.ended_by]
     if summary.ended_by == "certificate" and not summary.certificate_is_proved:
         ended = "an estimated certificate: it is at search.stop_at"
