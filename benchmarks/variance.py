@@ -32,12 +32,13 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from pgts_torch.agent.advantages import gae, score_function
-from pgts_torch.agent.critics import TabularCritic, TDLambda, lambda_returns
+from pgts_torch.agent.critics import TabularCritic, lambda_returns
 from pgts_torch.agent.policies import SoftmaxPolicy
-from pgts_torch.agent.rollout import FixedHorizon, Rollout, rollout
+from pgts_torch.agent.rollout import Rollout, rollout
 from pgts_torch.agent.world import TabularWorld
 from pgts_torch.bellman import backup
 from pgts_torch.envs.vector import TabularVectorEnv
+from pgts_torch.options import FixedHorizon, TabularValues, TDLambda
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, random_mdp
 from pgts_torch.tabular.ascent import softmax_direction
@@ -140,7 +141,7 @@ def measured(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], estimates: int) -> di
     truth = exact.evaluate(mdp, pi_SA)
     policy = softmax_policy(pi_SA)
     gamma = float(mdp.outcomes.discount_NAK.max())
-    horizon = FixedHorizon(math.ceil(math.log(LEFT_OUT) / math.log(gamma)))
+    horizon = FixedHorizon(length=math.ceil(math.log(LEFT_OUT) / math.log(gamma)))
 
     def act(copies: int, name: str) -> Rollout:
         env = TabularVectorEnv(mdp, copies, autoreset_mode=AutoresetMode.DISABLED)
@@ -149,7 +150,7 @@ def measured(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], estimates: int) -> di
         return rollout(world, policy, horizon, seed=0, names=("variance", name), generator=generator)
 
     # Line r of v_RS: the critic of estimate r, which has seen episodes of its own.
-    critics = [TabularCritic(S, A, method=TDLambda(0.9), step_size=STEP_SIZE) for _ in range(R)]
+    critics = [TabularCritic(S, A, TabularValues(method=TDLambda(lambda_=0.9), step_size=STEP_SIZE)) for _ in range(R)]
     for k in range(EARLIER):
         episodes = act(R * EPISODES, f"earlier {k}")
         for r, critic in enumerate(critics):

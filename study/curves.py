@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgts_torch.agent.build import Description, make_tabular_policy
+from pgts_torch.agent.build import Description
+from pgts_torch.agent.policies import SimplexPolicy
+from pgts_torch.options import Simplex
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.ascent import projected_step
 from pgts_torch.tabular.mdp import TabularMDP
@@ -110,5 +112,5 @@ def cells(settings: Sequence[tuple[int, float]], pi_SA: Float[Tensor, "S A"]) ->
 
 def initial_policy(mdp: TabularMDP, init: Description) -> Float[Tensor, "S A"]:
     """The policy that a description like {"type": "biased", "action": 0, "probability": 1.0} names."""
-    description = {"type": "simplex", "init": init}
-    return make_tabular_policy(description, mdp.num_states, mdp.num_actions).table()
+
+    return SimplexPolicy(mdp.num_states, mdp.num_actions, Simplex.model_validate({"init": init})).table()

@@ -19,6 +19,7 @@ ROOMS = [
     "errors",
     "files",
     "trust",
+    "options",
     "bellman",
     "seeding",
     "tabular",

@@ -1,41 +1,11 @@
 """Advantages of the actions that were taken, in the form in which updates take those of all actions."""
 
-from dataclasses import dataclass
-from typing import final
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.critics import Critic, lambda_returns
+from pgts_torch.agent.critics import lambda_returns
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.errors import PgtsError
-
-
-@final
-@dataclass(frozen=True)
-class LookaheadAdvantages:
-    """Of all actions, by a lookahead from the visited states."""
-
-
-@final
-@dataclass(frozen=True)
-class SampledAdvantages:
-    """Of the actions taken, from what came of them, as in PPO and A2C (`gae`)."""
-
-    lambda_: float = 0.95
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.lambda_ <= 1:
-            raise PgtsError(f"lambda is {self.lambda_}; it must be in [0, 1]")
-
-    def __call__(self, rollout: Rollout, critic: Critic) -> Float[Tensor, "T B"]:
-        """The advantages; where an episode is over, they mean nothing."""
-        v_TB, next_v_TB = critic.values(rollout)
-        return gae(rollout, v_TB, next_v_TB, self.lambda_)
-
-
-Estimator = LookaheadAdvantages | SampledAdvantages
 
 
 def gae(

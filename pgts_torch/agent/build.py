@@ -1,61 +1,51 @@
-"""Parts of the algorithm from plain descriptions, `"softmax"` or `{"type": "softmax", "init": {"type": "uniform"}}`.
+"""Parts of the algorithm from their options, and what the environment chooses where they are auto."""
 
-The command line, `PGTS(...)` and saved models speak of parts in this one form.
-"""
-
-import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 
-from pgts_torch.agent.advantages import Estimator, LookaheadAdvantages, SampledAdvantages
-from pgts_torch.agent.critics import Critic, ExactCritic, MonteCarlo, RolloutCritic, TabularCritic, TDLambda
-from pgts_torch.agent.networks import CNN, MLP
+from pgts_torch.agent.critics import Critic, ExactCritic, RolloutCritic, TabularCritic
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
-from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
-from pgts_torch.agent.policies import Biased, Policy, Random, SimplexPolicy, SoftmaxPolicy, TabularPolicy, Uniform
-from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Horizon
-from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate, TargetUpdate
+from pgts_torch.agent.neural_updates import GradientUpdate, PPOUpdate
+from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy, TabularPolicy
+from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate, Update
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.options.arguments import checked, described
+from pgts_torch.options.critics import (
+    AutoCritic,
+    ExactValues,
+    NetworkValues,
+    RolloutValues,
+    SharedNetwork,
+    TabularValues,
+)
+from pgts_torch.options.part import Part
+from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Network, Simplex, Softmax
+from pgts_torch.options.rollouts import Estimator, LookaheadAdvantages, SampledAdvantages
+from pgts_torch.options.search import MCTS, Auto, Expectimax, Kind, Sampled
+from pgts_torch.options.training import Training
+from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
-from pgts_torch.tabular.exact import check_depth
 
-Description = str | Mapping[str, Any]
+Description = str | Mapping[str, Any] | Part
+"""Options; or their name, "ppo", or a mapping of plain values, {"type": "ppo", "clip_range": 0.1}."""
 
-DEFAULT_MAX_DEPTH = 64
-DEFAULT_TOLERANCE = 0.7
+_Choices = Mapping[type[Part], Callable[..., Any]]
 
-_Choices = Mapping[str, Callable[..., Any]]
-
-_INITS: _Choices = {"uniform": Uniform, "random": Random, "biased": Biased}
-_HORIZONS: _Choices = {"fixed": FixedHorizon, "geometric": GeometricHorizon}
-_METHODS: _Choices = {"monte_carlo": MonteCarlo, "td_lambda": TDLambda}
-_ESTIMATORS: _Choices = {"lookahead": LookaheadAdvantages, "sampled": SampledAdvantages}
-_TABLES: _Choices = {"softmax": SoftmaxPolicy, "simplex": SimplexPolicy}
-_NETWORKS: _Choices = {"mlp": MLP, "cnn": CNN}
-_CRITICS: _Choices = {
-    "exact": ExactCritic,
-    "tabular": TabularCritic,
-    "rollout": RolloutCritic,
-    "network": NetworkCritic,
-}
-_SEARCHES: _Choices = {
-    "auto": AutoSearch,
-    "expectimax": ExpectimaxSearch,
-    "sampled": SampledSearch,
-    "mcts": MCTSSearch,
-}
-_TABLE_UPDATES: _Choices = {"projected": ProjectedUpdate, "softmax": SoftmaxUpdate, "mirror": MirrorUpdate}
-_NETWORK_UPDATES: _Choices = {
-    "gradient": GradientUpdate,
-    "ppo": PPOUpdate,
-    "mirror": NetworkMirrorUpdate,
-    "cmpo": CMPOUpdate,
+_SEARCHES: _Choices = {Auto: AutoSearch, Expectimax: ExpectimaxSearch, Sampled: SampledSearch, MCTS: MCTSSearch}
+_TABLES: _Choices = {Softmax: SoftmaxPolicy, Simplex: SimplexPolicy}
+_UPDATES: _Choices = {
+    Projected: ProjectedUpdate,
+    SoftmaxGradient: SoftmaxUpdate,
+    Mirror: MirrorUpdate,
+    Gradient: GradientUpdate,
+    PPO: PPOUpdate,
+    CMPO: CMPOUpdate,
 }
 
 
@@ -69,123 +59,80 @@ def make_device(device: torch.device | str) -> torch.device:
     return torch.device(device)
 
 
-def make_horizon(description: Description) -> Horizon:
-    """A horizon: fixed(length), geometric(max_length)."""
-    return _make("horizon", _HORIZONS, description)
+def chosen(options: Training, world: World) -> Training:
+    """The options, with what is auto chosen by the environment: tables where its states are numbered, else networks.
+
+    Raises:
+        PgtsError: options that do not go together.
+    """
+    policy, critic, update = options.policy, options.critic, options.update
+    numbered = isinstance(world, TabularWorld)
+    if isinstance(policy, AutoPolicy):
+        policy = Softmax() if numbered else CNN() if len(world.observation_space.shape or ()) == 3 else MLP()
+    if isinstance(critic, AutoCritic):
+        critic = TabularValues() if numbered else NetworkValues()
+    if isinstance(update, AutoUpdate):
+        neural = PPO() if isinstance(options.estimator, SampledAdvantages) else CMPO()
+        update = neural if isinstance(policy, Network) else Projected() if isinstance(policy, Simplex) else Mirror()
+    return checked(dict(options) | {"policy": policy, "critic": critic, "update": update})
 
 
-def make_estimator(description: Description) -> Estimator:
-    """What advantages come from: lookahead, or sampled(lambda)."""
-    return _make("estimator", _ESTIMATORS, description)
-
-
-def make_search(description: Description, world: World) -> Search:
-    """A search: auto, expectimax(max_width), sampled(samples, share) or mcts(simulations, root,
-    rule, exploration, wave, prior, backup, merge, samples); each also takes max_nodes and max_bytes."""
+def make_search(options: Kind, world: World) -> Search:
+    """A search of the world's model; MissingModel where there is none."""
     if world.model is None:
         raise MissingModel("the environment has no model that a lookahead could ask")
-    return _make("search", _SEARCHES, description, world.model)
+    return _made(_SEARCHES, options)(world.model, options)
 
 
-def make_policy(description: Description | None, world: World, *, seed: int) -> Policy:
-    """A policy: softmax or simplex (init: uniform, random, biased(action, probability)), or a network, mlp(hidden,
-    activation, normalize) or cnn(...). Default: a softmax table where the environment is tabular, else a network."""
-    if description is None:
-        images = len(world.observation_space.shape or ()) == 3
-        description = "softmax" if isinstance(world, TabularWorld) else "cnn" if images else "mlp"
-    kind = _parts("policy", {**_TABLES, **_NETWORKS}, description)[0]
-    if kind in _NETWORKS:
-        network = _make("policy", _NETWORKS, description)
-        return NetworkPolicy(
-            world.observation_space, world.num_actions, network=network, seed=seed, device=world.device
-        )
-    S, A = _tabular(world, f"the policy {kind!r}").mdp_shape
-    return make_tabular_policy(description, S, A, seed=seed, device=world.device)
+def make_policy(options: Part, world: World, *, seed: int) -> Policy:
+    """A table, or a network."""
+    if isinstance(options, Network):
+        return NetworkPolicy(world.observation_space, world.num_actions, options, seed=seed, device=world.device)
+    S, A = _tabular(world, f"the policy {_type(options)!r}").mdp_shape
+    return _made(_TABLES, options)(S, A, options, seed=seed, device=world.device)
 
 
-def make_tabular_policy(
-    description: Description, num_states: int, num_actions: int, *, seed: int = 0, device: torch.device | str = "cpu"
-) -> TabularPolicy:
-    """A policy that is a table."""
-    nested = {"init": _INITS}
-    return _make("policy", _TABLES, description, num_states, num_actions, nested=nested, seed=seed, device=device)
-
-
-def make_update(
-    description: Description | None,
-    policy: Policy,
-    estimator: Estimator = LookaheadAdvantages(),  # noqa: B008 - frozen
-) -> Update:
-    """An update, of a table: projected, softmax or mirror (step_size, state_weight; of mirror also
-    normalize, floor); of a network: gradient, ppo,
-    mirror or cmpo. Default: the one for the policy, of a network cmpo with a lookahead and ppo without."""
-    network = isinstance(policy, NetworkPolicy)
-    if description is None:
-        neural = "ppo" if isinstance(estimator, SampledAdvantages) else "cmpo"
-        description = neural if network else "projected" if isinstance(policy, SimplexPolicy) else "mirror"
-    kind = _parts("update", {**_TABLE_UPDATES, **_NETWORK_UPDATES}, description)[0]
-    choices = _NETWORK_UPDATES if kind not in _TABLE_UPDATES or (network and kind == "mirror") else _TABLE_UPDATES
-    return _make("update", choices, description)
+def make_update(options: Part, policy: Policy) -> Update:
+    """An update of such a policy."""
+    if isinstance(options, Mirror) and isinstance(policy, NetworkPolicy):
+        return NetworkMirrorUpdate(options)
+    return _made(_UPDATES, options)(options)
 
 
 def make_critic(
-    description: Description | None,
+    options: Part,
     world: World,
     policy: Policy,
     estimator: Estimator = LookaheadAdvantages(),  # noqa: B008 - frozen
     *,
     seed: int,
 ) -> Critic:
-    """A critic: exact(target), tabular(target, method, step_size), rollout(samples, target, horizon) or
-    network(network, target, method, ...), whose network may be "shared" with the policy's. Default: tabular where the
-    environment is, else a network like the policy's. With a lookahead its learning rate is 1e-3 and, unless its target
-    network lags, its targets are fresh; with sampled advantages they are not, and the rate is 3e-4."""
-    if description is None:
-        description = "tabular" if isinstance(world, TabularWorld) else "network"
-    kind, options = _parts("critic", _CRITICS, description)
-    nested: dict[str, _Choices] = {"method": _METHODS, "horizon": _HORIZONS}
-    if kind == "network":
-        sampled = isinstance(estimator, SampledAdvantages)
-        lags = (options.get("polyak", 1), options.get("target_period", 1)) != (1, 1)
-        options.setdefault("learning_rate", 3e-4 if sampled else 1e-3)
-        options.setdefault("fresh_targets", not sampled and not lags)
-        if options.get("network") == "shared":
+    """A critic."""
+    if isinstance(options, NetworkValues):
+        trunk = None
+        if isinstance(options.network, SharedNetwork):
             if not isinstance(policy, NetworkPolicy):
                 raise PgtsError(f"critic.network is 'shared'; a {type(policy).__name__} has no network to share")
-            description = {"type": kind, **options, "network": policy.network.trunk}
-        else:
-            nested["network"] = _NETWORKS
-            images = len(world.observation_space.shape or ()) == 3
-            description = {"type": kind, "network": "cnn" if images else "mlp", **options}
-        given: tuple[Any, ...] = (world.observation_space, world.num_actions)
-        return _make("critic", _CRITICS, description, *given, nested=nested, seed=seed, device=world.device)
-    tabular = _tabular(world, f"the critic {kind!r}")
-    if kind == "tabular":
-        return _make("critic", _CRITICS, description, *tabular.mdp_shape, nested=nested, device=world.device)
-    given = (tabular.mdp,) if kind == "exact" else (tabular.model,)
-    return _make("critic", _CRITICS, description, *given, nested=nested)
+            trunk = policy.network.trunk
+        return NetworkCritic(
+            world.observation_space,
+            world.num_actions,
+            options.filled(estimator.type),
+            trunk=trunk,
+            seed=seed,
+            device=world.device,
+        )
+    tabular = _tabular(world, f"the critic {_type(options)!r}")
+    if isinstance(options, TabularValues):
+        return TabularCritic(*tabular.mdp_shape, options, device=world.device)
+    if isinstance(options, RolloutValues):
+        return RolloutCritic(tabular.model, options)
+    assert isinstance(options, ExactValues)
+    assert tabular.mdp is not None
+    return ExactCritic(tabular.mdp, options)
 
 
-def make_depths(depth: int | Literal["adaptive"], max_depth: int | None, tolerance: float | None) -> Sequence[int]:
-    """The depths that an iteration tries, in order; PgtsError where an argument is out of range or has no effect."""
-    if depth != "adaptive":
-        for name, value in (("max_depth", max_depth), ("tolerance", tolerance)):
-            if value is not None:
-                raise PgtsError(f"{name} is {value}, which only depth='adaptive' heeds; depth is {depth}")
-        return (check_depth(depth),)
-    if tolerance is not None and not 0 <= tolerance < math.inf:
-        raise PgtsError(f"tolerance is {tolerance}; it must be finite and at least 0")
-    return range(check_depth(DEFAULT_MAX_DEPTH if max_depth is None else max_depth) + 1)
-
-
-def check_parts(
-    arguments: Mapping[str, Any],
-    world: World,
-    policy: Policy,
-    critic: Critic,
-    update: Update,
-    estimator: Estimator,
-) -> None:
+def check_parts(arguments: Mapping[str, Any], world: World, policy: Policy, update: Update) -> None:
     """PgtsError where parts do not fit each other, or where one of the arguments of `PGTS` would have no effect."""
     update.check(policy)
     if isinstance(policy, TabularPolicy):
@@ -194,34 +141,22 @@ def check_parts(
             raise PgtsError(f"the policy is one of (states, actions) = {found}; the environment has {shape}")
     if arguments["gamma"] not in (None, world.gamma):
         raise PgtsError(f"gamma is {arguments['gamma']}; the environment has its own, {world.gamma}")
-    if not isinstance(estimator, SampledAdvantages):
-        return
-    for name, default in (("depth", 0), ("search", "auto"), ("stop_at", None)):
-        if (value := arguments[name]) != default:
-            raise PgtsError(f"{name} is {value}; sampled advantages look no step ahead, it must be {default}")
-    if not isinstance(update, NetworkUpdate):
-        raise PgtsError(
-            f"{type(update).__name__} takes one row a state; sampled advantages have one a visit: take a network, mlp "
-            "or cnn, as policy"
-        )
-    if not isinstance(critic, TabularCritic | NetworkCritic) or critic.target != "v":
-        raise PgtsError(
-            f"the critic is {type(critic).__name__} of {critic.target}; sampled advantages stand on what was learned "
-            "before, so they need a tabular or network critic of v"
-        )
-    if isinstance(update, TargetUpdate):
-        raise PgtsError(
-            f"{type(update).__name__} needs the advantages of all actions, for they stand in an exponent; sampled ones "
-            "are of the actions taken"
-        )
 
 
-def described(arguments: Mapping[str, Any]) -> dict[str, Any]:
+def plain(arguments: Mapping[str, Any], options: Training) -> dict[str, Any]:
     """The arguments of `PGTS` as plain values; PgtsError where a part was given as an object."""
-    for name in ("search", "estimator", "policy", "critic", "update", "horizon"):
-        if not isinstance(arguments[name], str | Mapping | None):
+    for name in ("policy", "critic", "update"):
+        if not isinstance(arguments[name], str | Mapping | Part | None):
             raise PgtsError(f"{name} was given as {arguments[name]!r}; only models made from descriptions can be saved")
-    return {**arguments, "env_kwargs": dict(arguments["env_kwargs"] or {})}
+    return {**arguments, **described(options), "env_kwargs": dict(arguments["env_kwargs"] or {})}
+
+
+def _made(choices: _Choices, options: Part) -> Callable[..., Any]:
+    return next(make for kind, make in choices.items() if isinstance(options, kind))
+
+
+def _type(options: Any) -> str:
+    return options.type
 
 
 def _tabular(world: World, what: str) -> TabularWorld:
@@ -231,32 +166,3 @@ def _tabular(world: World, what: str) -> TabularWorld:
             "cnn as policy, network as critic"
         )
     return world
-
-
-def _make(
-    what: str,
-    known: Mapping[str, Callable[..., Any]],
-    description: Description,
-    *given: Any,
-    nested: Mapping[str, Mapping[str, Callable[..., Any]]] | None = None,
-    **extra: Any,
-) -> Any:
-    """Build `what` from its description, its nested parts first."""
-    kind, options = _parts(what, known, description)
-    for name, choices in (nested or {}).items():
-        if name in options:
-            options[name] = _make(f"{what}.{name}", choices, options[name])
-    if "lambda" in options:
-        options["lambda_"] = options.pop("lambda")
-    try:
-        return known[kind](*given, **options, **extra)
-    except TypeError as error:
-        raise PgtsError(f"{what} {kind!r} does not take these options: {sorted(options)} ({error})") from error
-
-
-def _parts(what: str, known: Mapping[str, Any], description: Description) -> tuple[str, dict[str, Any]]:
-    options = dict(description) if isinstance(description, Mapping) else {}
-    kind = options.pop("type", None) if isinstance(description, Mapping) else description
-    if not isinstance(kind, str) or kind not in known:
-        raise PgtsError(f"{what} is {kind!r}; it must be one of {', '.join(known)}")
-    return kind, options

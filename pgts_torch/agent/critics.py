@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, TypeVar, final
 
@@ -12,10 +12,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.policies import Policy, fitting, listed
-from pgts_torch.agent.rollout import GeometricHorizon, Horizon, Rollout, simulated_returns
+from pgts_torch.agent.rollout import Rollout, simulated_returns
 from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import SamplingModel
+from pgts_torch.options.critics import ExactValues, RolloutValues, TabularValues, TDLambda
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
 
@@ -26,6 +27,7 @@ Learned = TypeVar("Learned")
 class Critic(ABC):
     """An estimate of the values of the policy it was last fitted to.
 
+    options: what it was made from; None for a critic of the caller's own kind.
     target: whether a lookahead stands on its v (one more level) or its Q.
     draws_when_asked: whether it draws when it is asked for values, not when it is fitted.
     is_exact: whether its values are those of the policy, but for `error`.
@@ -33,6 +35,7 @@ class Critic(ABC):
     dtype: that its values are rounded to.
     """
 
+    options: Any = None
     target: Target
     draws_when_asked: bool = False
     is_exact: bool = False
@@ -84,9 +87,9 @@ class ExactCritic(Critic):
 
     is_exact = True
 
-    def __init__(self, mdp: TabularMDP, *, target: Target = "v") -> None:
+    def __init__(self, mdp: TabularMDP, options: ExactValues = ExactValues()) -> None:  # noqa: B008 - frozen
         self.mdp = mdp
-        self.target = check_target(target)
+        self.options, self.target = options, options.target
         self._evaluation: exact.Evaluation | None = None
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
@@ -112,28 +115,6 @@ class ExactCritic(Critic):
 
 
 @final
-@dataclass(frozen=True)
-class MonteCarlo:
-    """Targets are sums of observed rewards. Where a fixed horizon or a time limit cut an episode, the present estimate
-    stands for the rest; a geometric horizon cuts nothing, its sums are unbiased as they are."""
-
-
-@final
-@dataclass(frozen=True)
-class TDLambda:
-    """Targets are lambda-returns (Sutton and Barto 2018, Sec. 12.1)."""
-
-    lambda_: float = 0.9
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.lambda_ <= 1:
-            raise PgtsError(f"lambda is {self.lambda_}; it must be in [0, 1]")
-
-
-Method = MonteCarlo | TDLambda
-
-
-@final
 class TabularCritic(Critic):
     """One number for each state, or each (state, action), moved toward targets from rollouts.
 
@@ -143,45 +124,36 @@ class TabularCritic(Critic):
 
     Args:
         num_states, num_actions: the shape of the table.
-        target: learn "v", or "q" at the actions taken.
-        method: how targets are made.
-        step_size: alpha in (0, 1]; or "mean": alpha is the share of the new visits among all so far, which makes the
-            estimate the mean of all targets. "mean" suits a policy that stands still.
-        initial: of cells that were never visited: a number, or "mean": the w that makes the mean of an iteration's
-            targets w, where w stands for the rest of episodes that were cut in such a cell. A constant added to all
-            rewards of a continuing task adds constant / (1 - gamma) to it, as to all values; a factor multiplies it.
+        options: with `step_size` "mean" alpha is the share of the new visits among all so far, which makes the estimate
+            the mean of all targets, and suits a policy that stands still. With `initial` "mean" cells that were never
+            visited are worth the w that makes the mean of an iteration's targets w, where w stands for the rest of
+            episodes that were cut in such a cell. A constant added to all rewards of a continuing task adds constant /
+            (1 - gamma) to it, as to all values; a factor multiplies it.
     """
+
+    options: TabularValues
 
     def __init__(
         self,
         num_states: int,
         num_actions: int,
+        options: TabularValues = TabularValues(),  # noqa: B008 - frozen
         *,
-        target: Target = "v",
-        method: Method = TDLambda(),
-        step_size: float | Literal["mean"] = 0.5,
-        initial: float | Literal["mean"] = "mean",
         device: torch.device | str = "cpu",
     ) -> None:
-        if step_size != "mean" and not (isinstance(step_size, int | float) and 0 < step_size <= 1):
-            raise PgtsError(f"step_size is {step_size!r}; it must be in (0, 1] or 'mean'")
-        if initial != "mean" and not (isinstance(initial, int | float) and math.isfinite(initial)):
-            raise PgtsError(f"initial is {initial!r}; it must be a finite number or 'mean'")
         self.num_states, self.num_actions = num_states, num_actions
-        self.target = check_target(target)
-        self.method = method
-        self.step_size = step_size
-        self.initial = initial
+        self.options, self.target = options, options.target
         self._policy: Policy | None = None
-        cells = num_states if target == "v" else num_states * num_actions
-        self._value_C = torch.full((cells,), 0.0 if initial == "mean" else initial, dtype=torch.float64, device=device)
+        cells = num_states if self.target == "v" else num_states * num_actions
+        first = 0.0 if options.initial == "mean" else options.initial
+        self._value_C = torch.full((cells,), first, dtype=torch.float64, device=device)
         self._count_C = torch.zeros(cells, dtype=torch.float64, device=device)
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
         """Move every visited cell toward the mean of its targets; returns the mean squared error before."""
         self._policy = policy
         value_C = self._value_C
-        if self.initial == "mean":
+        if self.options.initial == "mean":
             value_C = torch.where(self._count_C > 0, value_C, self._mean_target(rollout))
         target_TB = self._targets(rollout, partial(self._read, value_C))[rollout.alive_TB]
         check_targets(target_TB)
@@ -194,7 +166,7 @@ class TabularCritic(Critic):
         count_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, ones_V)
         sum_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, target_TB)
         self._count_C += count_C
-        alpha_C = count_C / self._count_C.clamp(min=1) if self.step_size == "mean" else self.step_size
+        alpha_C = count_C / self._count_C.clamp(min=1) if self.options.step_size == "mean" else self.options.step_size
         seen_C = count_C > 0
         mean_C = sum_C / count_C.clamp(min=1)
         self._value_C = torch.where(seen_C, value_C + alpha_C * (mean_C - value_C), value_C)
@@ -226,8 +198,8 @@ class TabularCritic(Critic):
     def _targets(self, rollout: Rollout, v: Callable[[Tensor], Tensor]) -> Float[Tensor, "T B"]:
         next_TB = rollout.observation_UB[1:]
         bootstrap_TB = v(next_TB.reshape(-1)).view(next_TB.shape)
-        if isinstance(self.method, TDLambda):
-            return lambda_returns(rollout, bootstrap_TB, rollout.discount_TB, self.method.lambda_)
+        if isinstance(self.options.method, TDLambda):
+            return lambda_returns(rollout, bootstrap_TB, rollout.discount_TB, self.options.method.lambda_)
         return lambda_returns(rollout, bootstrap_TB, rollout.survival_TB, 1.0)
 
     def _mean_target(self, rollout: Rollout) -> Float[Tensor, ""]:
@@ -253,27 +225,14 @@ class RolloutCritic(Critic):
 
     Args:
         model: samples outcomes.
-        samples: episodes for each state, or for each (state, action).
-        target: whether lookaheads stand on v or on Q; both can be asked for.
-        horizon: a fixed one leaves out what comes after it.
+        options: both v and Q can be asked for, whatever the target. A fixed horizon leaves out what comes after it.
     """
 
     draws_when_asked = True
+    options: RolloutValues
 
-    def __init__(
-        self,
-        model: SamplingModel,
-        *,
-        samples: int = 8,
-        target: Target = "v",
-        horizon: Horizon = GeometricHorizon(),  # noqa: B008 - frozen
-    ) -> None:
-        if samples < 1:
-            raise PgtsError(f"samples is {samples}; it must be at least 1")
-        self.model = model
-        self.samples = samples
-        self.target = check_target(target)
-        self.horizon = horizon
+    def __init__(self, model: SamplingModel, options: RolloutValues = RolloutValues()) -> None:  # noqa: B008 - frozen
+        self.model, self.options, self.target = model, options, options.target
         self._model_calls = 0
         self._following: tuple[Policy, torch.Generator] | None = None
 
@@ -299,13 +258,13 @@ class RolloutCritic(Critic):
         returns_B, num_steps = simulated_returns(
             self.model,
             policy,
-            state_N.repeat(self.samples),
-            self.horizon,
-            first_action_B=None if action_N is None else action_N.repeat(self.samples),
+            state_N.repeat(self.options.samples),
+            self.options.horizon,
+            first_action_B=None if action_N is None else action_N.repeat(self.options.samples),
             generator=generator,
         )
         self._model_calls += num_steps
-        return returns_B.view(self.samples, -1).mean(0)
+        return returns_B.view(self.options.samples, -1).mean(0)
 
 
 def lambda_returns(
@@ -341,10 +300,3 @@ def _fitted(learned: Learned | None) -> Learned:
     if learned is None:
         raise PgtsError("the critic knows no policy yet; fit it, or iterate, before asking for values")
     return learned
-
-
-def check_target(target: Target) -> Target:
-    """PgtsError unless target is "v" or "q"."""
-    if target not in ("v", "q"):
-        raise PgtsError(f"target is {target!r}; it must be 'v' or 'q'")
-    return target

@@ -72,7 +72,7 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
     made = rollout(
         algorithm.world.of(env),
         Greedy(algorithm.policy) if deterministic else algorithm.policy,
-        FixedHorizon(limit or UNLIMITED_LENGTH),
+        FixedHorizon(length=limit or UNLIMITED_LENGTH),
         seed=seed,
         names=names,
         generator=stream(seed, *names, device=algorithm.device),

@@ -7,10 +7,9 @@ no weights, so a training loop encodes its batch once.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
-from typing import Any, Literal, final
+from typing import Any, final
 
 import torch
 from gymnasium import spaces
@@ -21,8 +20,7 @@ from torch.nn.utils import skip_init
 
 from pgts_torch.agent.policies import fitting
 from pgts_torch.errors import NotFinite, PgtsError
-
-Activation = Literal["tanh", "relu"]
+from pgts_torch.options.policies import CNN, MLP
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 _MOST_INPUTS = 2**24
@@ -132,87 +130,41 @@ class Trunk(nn.Module):
         self.encoder, self.layers, self.num_features = encoder, layers, num_features
 
 
-@final
-@dataclass(frozen=True)
-class MLP:
-    """Fully connected layers over states or vectors; without hidden layers, one number for each (state, output).
+def make_trunk(network: MLP | CNN, observation_space: Space[Any], *, generator: torch.Generator) -> Trunk:
+    """A trunk on the CPU: orthogonal weights of gain sqrt(2) (Saxe et al. 2014), biases 0.
 
-    Args:
-        hidden: the sizes of the hidden layers.
-        activation: "tanh" or "relu".
-        normalize: observations by their running mean and variance (vectors only).
+    MLP: without hidden layers, one number for each (state, output). CNN: convolutions without padding over
+    channels-last images; the default is the usual one for the 7x7x3 views of MiniGrid (Chevalier-Boisvert et al. 2023).
+
+    Raises:
+        PgtsError: the network cannot see such observations.
     """
-
-    hidden: tuple[int, ...] = (64, 64)
-    activation: Activation = "tanh"
-    normalize: bool = False
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden", _sizes("hidden", self.hidden))
-        _check_activation(self.activation)
-
-    def trunk(self, observation_space: Space[Any], *, generator: torch.Generator) -> Trunk:
-        """A trunk on the CPU: orthogonal weights of gain sqrt(2) (Saxe et al. 2014), biases 0."""
-        encoder = Encoder(observation_space, normalize=self.normalize)
+    if isinstance(network, MLP):
+        encoder = Encoder(observation_space, normalize=network.normalize)
         if len(encoder.shape) != 1:
             raise PgtsError(f"an mlp sees states or vectors, not images of shape {encoder.shape}; use a cnn")
-        layers = _dense(encoder.num_inputs, self.hidden, self.activation, generator)
-        return Trunk(encoder, nn.Sequential(*layers), (encoder.num_inputs, *self.hidden)[-1])
-
-
-@final
-@dataclass(frozen=True)
-class CNN:
-    """Convolutions without padding over channels-last images, then fully connected layers.
-
-    The default is the usual one for the 7x7x3 views of MiniGrid (Chevalier-Boisvert et al. 2023).
-
-    Args:
-        channels: of the convolutions, one after the other.
-        kernel_size, stride: of all of them.
-        hidden: the sizes of the fully connected layers after them.
-        activation: "tanh" or "relu".
-        normalize: each channel by its running mean and variance.
-        scale: what observations are divided by. Default: 255 for uint8, else 1. MiniGrid's numbers are codes of at
-            most 10, so 10 suits them better.
-    """
-
-    channels: tuple[int, ...] = (16, 32, 64)
-    kernel_size: int = 2
-    stride: int = 1
-    hidden: tuple[int, ...] = (128,)
-    activation: Activation = "relu"
-    normalize: bool = False
-    scale: float | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "channels", _sizes("channels", self.channels))
-        object.__setattr__(self, "hidden", _sizes("hidden", self.hidden))
-        _sizes("kernel_size and stride", (self.kernel_size, self.stride))
-        _check_activation(self.activation)
-        if self.scale is not None and not 0 < self.scale < math.inf:
-            raise PgtsError(f"scale is {self.scale}; it must be finite and above 0")
-
-    def trunk(self, observation_space: Space[Any], *, generator: torch.Generator) -> Trunk:
-        """A trunk on the CPU, initialised as that of `MLP`."""
-        encoder = Encoder(observation_space, normalize=self.normalize, scale=self.scale)
+        flat, layers = encoder.num_inputs, list[nn.Module]()
+    else:
+        encoder = Encoder(observation_space, normalize=network.normalize, scale=network.scale)
         if len(encoder.shape) != 3:
             raise PgtsError(f"a cnn sees images (H, W, C), not {observation_space}; use an mlp")
-        height, width, inputs = encoder.shape
-        layers: list[nn.Module] = []
-        for outputs in self.channels:
-            height, width = ((side - self.kernel_size) // self.stride + 1 for side in (height, width))
-            if min(height, width) < 1:
-                raise PgtsError(f"images of shape {encoder.shape} are too small for {self}")
-            conv = skip_init(nn.Conv2d, inputs, outputs, self.kernel_size, self.stride, dtype=torch.float32)
-            layers += [_orthogonal(conv, math.sqrt(2), generator), _ACTIVATIONS[self.activation]()]
-            inputs = outputs
-        flat = height * width * inputs
-        layers += [nn.Flatten(), *_dense(flat, self.hidden, self.activation, generator)]
-        return Trunk(encoder, nn.Sequential(*layers), (flat, *self.hidden)[-1])
+        flat, layers = _convolutions(network, encoder, generator)
+    layers += _dense(flat, network.hidden, network.activation, generator)
+    return Trunk(encoder, nn.Sequential(*layers), (flat, *network.hidden)[-1])
 
 
-NetworkDescription = MLP | CNN
+def _convolutions(network: CNN, encoder: Encoder, generator: torch.Generator) -> tuple[int, list[nn.Module]]:
+    """How many numbers the convolutions end in, and their layers."""
+    height, width, inputs = encoder.shape
+    layers: list[nn.Module] = []
+    for outputs in network.channels:
+        height, width = ((side - network.kernel_size) // network.stride + 1 for side in (height, width))
+        if min(height, width) < 1:
+            raise PgtsError(f"images of shape {encoder.shape} are too small for {network!r}")
+        conv = skip_init(nn.Conv2d, inputs, outputs, network.kernel_size, network.stride, dtype=torch.float32)
+        layers += [_orthogonal(conv, math.sqrt(2), generator), _ACTIVATIONS[network.activation]()]
+        inputs = outputs
+    return height * width * inputs, [*layers, nn.Flatten()]
 
 
 @final
@@ -287,7 +239,7 @@ class Network(nn.Module):
             own[name].copy_(value)
 
 
-def _dense(inputs: int, hidden: tuple[int, ...], activation: Activation, generator: torch.Generator) -> list[nn.Module]:
+def _dense(inputs: int, hidden: Sequence[int], activation: str, generator: torch.Generator) -> list[nn.Module]:
     layers: list[nn.Module] = []
     for outputs in hidden:
         linear = skip_init(nn.Linear, inputs, outputs, dtype=torch.float32)
@@ -300,15 +252,3 @@ def _orthogonal(layer: Any, gain: float, generator: torch.Generator) -> Any:
     nn.init.orthogonal_(layer.weight, gain, generator=generator)
     nn.init.zeros_(layer.bias)
     return layer
-
-
-def _sizes(name: str, sizes: Any) -> tuple[int, ...]:
-    """The sizes as a tuple; PgtsError unless they are whole numbers of at least 1."""
-    if not isinstance(sizes, list | tuple) or not all(isinstance(size, int) and size >= 1 for size in sizes):
-        raise PgtsError(f"{name} is {sizes!r}; sizes are whole numbers of at least 1")
-    return tuple(sizes)
-
-
-def _check_activation(activation: str) -> None:
-    if activation not in _ACTIVATIONS:
-        raise PgtsError(f"activation is {activation!r}; it must be one of {', '.join(_ACTIVATIONS)}")

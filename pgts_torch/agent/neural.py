@@ -9,22 +9,16 @@ from gymnasium.spaces import Space
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.critics import (
-    Critic,
-    Method,
-    MonteCarlo,
-    Target,
-    TDLambda,
-    check_target,
-    check_targets,
-    lambda_returns,
-)
-from pgts_torch.agent.networks import MLP, Network, NetworkDescription, Trunk
+from pgts_torch.agent.critics import Critic, check_targets, lambda_returns
+from pgts_torch.agent.networks import Network, Trunk, make_trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.options.critics import MonteCarlo, NetworkValues
+from pgts_torch.options.fields import limit
+from pgts_torch.options.policies import CNN, MLP
 from pgts_torch.seeding import stream
 
 _ROUNDING = torch.finfo(torch.float32).eps
@@ -38,7 +32,7 @@ class NetworkPolicy(Policy):
     Args:
         observation_space: Discrete(n), vectors or channels-last images.
         num_actions: of the discrete action set.
-        network: its trunk.
+        options: its trunk.
         seed: the weights are drawn from the stream (seed, "policy"), alike on every device.
 
     Raises:
@@ -49,13 +43,14 @@ class NetworkPolicy(Policy):
         self,
         observation_space: Space[Any],
         num_actions: int,
+        options: MLP | CNN = MLP(),  # noqa: B008 - frozen
         *,
-        network: NetworkDescription = MLP(),  # noqa: B008 - frozen
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
         generator = stream(seed, "policy")
-        trunk = network.trunk(observation_space, generator=generator)
+        trunk = make_trunk(options, observation_space, generator=generator)
+        self.options = options
         self.network = Network(trunk, num_actions, gain=0.01, generator=generator).to(device)
         self.num_actions = num_actions
 
@@ -83,62 +78,36 @@ class NetworkCritic(Critic):
 
     Args:
         observation_space, num_actions: what is seen and done.
-        network: a trunk's description; or the trunk of a policy, to share it. A shared trunk is moved by both, and its
-            running statistics of observations by the policy's update.
-        target: learn "v", or "q" at the actions taken.
-        method: how targets are made.
-        learning_rate, max_grad_norm: of Adam; `max_grad_norm=None` clips nothing.
-        num_epochs, minibatch_size: passes over the visits of an iteration, and visits in each gradient step.
-        fresh_targets: each of these passes is a fit to targets of its own, of the critic as it is by then. One fit per
-            iteration leaves gamma (1 - lambda) / (1 - gamma lambda) of what is missing to v^pi, often 0.83.
-        normalize_returns: False keeps mean 0 and scale 1.
-        polyak, target_period: after every `target_period` fits the target network moves by the share `polyak` toward
-            the network. 1 and 1: the network as the last fit left it.
+        trunk: that of a policy, which is shared instead of `options.network`. It is moved by both, and its running
+            statistics of observations by the policy's update.
         seed: the weights are drawn from the stream (seed, "critic").
     """
 
     dtype = torch.float32
+    options: Any
 
     def __init__(
         self,
         observation_space: Space[Any],
         num_actions: int,
+        options: NetworkValues = NetworkValues(),  # noqa: B008 - frozen
         *,
-        network: NetworkDescription | Trunk = MLP(),  # noqa: B008 - frozen
-        target: Target = "v",
-        method: Method = TDLambda(0.95),  # noqa: B008 - frozen
-        learning_rate: float = 3e-4,
-        max_grad_norm: float | None = 0.5,
-        num_epochs: int = 10,
-        minibatch_size: int = 64,
-        fresh_targets: bool = False,
-        normalize_returns: bool = True,
-        polyak: float = 1.0,
-        target_period: int = 1,
+        trunk: Trunk | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
-        check_count("num_epochs", num_epochs)
-        check_count("minibatch_size", minibatch_size)
-        check_count("target_period", target_period)
-        if not 0 < polyak <= 1:
-            raise PgtsError(f"polyak is {polyak}; it must be above 0 and at most 1")
-        self.target = check_target(target)
-        self.num_actions, self.method = num_actions, method
-        self.num_epochs, self.minibatch_size, self.normalize_returns = num_epochs, minibatch_size, normalize_returns
-        self.polyak, self.target_period, self.fresh_targets = polyak, target_period, fresh_targets
+        self.options = filled = options.filled("sampled")
+        self.target, self.num_actions = options.target, num_actions
         generator = stream(seed, "critic")
-        trunk = network if isinstance(network, Trunk) else network.trunk(observation_space, generator=generator)
-        outputs = 1 if target == "v" else num_actions
+        if trunk is None:
+            own = CNN() if len(observation_space.shape or ()) == 3 else MLP()
+            network = options.network if isinstance(options.network, MLP | CNN) else own
+            trunk = make_trunk(network, observation_space, generator=generator)
+        outputs = 1 if self.target == "v" else num_actions
         self.network = Network(trunk, outputs, gain=1.0, generator=generator).to(device)
-        self._lags = polyak < 1 or target_period > 1
-        if fresh_targets and self._lags:
-            raise PgtsError(
-                "fresh_targets is True, but the network that makes targets lags behind: polyak is "
-                f"{polyak} and target_period {target_period}; take the one or the other"
-            )
+        self._lags = options.lags
         self._target_network = copy.deepcopy(self.network) if self._lags else self.network
-        self._optimiser = Optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
+        self._optimiser = Optimiser(learning_rate=filled.learning_rate, max_grad_norm=limit(options.max_grad_norm))
         self._policy: Policy | None = None
         self._asked: tuple[Rollout, tuple[Tensor, Tensor]] | None = None
         self._mean, self._scale, self._num_fits = 0.0, 1.0, 0
@@ -169,7 +138,7 @@ class NetworkCritic(Critic):
         if encoder.fresh or not _share(policy, self.network):
             encoder.absorb(observation_V)
         input_V = self.network.encode(observation_V)
-        fits, passes = (self.num_epochs, 1) if self.fresh_targets else (1, self.num_epochs)
+        fits, passes = (self.options.num_epochs, 1) if self.options.fresh_targets else (1, self.options.num_epochs)
         norms = self._fit(input_V, action_V, target_V, passes, generator)
         for _ in range(fits - 1):
             norms += self._fit(input_V, action_V, self._targets(rollout)[1][alive_TB], passes, generator)
@@ -190,12 +159,12 @@ class NetworkCritic(Critic):
     ) -> list[float]:
         """Move the network toward given targets; the norms of its gradients."""
         check_targets(target_V)
-        if self.normalize_returns:
+        if self.options.normalize_returns:
             self._rescale(target_V)
         y_V = (target_V - self._mean) / self._scale if self._scale else torch.zeros_like(target_V)
         columns, norms = (input_V, action_V, y_V.float()), []
         for _ in range(num_passes):
-            for input_N, action_N, y_N in minibatches(columns, self.minibatch_size, generator=generator):
+            for input_N, action_N, y_N in minibatches(columns, self.options.minibatch_size, generator=generator):
                 loss = (y_N - self._taken(self.network(input_N), action_N)).square().mean()
                 norms.append(self._optimiser.step(self.network.weights, loss, "value"))
         self._num_fits += 1
@@ -263,13 +232,13 @@ class NetworkCritic(Critic):
         asked, self._asked = self._asked, None
         if asked is not None and asked[0] is rollout and not self._lags:
             v_TB, next_v_TB = asked[1]
-        elif asked is None and not self._num_fits and self.normalize_returns:
+        elif asked is None and not self._num_fits and self.options.normalize_returns:
             v_TB = next_v_TB = torch.zeros_like(rollout.reward_TB)
         else:
             v_TB, next_v_TB = rollout.values(lambda observation_N: self._v(self._target_network, observation_N))
-        if isinstance(self.method, MonteCarlo):
+        if isinstance(self.options.method, MonteCarlo):
             return v_TB, lambda_returns(rollout, next_v_TB, rollout.survival_TB, 1.0)
-        return v_TB, lambda_returns(rollout, next_v_TB, rollout.discount_TB, self.method.lambda_)
+        return v_TB, lambda_returns(rollout, next_v_TB, rollout.discount_TB, self.options.method.lambda_)
 
     @torch.no_grad()
     def _rescale(self, target_V: Float[Tensor, "V"]) -> None:
@@ -288,10 +257,10 @@ class NetworkCritic(Critic):
 
     @torch.no_grad()
     def _move_target_network(self) -> None:
-        if not self._lags or self._num_fits % self.target_period:
+        if not self._lags or self._num_fits % self.options.target_period:
             return
         for moved, aim in zip(self._target_network.weights, self.network.weights, strict=True):
-            moved.lerp_(aim, self.polyak)
+            moved.lerp_(aim, self.options.polyak)
         for statistic, present in zip(self._target_network.buffers(), self.network.buffers(), strict=True):
             statistic.copy_(present)
 

@@ -12,8 +12,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import torch
 from jaxtyping import Float
@@ -21,11 +20,12 @@ from torch import Tensor
 
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural import NetworkPolicy
-from pgts_torch.agent.optimisers import Optimiser, check_positive, minibatches
+from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.rollout import StateWeight
-from pgts_torch.agent.updates import Update, check_state_weight
-from pgts_torch.errors import NotFinite, PgtsError, check_count
+from pgts_torch.agent.updates import Update
+from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.options.fields import limit
+from pgts_torch.options.updates import PPO, Gradient
 from pgts_torch.search.lookahead import check_finite
 
 
@@ -53,33 +53,22 @@ class Move(NamedTuple):
     losses: dict[str, float]
 
 
-@dataclass(eq=False, kw_only=True)
 class NetworkUpdate(Update):
     """Gradient steps on the parameters of a network policy.
 
     Running statistics of the observations see the batch after the steps, so that these start from the policy that made
     it; only the first batch of all is seen before.
-
-    Args:
-        learning_rate: of the optimiser.
-        optimizer: "adam" or plain gradient descent, "sgd".
-        max_grad_norm: longer gradients are shortened to it; None: never.
     """
 
     policies = (NetworkPolicy,)
 
-    learning_rate: float = 3e-4
-    optimizer: Literal["adam", "sgd"] = "adam"
-    max_grad_norm: float | None = 0.5
-    state_weight: StateWeight = "visits"
-    _optimiser: Optimiser = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        check_state_weight(self.state_weight)
+    def __init__(self, options: Any) -> None:
+        self.options, self.state_weight = options, options.state_weight
         self._optimiser = Optimiser(
-            learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm, method=self.optimizer
+            learning_rate=options.learning_rate,
+            max_grad_norm=limit(options.max_grad_norm),
+            method=options.optimizer,
         )
-        self.check_options()
 
     def __call__(
         self,
@@ -141,10 +130,6 @@ class NetworkUpdate(Update):
             self._optimiser.check_fits(policy.network.weights)
 
     @abstractmethod
-    def check_options(self) -> None:
-        """PgtsError if an option beside those above is out of range."""
-
-    @abstractmethod
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
         """Take the steps."""
 
@@ -154,66 +139,46 @@ class NetworkUpdate(Update):
 
 
 @final
-@dataclass(eq=False, kw_only=True)
 class GradientUpdate(NetworkUpdate):
     """One step up the all-action policy gradient; with sampled advantages, A2C (Mnih et al. 2016).
 
         maximise  sum_s w(s) [ sum_a pi(a|s) adv(s, a) + entropy_coef H(pi(.|s)) ]
 
     With one-hot states, no hidden layer and plain gradient descent it is `SoftmaxUpdate`.
-
-    Args:
-        entropy_coef: at least 0, in reward units.
     """
 
-    entropy_coef: float = 0.0
+    options: Gradient
 
-    def check_options(self) -> None:
-        _check_entropy_coef(self.entropy_coef)
+    def __init__(self, options: Gradient = Gradient()) -> None:  # noqa: B008 - frozen
+        super().__init__(options)
 
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
         """policy: less the objective without entropy, before the step; grad_norm: before clipping."""
         log_NA = network(batch.input_N).log_softmax(-1)
         policy_loss = -(batch.weight_N @ (log_NA.exp() * batch.advantage_NA.float()).sum(-1))
-        bonus = batch.weight_N @ entropy(log_NA) if self.entropy_coef else 0.0
-        norm = self.step(network, policy_loss - self.entropy_coef * bonus)
+        coef = self.options.entropy_coef
+        bonus = batch.weight_N @ entropy(log_NA) if coef else 0.0
+        norm = self.step(network, policy_loss - coef * bonus)
         losses = {"policy": float(policy_loss.detach()), "grad_norm": norm}
         return Move(log_NA.detach(), log_probs(network, batch.input_N), losses)
 
 
 @final
-@dataclass(eq=False, kw_only=True)
 class PPOUpdate(NetworkUpdate):
     """Many small steps up an objective that is clipped where pi has moved far enough (Schulman et al. 2017).
 
         maximise  mean_s w(s) [ sum_a pi_old(a|s) min(rho_a adv, clip(rho_a, 1 - clip_range, 1 + clip_range) adv)
                                 + entropy_coef H(pi(.|s)) ],        rho_a = pi(a|s) / pi_old(a|s)
 
-    over minibatches, the weights scaled to a mean of 1.
-
-    Args:
-        clip_range: above 0.
-        num_epochs, minibatch_size: passes over the batch, and observations in each step.
-        entropy_coef: at least 0, in units of the advantages (after their normalisation).
-        target_kl: no further step once the mean KL(pi_old || pi) of a minibatch, over all actions, exceeds it.
-        normalize_advantage: divide by the root of mean_s w(s) (sum_a pi_old(a|s) |adv(s, a)|)^2; for sampled advantages
-            that is their root mean square. Nothing is subtracted: their mean under pi is 0 already.
+    over minibatches, the weights scaled to a mean of 1. `normalize_advantage` divides by the root of
+    mean_s w(s) (sum_a pi_old(a|s) |adv(s, a)|)^2; for sampled advantages that is their root mean square. Nothing is
+    subtracted: their mean under pi is 0 already. `target_kl` is held against the mean KL(pi_old || pi) of a minibatch.
     """
 
-    clip_range: float = 0.2
-    num_epochs: int = 10
-    minibatch_size: int = 64
-    entropy_coef: float = 0.0
-    target_kl: float | None = None
-    normalize_advantage: bool = True
+    options: PPO
 
-    def check_options(self) -> None:
-        check_positive("clip_range", self.clip_range)
-        check_count("num_epochs", self.num_epochs)
-        check_count("minibatch_size", self.minibatch_size)
-        _check_entropy_coef(self.entropy_coef)
-        if self.target_kl is not None:
-            check_positive("target_kl", self.target_kl)
+    def __init__(self, options: PPO = PPO()) -> None:  # noqa: B008 - frozen
+        super().__init__(options)
 
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
         """policy: mean over the steps of less the objective without entropy; grad_norm: mean, before clipping;
@@ -221,12 +186,15 @@ class PPOUpdate(NetworkUpdate):
         input_N, advantage_NA, weight_N = batch.input_N, batch.advantage_NA.float(), batch.weight_N
         old_NA = log_probs(network, input_N)
         weight_N = weight_N / weight_N.mean()
-        if self.normalize_advantage:
+        if self.options.normalize_advantage:
             advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N)
         columns, policy_losses, norms = (input_N, old_NA, advantage_NA, weight_N), [], []
-        made = passes(network, columns, self.num_epochs, self.minibatch_size, generator)
+        made = passes(network, columns, self.options.num_epochs, self.options.minibatch_size, generator)
         for log_NA, (_, before_NA, part_NA, part_N) in made:
-            if self.target_kl is not None and mean(part_N, divergence(before_NA, log_NA)) > self.target_kl:
+            if (
+                self.options.target_kl is not None
+                and mean(part_N, divergence(before_NA, log_NA)) > self.options.target_kl
+            ):
                 break
             with torch.no_grad():
                 gain_NA, push_NA = self.objective(log_NA, before_NA, part_NA)
@@ -235,7 +203,7 @@ class PPOUpdate(NetworkUpdate):
             norms.append(self.step(network, policy_loss, through=(log_NA, down_NA)))
             policy_losses.append(float(policy_loss))
         new_NA = log_probs(network, input_N)
-        outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.clip_range
+        outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.options.clip_range
         losses = {
             "policy": sum(policy_losses) / len(policy_losses),
             "grad_norm": sum(norms) / len(norms),
@@ -254,12 +222,12 @@ class PPOUpdate(NetworkUpdate):
         Autograd through these dozen operations would cost as much as the network itself.
         """
         ratio_NA = (log_NA - old_NA).exp()
-        clipped_NA = ratio_NA.clamp(1 - self.clip_range, 1 + self.clip_range)
+        clipped_NA = ratio_NA.clamp(1 - self.options.clip_range, 1 + self.options.clip_range)
         free_NA = ratio_NA * advantage_NA
         gain_NA = torch.minimum(free_NA, clipped_NA * advantage_NA)
         slope_NA = torch.where(gain_NA == free_NA, advantage_NA, 0.0)
-        if self.entropy_coef:
-            slope_NA = slope_NA - self.entropy_coef * (log_NA + 1)
+        if self.options.entropy_coef:
+            slope_NA = slope_NA - self.options.entropy_coef * (log_NA + 1)
         return gain_NA, log_NA.exp() * slope_NA
 
 
@@ -312,8 +280,3 @@ def _check_numbers(advantage_NA: Tensor, weight_N: Tensor) -> None:
                 )
     if not float(weight_N.sum()) > 0 or float(weight_N.min()) < 0:
         raise PgtsError(f"weight_N is {weight_N.tolist()[:8]}; weights are at least 0, and some state must count")
-
-
-def _check_entropy_coef(entropy_coef: float) -> None:
-    if not 0 <= entropy_coef < math.inf:
-        raise PgtsError(f"entropy_coef is {entropy_coef}; it must be finite and at least 0")

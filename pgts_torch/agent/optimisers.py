@@ -32,11 +32,6 @@ class Optimiser:
     def __init__(
         self, *, learning_rate: float, max_grad_norm: float | None, method: Literal["adam", "sgd"] = "adam"
     ) -> None:
-        check_positive("learning_rate", learning_rate)
-        if max_grad_norm is not None:
-            check_positive("max_grad_norm", max_grad_norm)
-        if method not in ("adam", "sgd"):
-            raise PgtsError(f"optimizer is {method!r}; it must be adam or sgd")
         self.learning_rate, self.max_grad_norm, self.method = learning_rate, max_grad_norm, method
         self._num_steps = 0
         self._first_D: Tensor | None = None
@@ -138,9 +133,3 @@ def minibatches(columns: Sequence[Tensor], size: int, *, generator: torch.Genera
         return iter([tuple(columns)])
     order_N = torch.randperm(len(columns[0]), generator=generator, device=generator.device)
     return zip(*(column[order_N.to(column.device)].split(size) for column in columns), strict=True)
-
-
-def check_positive(name: str, value: float) -> None:
-    """PgtsError unless it is finite and above 0."""
-    if not 0 < value < math.inf:
-        raise PgtsError(f"{name} is {value}; it must be finite and above 0")

@@ -1,6 +1,5 @@
 """Policy gradient with tree search, from rollouts.        [PGTS Alg. 1]"""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
 from pathlib import Path
@@ -14,20 +13,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pgts_torch.agent import saved, saving
-from pgts_torch.agent.advantages import SampledAdvantages
 from pgts_torch.agent.build import (
-    DEFAULT_TOLERANCE,
     Description,
     check_parts,
-    described,
+    chosen,
     make_critic,
-    make_depths,
     make_device,
-    make_estimator,
-    make_horizon,
     make_policy,
     make_search,
     make_update,
+    plain,
 )
 from pgts_torch.agent.certificate import Certificates
 from pgts_torch.agent.critics import Critic
@@ -39,13 +34,14 @@ from pgts_torch.agent.model_check import Mode, ModelCheck
 from pgts_torch.agent.policies import Policy, listed
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.ranks import present_ranks
-from pgts_torch.agent.rollout import Horizon
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
 from pgts_torch.agent.world import ModelWorld
-from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.errors import PgtsError
 from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.rewards import RewardRange
+from pgts_torch.options.arguments import read
+from pgts_torch.options.rollouts import SampledAdvantages
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.seeding import SharedGenerators, stream
@@ -125,7 +121,7 @@ class PGTS:
         policy: Description | Policy | None = None,
         critic: Description | Critic | None = None,
         update: Description | Update | None = None,
-        horizon: Description | Horizon = "fixed",
+        horizon: Description = "fixed",
         num_envs: int = 32,
         actions_per_dimension: int | None = None,
         action_repeat: int = 1,
@@ -141,15 +137,11 @@ class PGTS:
         self._arguments = {
             name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()
         }
-        depths = make_depths(depth, max_depth, tolerance)
-        if stop_at is not None and not 0 <= stop_at < math.inf:
-            raise PgtsError(f"stop_at is {stop_at}; it must be finite and at least 0")
+        options = read(self._arguments)
+        num_envs = options.rollout.num_envs
         self.seed = seed
         self.device = make_device(device)
-        chosen = make_estimator(estimator)
         self.ranks = present_ranks()
-        num_envs = self._arguments["num_envs"]
-        check_count("num_envs", num_envs)
         with SharedGenerators(seed, "construction"):
             self.source = EnvSource.of(env, kwargs=env_kwargs, gamma=gamma, actions_per_dimension=actions_per_dimension)
             if num_envs < self.ranks.size and self.source.given is None:
@@ -159,44 +151,46 @@ class PGTS:
                 num_envs=self.ranks.count(num_envs),
                 gamma=gamma,
                 observation_key=observation_key,
-                plain=isinstance(chosen, SampledAdvantages),
-                action_repeat=action_repeat,
+                plain=isinstance(options.estimator, SampledAdvantages),
+                action_repeat=options.search.action_repeat,
                 device=device,
             )
         self._arguments["env"] = self.source.description
         if reward_range is not None:
             self.world.promise(RewardRange.of(reward_range))
+        self.options = options = chosen(options, self.world)
         if not isinstance(policy, Policy):
-            policy = make_policy(policy, self.world, seed=seed)
+            policy = make_policy(options.policy, self.world, seed=seed)
         if not isinstance(critic, Critic):
-            critic = make_critic(critic, self.world, policy, chosen, seed=seed)
+            critic = make_critic(options.critic, self.world, policy, options.estimator, seed=seed)
         if not isinstance(update, Update):
-            update = make_update(update, policy, chosen)
-        if not isinstance(horizon, Horizon):
-            horizon = make_horizon(horizon)
-        self.policy, self.critic, self.update, self.horizon = policy, critic, update, horizon
+            update = make_update(options.update, policy)
+        self.policy, self.critic, self.update, self.horizon = policy, critic, update, options.rollout.horizon
         self.search: Search | None = None
         self.certificates: Certificates | None = None
         self.depth_choice: DepthChoice | None = None
-        if isinstance(chosen, SampledAdvantages):
-            self.estimator: Estimator = SampledEstimator(policy, critic, chosen.lambda_, update.state_weight)
+        if isinstance(options.estimator, SampledAdvantages):
+            self.estimator: Estimator = SampledEstimator(policy, critic, options.estimator.lambda_, update.state_weight)
         else:
             assert isinstance(self.world, ModelWorld)
-            self.search = make_search(search, self.world)
+            self.search = make_search(options.search, self.world)
+            depths, stop_at = options.search.depths, options.search.stop_at
             self.certificates = Certificates(self.world, self.search, critic, num_depths=len(depths), ranks=self.ranks)
             if stop_at is not None:
                 self.certificates.check(f"stop_at is {stop_at}")
             if depth == "adaptive":
                 self.certificates.check("depth is adaptive")
             look = PolicyLookahead(self.world, policy, critic, self.search, self.ranks)
-            tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
+            tolerance = options.search.filled("adaptive").tolerance
             self.depth_choice = DepthChoice(
                 look, self.certificates, depths=depths, tolerance=tolerance, stop_at=stop_at
             )
             self.estimator = LookaheadEstimator(look, self.depth_choice, update.state_weight)
         is_asked = self.search is not None
-        self.model_check = ModelCheck(self.world, mode=model_check, is_asked=is_asked, seed=seed, ranks=self.ranks)
-        check_parts(self._arguments, self.world, policy, critic, update, chosen)
+        self.model_check = ModelCheck(
+            self.world, mode=options.search.model_check, is_asked=is_asked, seed=seed, ranks=self.ranks
+        )
+        check_parts(self._arguments, self.world, policy, update)
         self._own_actions = self.source.own_actions(self.world.env)
         self._predicting = stream(seed, "predict", device=self.device)
         self.num_iterations = 0
@@ -335,7 +329,10 @@ class PGTS:
 
     def content(self) -> dict[str, Any]:
         """What `save` writes: the arguments and the state. Of several processes all must ask for it."""
-        return {"arguments": described(self._arguments) | {"device": str(self.device)}, "state": self.state_dict()}
+        return {
+            "arguments": plain(self._arguments, self.options) | {"device": str(self.device)},
+            "state": self.state_dict(),
+        }
 
     @classmethod
     def load(

@@ -2,7 +2,6 @@
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import Any, final
 
 import torch
@@ -10,57 +9,37 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.options.policies import Biased, Init, Random, Simplex, Softmax, Uniform
 from pgts_torch.seeding import stream
 
 
-@dataclass(frozen=True)
-class Uniform:
-    """All actions alike."""
-
-    def probs(self, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
-        return torch.full((num_states, num_actions), 1 / num_actions, dtype=torch.float64)
-
-
-@dataclass(frozen=True)
-class Random:
-    """Each state's distribution drawn uniformly from the simplex."""
-
-    def probs(self, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
-        uniform_SA = torch.rand(num_states, num_actions, generator=generator, dtype=torch.float64)
-        exponential_SA = -torch.log1p(-uniform_SA).clamp(max=-1e-12)
-        return exponential_SA / exponential_SA.sum(-1, keepdim=True)
-
-
-@dataclass(frozen=True)
-class Biased:
-    """One action with the given probability in every state, the others sharing the rest.
+def initial(init: Init, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
+    """The policy before the first update.
 
     `Biased(action=0, probability=1)` on the Ladder is the paper's "always left".
     """
-
-    action: int
-    probability: float
-
-    def probs(self, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
-        if not 0 <= self.action < num_actions:
-            raise PgtsError(f"action is {self.action}; actions are 0 to {num_actions - 1}")
-        if not 0 < self.probability <= 1:
-            raise PgtsError(f"probability is {self.probability}; it must be above 0 and at most 1")
-        if num_actions == 1:
-            return torch.ones(num_states, 1, dtype=torch.float64)
-        rest = (1 - self.probability) / (num_actions - 1)
-        probs_SA = torch.full((num_states, num_actions), rest, dtype=torch.float64)
-        probs_SA[:, self.action] = self.probability
-        return probs_SA
-
-
-Initialisation = Uniform | Random | Biased
+    if isinstance(init, Biased) and init.action >= num_actions:
+        raise PgtsError(f"policy.init.action is {init.action}; actions are 0 to {num_actions - 1}")
+    if isinstance(init, Uniform) or num_actions == 1:
+        return torch.full((num_states, num_actions), 1 / num_actions, dtype=torch.float64)
+    if isinstance(init, Random):
+        uniform_SA = torch.rand(num_states, num_actions, generator=generator, dtype=torch.float64)
+        exponential_SA = -torch.log1p(-uniform_SA).clamp(max=-1e-12)
+        return exponential_SA / exponential_SA.sum(-1, keepdim=True)
+    rest = (1 - init.probability) / (num_actions - 1)
+    probs_SA = torch.full((num_states, num_actions), rest, dtype=torch.float64)
+    probs_SA[:, init.action] = init.probability
+    return probs_SA
 
 
 class Policy(ABC):
-    """pi(a|o) over observations: states of a tabular world, vectors or images of another."""
+    """pi(a|o) over observations: states of a tabular world, vectors or images of another.
+
+    options: what it was made from; None for a policy of the caller's own kind.
+    """
 
     num_actions: int
+    options: Any = None
 
     @abstractmethod
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
@@ -104,24 +83,19 @@ class TabularPolicy(Policy):
 
 @final
 class SoftmaxPolicy(TabularPolicy):
-    """pi(a|s) ~ exp(logits[s, a]): every action keeps a positive probability.
-
-    Raises:
-        PgtsError: an initialisation with a probability of 0 (its logit would be infinite).
-    """
+    """pi(a|s) ~ exp(logits[s, a]): every action keeps a positive probability."""
 
     def __init__(
         self,
         num_states: int,
         num_actions: int,
+        options: Softmax = Softmax(),  # noqa: B008 - frozen
         *,
-        init: Initialisation = Uniform(),
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
-        probs_SA = init.probs(num_states, num_actions, stream(seed, "policy"))
-        if not bool((probs_SA > 0).all()):
-            raise PgtsError(f"{init} gives some action probability 0; a softmax policy cannot: use a simplex policy")
+        self.options = options
+        probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy"))
         self.num_states, self.num_actions = num_states, num_actions
         self.logits_SA = probs_SA.log().to(device)
 
@@ -144,13 +118,14 @@ class SimplexPolicy(TabularPolicy):
         self,
         num_states: int,
         num_actions: int,
+        options: Simplex = Simplex(),  # noqa: B008 - frozen
         *,
-        init: Initialisation = Uniform(),
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
+        self.options = options
         self.num_states, self.num_actions = num_states, num_actions
-        self.probs_SA = init.probs(num_states, num_actions, stream(seed, "policy")).to(device)
+        self.probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy")).to(device)
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         """The rows of the parameter."""

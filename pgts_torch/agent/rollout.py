@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, final
 
 import numpy as np
 import torch
@@ -18,70 +17,29 @@ from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, Horizon
+from pgts_torch.options.updates import StateWeight
 from pgts_torch.seeding import SharedGenerators, draw_keys, seed_sequence
 
-StateWeight = Literal["occupancy", "visits", "uniform"]
 
+def survival(horizon: Horizon, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
+    """The factor of the weight of an episode after a step of this discount.
 
-@final
-@dataclass(frozen=True)
-class FixedHorizon:
-    """Every episode runs for `length` steps or until it terminates; a visit has the product of the discounts before it
-    as its weight."""
-
-    length: int = 100
-
-    def __post_init__(self) -> None:
-        if self.length < 1:
-            raise PgtsError(f"horizon length is {self.length}; it must be at least 1")
-
-    @property
-    def limit(self) -> int:
-        """The largest number of steps of an episode."""
-        return self.length
-
-    def survival(self, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
-        """The factor of the weight after a step of this discount: the discount."""
-        return discount_B.double()
-
-    def check_end(self, num_alive: int) -> None:
-        """Do nothing: episodes may be alive at the limit."""
-
-
-@final
-@dataclass(frozen=True)
-class GeometricHorizon:
-    """After each step an episode goes on with the probability gamma; every visit has weight 1.
-
-    So visits are an unbiased sample of d^pi, and undiscounted sums of rewards are unbiased estimates of v^pi. Reaching
-    `max_length` is an error: it guards against episodes that never end (gamma = 1).
+    Fixed horizon: the discount. Geometric horizon: 1 with the discount as its probability, else 0; so visits are an
+    unbiased sample of d^pi, and undiscounted sums of rewards are unbiased estimates of v^pi.
     """
-
-    max_length: int = 100_000
-
-    def __post_init__(self) -> None:
-        if self.max_length < 1:
-            raise PgtsError(f"max_length is {self.max_length}; it must be at least 1")
-
-    @property
-    def limit(self) -> int:
-        """The largest number of steps of an episode."""
-        return self.max_length
-
-    def survival(self, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
-        """The factor of the weight after a step of this discount: 1 with the discount as its probability, else 0."""
-        uniform_B = torch.rand(discount_B.shape, generator=generator, dtype=torch.float64, device=generator.device)
-        return (uniform_B.to(discount_B.device) < discount_B).double()
-
-    def check_end(self, num_alive: int) -> None:
-        """PgtsError if episodes are alive at the limit."""
-        if num_alive:
-            raise PgtsError(
-                f"an episode is longer than max_length = {self.max_length} of the geometric horizon; is gamma 1?"
-            )
+    if isinstance(horizon, FixedHorizon):
+        return discount_B.double()
+    uniform_B = torch.rand(discount_B.shape, generator=generator, dtype=torch.float64, device=generator.device)
+    return (uniform_B.to(discount_B.device) < discount_B).double()
 
 
-Horizon = FixedHorizon | GeometricHorizon
+def check_end(horizon: Horizon, num_alive: int) -> None:
+    """PgtsError if episodes are alive at the limit of a geometric horizon."""
+    if num_alive and isinstance(horizon, GeometricHorizon):
+        raise PgtsError(
+            f"an episode is longer than max_length = {horizon.max_length} of the geometric horizon; is gamma 1?"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,11 +218,11 @@ def _episodes(
                 reads.append(model_world.read(episodes.observation, observations[-1]))
         except BaseException as error:
             raise _failure(env, f"in step {len(rows)}", *episodes.blame(error)) from error
-        survival_B = horizon.survival(torch.from_numpy(discount_B), generator).numpy()
+        survival_B = survival(horizon, torch.from_numpy(discount_B), generator).numpy()
         rows.append((action_B, reward_B, discount_B, alive_B, weight_B * alive_B, survival_B))
         weight_B = weight_B * survival_B
         alive_B = alive_B & (survival_B > 0) & ~truncated_B
-    horizon.check_end(int(alive_B.sum()))
+    check_end(horizon, int(alive_B.sum()))
     state_UB = model_world.numbers(torch.cat(reads)).view(len(reads), -1) if model_world else None
     action_TB, reward_TB, discount_TB, alive_TB, weight_TB, survival_TB = (
         torch.from_numpy(np.array(column)).to(world.device) for column in zip(*rows, strict=True)
@@ -317,12 +275,11 @@ def simulated_returns(
             )
         returns_B[row_N] += weight_N * sampled.reward_N
         num_steps += len(row_N)
-        weight_N = weight_N * horizon.survival(sampled.discount_N, generator)
-        # from here on only the episodes that are not over
+        weight_N = weight_N * survival(horizon, sampled.discount_N, generator)
         alive_N = weight_N > 0
         row_N, state_N, weight_N = row_N[alive_N], sampled.next_state_N[alive_N], weight_N[alive_N]
         if len(row_N) == 0:
             break
         action_N = policy.sample(state_N, generator=generator)
-    horizon.check_end(len(row_N))
+    check_end(horizon, len(row_N))
     return returns_B, num_steps

@@ -1,8 +1,7 @@
 """How network policies move toward a target policy that the advantages of all actions name."""
 
 from abc import abstractmethod
-from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import torch
 from jaxtyping import Float
@@ -10,11 +9,9 @@ from torch import Tensor
 
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural_updates import Batch, Move, NetworkUpdate, divergence, log_probs, mean, passes
-from pgts_torch.agent.optimisers import check_positive
-from pgts_torch.errors import check_count
+from pgts_torch.options.updates import CMPO, Mirror
 
 
-@dataclass(eq=False, kw_only=True)
 class TargetUpdate(NetworkUpdate):
     """A step of the policy's probabilities, projected onto the network by KL.
 
@@ -22,13 +19,9 @@ class TargetUpdate(NetworkUpdate):
 
     over minibatches, the weights scaled to a mean of 1. The advantages must be of all actions: in the exponent, an
     estimate from one action is not unbiased.
-
-    Args:
-        num_epochs, minibatch_size: passes over the batch, and observations in each step.
     """
 
-    num_epochs: int = 10
-    minibatch_size: int = 64
+    options: Any
 
     @abstractmethod
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
@@ -44,7 +37,7 @@ class TargetUpdate(NetworkUpdate):
         target_NA = (old_NA + exponent_NA).log_softmax(-1)
         weight_N = batch.weight_N / batch.weight_N.mean()
         columns, norms = (batch.input_N, target_NA, weight_N), []
-        made = passes(network, columns, self.num_epochs, self.minibatch_size, generator)
+        made = passes(network, columns, self.options.num_epochs, self.options.minibatch_size, generator)
         for log_NA, (_, part_NA, part_N) in made:
             norms.append(self.step(network, mean(part_N, divergence(part_NA, log_NA))))
         new_NA = log_probs(network, batch.input_N)
@@ -53,7 +46,6 @@ class TargetUpdate(NetworkUpdate):
 
 
 @final
-@dataclass(eq=False, kw_only=True)
 class NetworkMirrorUpdate(TargetUpdate):
     """The mirror step, step(s, a) = adv(s, a) / temperature (Tomar et al. 2022; Protopapas and Barakat 2024).
 
@@ -61,22 +53,17 @@ class NetworkMirrorUpdate(TargetUpdate):
     step_size * w(s) = 1 / temperature does.
 
     Args:
-        temperature: in reward units; small ones make long steps.
+        options: those of networks.
     """
 
-    temperature: float = 1.0
-
-    def check_options(self) -> None:
-        check_positive("temperature", self.temperature)
-        check_count("num_epochs", self.num_epochs)
-        check_count("minibatch_size", self.minibatch_size)
+    def __init__(self, options: Mirror = Mirror()) -> None:  # noqa: B008 - frozen
+        super().__init__(options.filled("networks"))
 
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
-        return batch.advantage_NA.float() / self.temperature
+        return batch.advantage_NA.float() / self.options.temperature
 
 
 @final
-@dataclass(eq=False, kw_only=True)
 class CMPOUpdate(TargetUpdate):
     """Clipped MPO, step(s, a) = clip(adv(s, a) / (temperature scale), -clip, clip) (Hessel et al. 2021, Sec. 4).
 
@@ -85,27 +72,18 @@ class CMPOUpdate(TargetUpdate):
     The default for lookaheads: how far an action moves depends on how much better it is than usual, never on the scale
     of rewards, of which a factor of 2^k leaves every bit as it is. The scale is a mean and no root of a mean square:
     few states in which all depends on the action do not silence the many in which it matters a little.
-
-    Args:
-        temperature: in units of the scale; small ones make long steps.
-        clip: above 0; the most that an action gains or loses in log pi, before Z.
     """
 
-    learning_rate: float = 1e-3
-    temperature: float = 0.1
-    clip: float = 3.0
-
-    def check_options(self) -> None:
-        check_positive("temperature", self.temperature)
-        check_positive("clip", self.clip)
-        check_count("num_epochs", self.num_epochs)
-        check_count("minibatch_size", self.minibatch_size)
+    def __init__(self, options: CMPO = CMPO()) -> None:  # noqa: B008 - frozen
+        super().__init__(options)
 
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
         scale = max(advantage_scale(batch.advantage_NA, batch.weight_N), batch.noise)
         if scale == 0:  # all actions are alike
             return torch.zeros_like(batch.advantage_NA, dtype=torch.float32)
-        return (batch.advantage_NA / scale / self.temperature).clamp(-self.clip, self.clip).float()
+        return (
+            (batch.advantage_NA / scale / self.options.temperature).clamp(-self.options.clip, self.options.clip).float()
+        )
 
 
 def advantage_scale(advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]) -> float:

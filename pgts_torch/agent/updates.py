@@ -1,17 +1,16 @@
 """How a policy moves, given lookahead values at the states it visited."""
 
-import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, final
+from typing import Any, ClassVar, final
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy
-from pgts_torch.agent.rollout import StateWeight
 from pgts_torch.errors import PgtsError
+from pgts_torch.options.fields import limit
+from pgts_torch.options.updates import Mirror, Projected, SoftmaxGradient, StateWeight
 from pgts_torch.search.lookahead import check_finite
 from pgts_torch.tabular.ascent import centred, floored, normalised, projected_step, softmax_direction
 
@@ -22,8 +21,10 @@ class Update(ABC):
     state_weight: w(s) of a visited state. `occupancy`: the estimate of d^pi(s), as in the paper. `visits`: its share of
         all visits, without discounts (sums to 1). `uniform`: 1, as in h-PMD.
     policies: the kinds of policy that it moves.
+    options: what it was made from; None for an update of the caller's own kind.
     """
 
+    options: Any = None
     state_weight: StateWeight
     policies: ClassVar[tuple[type[Policy], ...]]
 
@@ -66,21 +67,13 @@ class Update(ABC):
             )
 
 
-@dataclass(frozen=True)
 class TabularUpdate(Update):
     """One step at the rows of a table; all other states stay as they are.
 
-    Args:
-        step_size: eta > 0.
+    step_size: eta > 0.
     """
 
-    step_size: float = 0.1
-    state_weight: StateWeight = "occupancy"
-
-    def __post_init__(self) -> None:
-        if not 0 < self.step_size < math.inf:
-            raise PgtsError(f"step_size is {self.step_size}; it must be finite and above 0")
-        check_state_weight(self.state_weight)
+    step_size: float
 
     def __call__(
         self,
@@ -116,11 +109,13 @@ class TabularUpdate(Update):
 
 
 @final
-@dataclass(frozen=True)
 class ProjectedUpdate(TabularUpdate):
     """The paper's update, pi(.|s) <- proj[pi(.|s) + eta w(s) q(s, .)].        [PGTS Eq. (3)]"""
 
     policies = (SimplexPolicy,)
+
+    def __init__(self, options: Projected = Projected()) -> None:  # noqa: B008 - frozen
+        self.options, self.step_size, self.state_weight = options, options.step_size, options.state_weight
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         assert isinstance(policy, SimplexPolicy)
@@ -128,11 +123,13 @@ class ProjectedUpdate(TabularUpdate):
 
 
 @final
-@dataclass(frozen=True)
 class SoftmaxUpdate(TabularUpdate):
     """All-action policy gradient on the logits: theta(s, .) <- theta(s, .) + eta w(s) pi (q - <pi, q>)."""
 
     policies = (SoftmaxPolicy,)
+
+    def __init__(self, options: SoftmaxGradient = SoftmaxGradient()) -> None:  # noqa: B008 - frozen
+        self.options, self.step_size, self.state_weight = options, options.step_size, options.state_weight
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         assert isinstance(policy, SoftmaxPolicy)
@@ -141,7 +138,6 @@ class SoftmaxUpdate(TabularUpdate):
 
 
 @final
-@dataclass(frozen=True)
 class MirrorUpdate(TabularUpdate):
     """A KL step at visited states, in units of what the advantages amount to (Protopapas and Barakat 2024).
 
@@ -151,33 +147,25 @@ class MirrorUpdate(TabularUpdate):
     every bit as it is. Where all advantages are 0 nothing moves.
 
     Args:
-        normalize: "rms": s as above, and at least the standard error of a sampled lookahead; "none": s = 1, the paper's
-            step in reward units.
-        floor: the least that log pi(a|s) may be below its largest in a row that moves, so that a policy which was sure
-            too early can come back; None: no limit.
+        options: those of tables. With `normalize` "rms" s is at least the standard error of a sampled lookahead; with
+            "none" it is 1, the paper's step in reward units. `floor` is the least that log pi(a|s) may be below its
+            largest in a row that moves, so that a policy which was sure too early can come back.
     """
 
     policies = (SoftmaxPolicy, SimplexPolicy)
+    options: Any
 
-    step_size: float = 1.0
-    state_weight: StateWeight = "uniform"
-    normalize: Literal["rms", "none"] = "rms"
-    floor: float | None = 12.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.normalize not in ("rms", "none"):
-            raise PgtsError(f"normalize is {self.normalize!r}; it must be rms or none")
-        if self.floor is not None and not 0 < self.floor < math.inf:
-            raise PgtsError(f"floor is {self.floor}; it must be finite and above 0, or None")
+    def __init__(self, options: Mirror = Mirror()) -> None:  # noqa: B008 - frozen
+        self.options = filled = options.filled("tables")
+        self.step_size, self.state_weight, self._floor = filled.step_size, filled.state_weight, limit(filled.floor)
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         pi_NA = policy.probs(state_N)
         log_NA = policy.logits_SA[state_N] if isinstance(policy, SoftmaxPolicy) else pi_NA.log()
         advantage_NA = centred(q_NA, pi_NA)
-        if self.normalize == "rms":
+        if self.options.normalize == "rms":
             advantage_NA = normalised(advantage_NA, pi_NA, noise=noise)
-        next_NA = floored(log_NA, self.step_size * weight_N[:, None] * advantage_NA, self.floor)
+        next_NA = floored(log_NA, self.step_size * weight_N[:, None] * advantage_NA, self._floor)
         moves_N1 = (advantage_NA != 0).any(-1, keepdim=True)
         if isinstance(policy, SoftmaxPolicy):
             _replace(policy.logits_SA, state_N, torch.where(moves_N1, next_NA, log_NA))
@@ -190,9 +178,3 @@ def _replace(table_SA: Float[Tensor, "S A"], state_N: Int[Tensor, "N"], row_NA: 
     """Write the rows; NotFinite, and nothing written, if they are no logits or probabilities."""
     check_finite("probability", "the next policy", row_NA, state_N)
     table_SA[state_N] = row_NA
-
-
-def check_state_weight(state_weight: str) -> None:
-    """PgtsError unless it is one."""
-    if state_weight not in ("occupancy", "visits", "uniform"):
-        raise PgtsError(f"state_weight is {state_weight!r}; it must be occupancy, visits or uniform")

@@ -149,7 +149,7 @@ def not_converged(movement: Movement, update: Update, *, missing_share: float | 
 def _longer_steps(update: Update) -> str:
     if isinstance(update, TabularUpdate):
         return f"a larger update.step_size than {update.step_size:g}"
-    rate = f"a larger update.learning_rate than {getattr(update, 'learning_rate', 0):g}"
+    rate = f"a larger update.learning_rate than {getattr(update.options, 'learning_rate', 0):g}"
     return f"{rate}, a smaller update.temperature" if isinstance(update, TargetUpdate) else rate
 
 

@@ -11,8 +11,8 @@ from typing import Any, NoReturn
 
 from pgts_torch import files
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.fields import INT64_MAX
-from pgts_torch.experiment.schema import Option
+from pgts_torch.options.fields import INT64_MAX
+from pgts_torch.options.schema import Option
 
 WIDTH = 79
 

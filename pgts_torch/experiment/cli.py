@@ -30,8 +30,8 @@ from pgts_torch.experiment.arguments import (
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.ownership import SUMMARY_FILE
-from pgts_torch.experiment.schema import Schema
 from pgts_torch.experiment.terminal import plain_warnings, print_kept, safe_output
+from pgts_torch.options.schema import Schema
 from pgts_torch.trust import check_imports
 
 CHECK_FAILED = TRAINING_FAILED = 1

@@ -1,8 +1,6 @@
 """From a file and command-line overrides to a `Config`, with every mistake reported at once."""
 
-import functools
-import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,9 +11,9 @@ from pgts_torch import files
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import strict_yaml
 from pgts_torch.experiment.config import Config, with_types
-from pgts_torch.experiment.fields import INT64_MAX
-from pgts_torch.experiment.schema import KeyPath, Node, Place, Schema, is_nullable, is_text, requirement
 from pgts_torch.experiment.strict_yaml import Document, YamlMistake
+from pgts_torch.options.mistakes import Mistake, escape, explain, quote, schema_of, show, what
+from pgts_torch.options.schema import KeyPath, Node, Schema, is_nullable, is_text
 
 MAX_BYTES = 2**15
 """A larger configuration file is refused."""
@@ -64,16 +62,11 @@ class _Mistake:
         return f"{self.origin.where}: {self.message}" if self.origin.where else self.message
 
 
-@functools.cache
-def _schema() -> Schema:
-    return Schema(Config)
-
-
 @dataclass
 class _Loader:
     """Collects values with their origins, and mistakes."""
 
-    schema: Schema = field(default_factory=_schema)
+    schema: Schema = field(default_factory=lambda: schema_of(Config))
     data: dict[str, Any] = field(default_factory=dict)
     origins: dict[KeyPath, _Origin] = field(default_factory=dict)
     mistakes: list[_Mistake] = field(default_factory=list)
@@ -83,7 +76,7 @@ class _Loader:
         for key, text in self._flags(arguments):
             self._override(key, text)
         self.data = with_types(self.data)
-        self._fill_types(self.schema.root, self.data)
+        self.data = self.schema.with_tags(self.schema.root, self.data)
         config = self._validate(file_is_read)
         if self.mistakes or config is None:
             raise ConfigError(self._lines())
@@ -121,7 +114,7 @@ class _Loader:
             if waiting is not None:
                 yield waiting, None if is_flag else argument
             elif not is_flag:
-                self._refuse(f"{_quote(argument)} belongs to no option; write --KEY VALUE", "")
+                self._refuse(f"{quote(argument)} belongs to no option; write --KEY VALUE", "")
             key, equals, text = argument.removeprefix("--").partition("=")
             if is_flag and equals:
                 yield key, text
@@ -133,15 +126,15 @@ class _Loader:
         path = tuple(key.split("."))
         nodes = self.schema.find(path)
         if not all(path) or not nodes:
-            return self._refuse(f"--{_escape(key)} is unknown{self._hint(key, '--')}", "")
+            return self._refuse(f"--{escape(key)} is unknown{self.schema.hint(key, '--')}", "")
         if text is None and nodes[0].get("type") == "boolean":
             text = "true"
         if text is None:
-            return self._refuse(f"--{key} needs a value: {_what(nodes[0])}", "")
+            return self._refuse(f"--{key} needs a value: {what(nodes[0])}", "")
         try:
             document = _argument(text, nodes)
         except YamlMistake as mistake:
-            return self._refuse(f"{_quote(text)}: {mistake.reason}", f"--{key}")
+            return self._refuse(f"{quote(text)}: {mistake.reason}", f"--{key}")
         for _, reason in document.mistakes:
             self._refuse(reason, f"--{key}")
         self._put(path, document)
@@ -159,64 +152,23 @@ class _Loader:
         for key in ((), *document.line):
             self.origins[(*path, *key)] = _Origin(where, text=document.text.get(key))
 
-    def _fill_types(self, node: Node, data: Any) -> None:
-        """Where a section leaves its `type` out, the default's holds."""
-        if not isinstance(data, dict):
-            return
-        if variants := self.schema.variants(node):
-            data.setdefault("type", node["default"]["type"])
-            node = variants.get(data["type"], {}) if isinstance(data["type"], str) else {}
-        for name, child in self.schema.fields(node).items():
-            if name in data:
-                self._fill_types(child, data[name])
-
     def _validate(self, file_is_read: bool) -> Config | None:
         try:
             return Config.model_validate(self.data)
         except ValidationError as error:
-            for each in error.errors(include_url=False):
-                depends_on_file = each["type"] in ("conflict", "extra_forbidden")
+            for each in explain(Config, error, lambda key: self._origin(key).text):
+                depends_on_file = each.kind in ("conflict", "extra_forbidden")
                 if file_is_read or not depends_on_file:
-                    self.mistakes.append(self._translate(each))
+                    self.mistakes.append(self._located(each))
         return None
 
-    def _translate(self, error: Mapping[str, Any]) -> _Mistake:
-        """One error of pydantic in our words."""
-        place = self.schema.locate(error["loc"])
-        if error["type"] == "conflict":
-            keys = [tuple(key.split(".")) for key in error["ctx"]["keys"]] or [place.path]
-            given = [self.origins[key] for key in keys if key in self.origins]
-            return _Mistake(error["ctx"]["reason"], given[0] if given else self._origin(place.path))
-        if error["type"] == "union_tag_invalid":
-            tag = error["input"]["type"]
-            return self._unmet(place, (*place.path, "type"), tag)
-        if place.node is None:
-            return _Mistake(self._unknown(place), self._origin(place.path))
-        is_item = isinstance(error["loc"][-1], int)
-        return self._unmet(place, place.path, error["input"], verb="holds" if is_item else "is")
-
-    def _unmet(self, place: Place, path: KeyPath, value: Any, *, verb: str = "is") -> _Mistake:
-        assert place.node is not None
-        origin = self._origin(path)
-        shown = _show(value, origin.text)
-        key = ".".join(path)
-        must = _what(place.node) if path == place.path else requirement(place.node)
-        sentence = f"{key} {verb} {shown}; it must be {must}{_advice(place.node, value)}"
-        if origin.where == f"--{key}":
-            return _Mistake(f"--{sentence}", _Origin(""))
-        return _Mistake(sentence, origin)
-
-    def _unknown(self, place: Place) -> str:
-        key = ".".join(place.path)
-        if self.schema.find(place.path):
-            section = ".".join(place.path[:-1])
-            tag = place.parent["properties"]["type"]["const"]
-            return f"{key} does not belong to {section}.type {tag}; it must be left out, or {section}.type changed"
-        return f"{_escape(key)} is unknown{self._hint(key)}"
-
-    def _hint(self, key: str, prefix: str = "") -> str:
-        nearest = self.schema.nearest(key)
-        return f"; did you mean {prefix}{nearest}?" if nearest else "; `pgts train --help` lists all keys"
+    def _located(self, mistake: Mistake) -> _Mistake:
+        """With the place where it was made."""
+        given = [self.origins[key] for key in mistake.keys if key in self.origins]
+        origin = given[0] if given else self._origin(mistake.keys[0])
+        if mistake.is_value and origin.where == f"--{'.'.join(mistake.keys[0])}":
+            return _Mistake(f"--{mistake.message}", _Origin(""))
+        return _Mistake(mistake.message, origin)
 
     def _origin(self, path: KeyPath) -> _Origin:
         """The origin of a key, or of what was given below it, or of the nearest section around it that was given."""
@@ -246,7 +198,7 @@ def _mapping(value: Any) -> dict[str, Any]:
     if value is None:
         raise YamlMistake("the configuration is empty; it must be a mapping of keys to values", None)
     if not isinstance(value, dict):
-        raise YamlMistake(f"the configuration is {_show(value)}; it must be a mapping of keys to values", None)
+        raise YamlMistake(f"the configuration is {show(value)}; it must be a mapping of keys to values", None)
     return value
 
 
@@ -256,43 +208,3 @@ def _argument(text: str, nodes: Sequence[Node]) -> Document:
         is_null = text == "null" and all(is_nullable(node) for node in nodes)
         return Document(None if is_null else text, text={(): text})
     return strict_yaml.parse(text) if text else Document(None, text={(): ""})
-
-
-def _what(node: Node) -> str:
-    if "oneOf" in node:
-        return f"a mapping with the key type ({requirement(node)})"
-    return requirement(node)
-
-
-def _advice(node: Node, value: Any) -> str:
-    """How to write what was probably meant."""
-    if isinstance(value, bool):
-        return ""
-    if isinstance(value, int) and value > INT64_MAX:
-        return " and below 2**63" if node.get("maximum") == INT64_MAX else ""
-    if isinstance(value, float) and value.is_integer() and node.get("type") == "integer" and abs(value) < 1e15:
-        return f" (write {int(value)})"
-    if isinstance(value, int | float) and is_text(node):
-        return " (in quotes, to make it text)"
-    return ""
-
-
-def _show(value: Any, text: str | None = None) -> str:
-    """A value in one short line; a number as it was written, text in quotes."""
-    if isinstance(value, dict | list):
-        return "a mapping" if isinstance(value, dict) else "a list"
-    if text == "":
-        return "empty"
-    if isinstance(value, str):
-        return _quote(value)
-    return _escape(json.dumps(value) if text is None else text)
-
-
-def _quote(text: str) -> str:
-    return f"'{_escape(text)}'"
-
-
-def _escape(text: str, length: int = 60) -> str:
-    """Printable ASCII and letters as they are, everything else escaped; cut where it is long."""
-    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: length + 1])
-    return shown if len(shown) <= length else f"{shown[:length]}..."

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
 from torch import Tensor
 
 from pgts_torch import files
@@ -168,9 +169,24 @@ def _flat(prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def _check_config(config: Config, earlier: Mapping[str, Any], run: Path) -> None:
     """PgtsError, key by key, where a run had another configuration."""
-    if differing := list(_differing(flat(config), earlier)):
+    if differing := list(_differing(flat(config), _read_again(earlier))):
         lines = (f"{key} is {_shown(now)}; in run.dir {run} it is {_shown(before)}" for key, now, before in differing)
         raise PgtsError("\n".join([*lines, f"run.dir {run} holds an earlier run of another configuration; {_ADVICE}"]))
+
+
+def _read_again(earlier: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A flat configuration, with what this version adds to it; as it is where this version does not read it."""
+    sections: dict[str, Any] = {}
+    for key, value in earlier.items():
+        *path, name = key.split(".")
+        section = sections
+        for part in path:
+            section = section.setdefault(part, {})
+        section[name] = value
+    try:
+        return flat(Config.model_validate(sections))
+    except ValidationError:
+        return earlier
 
 
 def _differing(now: Mapping[str, Any], before: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:

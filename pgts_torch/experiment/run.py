@@ -48,30 +48,7 @@ def build(config: Config) -> PGTS:
     Raises:
         PgtsError: the environment does not exist or has no model, or parts do not fit it.
     """
-    sampled = config.estimator.type == "sampled"
-    return PGTS(
-        config.env.id,
-        depth=config.search.depth,
-        max_depth=config.search.max_depth,
-        tolerance=config.search.tolerance,
-        stop_at=config.search.stop_at,
-        search="auto" if sampled else config.search.description(),
-        estimator=config.estimator.plain(),
-        policy=config.policy_description(),
-        critic=config.critic_description(),
-        update=config.update_description(),
-        horizon=config.rollout.horizon.plain(),
-        num_envs=config.rollout.num_envs,
-        actions_per_dimension=config.env.actions_per_dimension,
-        observation_key=config.env.observation_key,
-        reward_range=config.env.reward_range,
-        action_repeat=config.search.action_repeat,
-        model_check=config.search.model_check,
-        gamma=config.env.gamma,
-        seed=config.seed,
-        device=config.device,
-        env_kwargs=dict(config.env.kwargs),
-    )
+    return PGTS(**config.arguments())
 
 
 def train(config: Config, *, strict_resume: bool = False, any_world_size: bool = False) -> Summary:

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from pgts_torch.errors import MemoryBudgetExceeded, NodeBudgetExceeded, PgtsError, RandomOutcomes
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
+from pgts_torch.options.search import Auto, Sampled
 from pgts_torch.search.engine import SampledSearch, Search
 from pgts_torch.search.expectimax import full_width
-from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaves, Lookahead
+from pgts_torch.search.lookahead import Leaves, Lookahead
 from pgts_torch.search.pruned import pruned
 from pgts_torch.search.topology import Topology, tree_nodes
 
@@ -35,8 +36,6 @@ class AutoSearch(Search):
 
     Args:
         model: enumerates or samples outcomes.
-        max_nodes: the most nodes of one search.
-        max_bytes: the most memory that a search may take.
 
     Raises:
         NodeBudgetExceeded: from a search, where even one state a level, or one sample of each action, is too much.
@@ -44,11 +43,11 @@ class AutoSearch(Search):
 
     choices = ("_width", "_too_much", "_samples", "_most_asked", "_picked")
 
-    def __init__(self, model: Model, *, max_nodes: int = MAX_NODES, max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, model: Model, options: Auto = Auto()) -> None:  # noqa: B008 - frozen
         super().__init__(model)
-        self.max_nodes, self.max_bytes = max_nodes, max_bytes
-        self.topology = Topology(model, max_bytes=max_bytes) if isinstance(model, EnumeratingModel) else None
-        self._width = max(1, max_nodes)
+        self.options = options
+        self.topology = Topology(model, max_bytes=options.max_bytes) if isinstance(model, EnumeratingModel) else None
+        self._width = options.max_nodes
         self._too_much: tuple[int, int] | None = None
         self._samples = 0
         self._most_asked = 0, 0
@@ -60,7 +59,7 @@ class AutoSearch(Search):
             try:
                 if self._too_much is None or roots < self._too_much[0] or expansions < self._too_much[1]:
                     try:
-                        full = full_width(leaves, self.topology, root_B, max_nodes=self.max_nodes)
+                        full = full_width(leaves, self.topology, root_B, max_nodes=self.options.max_nodes)
                         self._picked = _all_paths(full)
                         return full
                     except NodeBudgetExceeded:
@@ -83,7 +82,7 @@ class AutoSearch(Search):
         calls_left_behind, is_emptied = 0, False
         while True:
             try:
-                narrow = pruned(leaves, topology, root_B, max_width=self._width, max_nodes=self.max_nodes)
+                narrow = pruned(leaves, topology, root_B, max_width=self._width, max_nodes=self.options.max_nodes)
                 break
             except NodeBudgetExceeded as error:
                 if isinstance(error, MemoryBudgetExceeded):
@@ -102,10 +101,10 @@ class AutoSearch(Search):
             self._picked = _all_paths(narrow)
         else:
             self._picked = (
-                f"expectimax, {self._width} states a level: all paths need more than {self.max_nodes} nodes, "
+                f"expectimax, {self._width} states a level: all paths need more than {self.options.max_nodes} nodes, "
                 "or too much memory"
             )
-        if 2 * max(self._width, narrow.nodes) <= self.max_nodes:
+        if 2 * max(self._width, narrow.nodes) <= self.options.max_nodes:
             self._width *= 2
         return replace(narrow, model_calls=calls_left_behind + topology.model_calls - calls_before)
 
@@ -116,15 +115,16 @@ class AutoSearch(Search):
             self._samples, self._most_asked = 0, (roots, expansions)
         while (
             self._samples < MOST_SAMPLES
-            and tree_nodes(roots, A * 2 * max(self._samples, 1), expansions) <= self.max_nodes
+            and tree_nodes(roots, A * 2 * max(self._samples, 1), expansions) <= self.options.max_nodes
         ):
             self._samples = 2 * max(self._samples, 1)
         self._samples = max(self._samples, 1)
         while True:
             try:
-                search = SampledSearch(
-                    self.model, samples=self._samples, max_nodes=self.max_nodes, max_bytes=self.max_bytes
+                options = Sampled(
+                    samples=self._samples, max_nodes=self.options.max_nodes, max_bytes=self.options.max_bytes
                 )
+                search = SampledSearch(self.model, options)
                 look = search.look_ahead(leaves, root_B, generator)
                 break
             except NodeBudgetExceeded:
@@ -136,7 +136,7 @@ class AutoSearch(Search):
             f"sampled, {self._samples} outcomes of each action: the model only samples, and {look.nodes} nodes hold "
             f"{tree:.3g} paths"
         )
-        if self._samples < MOST_SAMPLES and look.nodes * 2**expansions <= self.max_nodes:
+        if self._samples < MOST_SAMPLES and look.nodes * 2**expansions <= self.options.max_nodes:
             self._samples *= 2
         return look
 

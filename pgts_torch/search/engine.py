@@ -1,33 +1,29 @@
 """Searches as objects: one way to look ahead in one model, with what it remembers from one search to the next."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Literal, final, get_args
+from typing import Any, final
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from pgts_torch.errors import MissingModel, PgtsError, check_count
+from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
-from pgts_torch.search.empirical import FixedSamples, Share
+from pgts_torch.options.search import MCTS, Expectimax, Sampled
+from pgts_torch.search.empirical import FixedSamples
 from pgts_torch.search.expectimax import full_width
-from pgts_torch.search.lookahead import MAX_BYTES, MAX_NODES, Leaf, Leaves, Lookahead, check_finite
-from pgts_torch.search.mcts import Root, check_options, grow
+from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_finite
+from pgts_torch.search.mcts import grow
 from pgts_torch.search.pruned import pruned
 from pgts_torch.search.sampled import plan_levels, sparse
-from pgts_torch.search.split import Rule
 from pgts_torch.search.topology import Topology
-from pgts_torch.search.tree import Backup
 from pgts_torch.seeding import draw_keys
 
-DEFAULT_SAMPLES = 4
+DEFAULT_SAMPLES = Sampled().samples
 REPLICATES = 8
 """Of the bootstrap of a sampled search: enough for the size of all standard errors together, which shortens steps."""
-
-Prior = Literal["uniform", "policy"]
-"""The probabilities that a tree search starts from: the same for all actions, or those of the current policy."""
 
 
 class Search(ABC):
@@ -129,35 +125,25 @@ class ExpectimaxSearch(Search):
 
     Args:
         model: enumerates outcomes.
-        max_nodes: the most nodes of one search.
-        max_width: the most states of a level that are expanded. Default: all.
-        max_bytes: the most memory that a search may take, with what is remembered.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        *,
-        max_nodes: int = MAX_NODES,
-        max_width: int | None = None,
-        max_bytes: int = MAX_BYTES,
-    ) -> None:
+    def __init__(self, model: Model, options: Expectimax = Expectimax()) -> None:  # noqa: B008 - frozen
         super().__init__(model)
-        self.topology: Topology = Topology(enumerating(model, "expectimax"), max_bytes=max_bytes)
-        if max_width is not None:
-            check_count("max_width", max_width)
-        self.max_nodes, self.max_width = max_nodes, max_width
+        self.options = options
+        self.topology: Topology = Topology(enumerating(model, "expectimax"), max_bytes=options.max_bytes)
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
-        if self.max_width is None:
-            return full_width(leaves, self.topology, root_B, max_nodes=self.max_nodes)
-        return pruned(leaves, self.topology, root_B, max_width=self.max_width, max_nodes=self.max_nodes)
+        max_width, max_nodes = self.options.max_width, self.options.max_nodes
+        if max_width is None:
+            return full_width(leaves, self.topology, root_B, max_nodes=max_nodes)
+        return pruned(leaves, self.topology, root_B, max_width=max_width, max_nodes=max_nodes)
 
     def reset(self) -> None:
         self.topology = self.topology.fresh()
 
     def __str__(self) -> str:
-        return "expectimax" if self.max_width is None else f"expectimax, {self.max_width} states a level"
+        width = self.options.max_width
+        return "expectimax" if width is None else f"expectimax, {width} states a level"
 
 
 @final
@@ -166,44 +152,32 @@ class SampledSearch(Search):
 
     Args:
         model: samples outcomes.
-        samples: outcomes of each (state, action), one number or one for each level.
-        share: what shares them, "none", "level" or "search".
-        max_nodes: the most nodes of one search.
-        max_bytes: the most memory that a search may take.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        *,
-        samples: int | Sequence[int | None] = DEFAULT_SAMPLES,
-        share: Share = "level",
-        max_nodes: int = MAX_NODES,
-        max_bytes: int = MAX_BYTES,
-    ) -> None:
+    def __init__(self, model: Model, options: Sampled = Sampled()) -> None:  # noqa: B008 - frozen
         super().__init__(model)
+        self.options = options
         self._model = sampling(model, "sampled")
-        plan_levels(samples, 1, share, model)
-        self.samples, self.share, self.max_nodes, self.max_bytes = samples, share, max_nodes, max_bytes
+        plan_levels(options.samples, 1, options.share, model)
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
         return sparse(
             leaves,
             self._model,
             root_B,
-            samples=self.samples,
-            share=self.share,
+            samples=self.options.samples,
+            share=self.options.share,
             generator=generator,
             replicates=REPLICATES,
-            max_nodes=self.max_nodes,
-            max_bytes=self.max_bytes,
+            max_nodes=self.options.max_nodes,
+            max_bytes=self.options.max_bytes,
         )
 
     def reset(self) -> None:
         """It remembers nothing."""
 
     def __str__(self) -> str:
-        return f"sampled, {self.samples} outcomes of each action, shared by {self.share}"
+        return f"sampled, {self.options.samples} outcomes of each action, shared by {self.options.share}"
 
 
 @final
@@ -212,54 +186,15 @@ class MCTSSearch(Search):
 
     Args:
         model: enumerates outcomes, or samples them.
-        simulations: of each root.
-        root, rule, exploration, wave, backup: see `mcts`.
-        prior: "uniform", or "policy": the probabilities of the current policy, as in AlphaZero.
-        merge: whether paths that meet are one node. Default: with maximum backups.
-        samples: how many sampled outcomes of each action stand for all, fresh ones in each search. Default: all are
-            enumerated, or 4 are sampled where the model cannot enumerate them.
-        max_nodes: the most nodes of one search.
-        max_bytes: the most memory that a search may take, with what is remembered.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        *,
-        simulations: int = 64,
-        root: Root = "gumbel",
-        rule: Rule = "gumbel",
-        exploration: float | None = None,
-        wave: int | None = None,
-        prior: Prior = "uniform",
-        backup: Backup = "max",
-        merge: bool | None = None,
-        samples: int | None = None,
-        max_nodes: int = MAX_NODES,
-        max_bytes: int = MAX_BYTES,
-    ) -> None:
+    def __init__(self, model: Model, options: MCTS = MCTS()) -> None:  # noqa: B008 - frozen
         super().__init__(model)
-        if prior not in get_args(Prior):
-            raise PgtsError(f"prior is {prior!r}; it must be one of {', '.join(map(repr, get_args(Prior)))}")
-        self.simulations, self.root, self.rule, self.exploration = simulations, root, rule, exploration
-        self.wave, self.backup, self.uses_prior = wave, backup, prior == "policy"
-        self.max_nodes, self.max_bytes = max_nodes, max_bytes
-        self.merge = backup == "max" if merge is None else merge
-        check_options(
-            simulations=simulations,
-            root=root,
-            rule=rule,
-            exploration=exploration,
-            wave=wave,
-            has_prior=self.uses_prior,
-            backup=backup,
-            merge=self.merge,
-        )
-        if samples is not None:
-            check_count("samples", samples)
-        enumerates = samples is None and isinstance(model, EnumeratingModel)
-        self.topology = Topology(enumerating(model, "mcts"), max_bytes=max_bytes) if enumerates else None
-        self.samples = samples or DEFAULT_SAMPLES
+        self.options, self.uses_prior = options, options.prior == "policy"
+        self._merge = options.backup == "max" if options.merge is None else options.merge
+        enumerates = options.samples is None and isinstance(model, EnumeratingModel)
+        self.topology = Topology(enumerating(model, "mcts"), max_bytes=options.max_bytes) if enumerates else None
+        self._samples = options.samples or DEFAULT_SAMPLES
         if not enumerates:
             sampling(model, "mcts")
 
@@ -267,22 +202,22 @@ class MCTSSearch(Search):
         topology, calls_each = self.topology, 1
         if topology is None:
             key = draw_keys(1, generator=generator).to(self.model.device)
-            samples = FixedSamples(sampling(self.model, "mcts"), samples=self.samples, key=key)
-            topology = Topology(samples, max_bytes=self.max_bytes)
-            calls_each = self.samples
+            samples = FixedSamples(sampling(self.model, "mcts"), samples=self._samples, key=key)
+            topology = Topology(samples, max_bytes=self.options.max_bytes)
+            calls_each = self._samples
         look = grow(
             leaves,
             topology,
             root_B,
-            simulations=self.simulations,
-            root=self.root,
-            rule=self.rule,
-            exploration=self.exploration,
-            wave=self.wave,
-            backup=self.backup,
-            merge=self.merge,
-            generator=generator if self.root == "gumbel" else None,
-            max_nodes=self.max_nodes,
+            simulations=self.options.simulations,
+            root=self.options.root,
+            rule=self.options.rule,
+            exploration=self.options.exploration,
+            wave=self.options.wave,
+            backup=self.options.backup,
+            merge=self._merge,
+            generator=generator if self.options.root == "gumbel" else None,
+            max_nodes=self.options.max_nodes,
         )
         return replace(look, model_calls=look.model_calls * calls_each)
 
@@ -291,13 +226,14 @@ class MCTSSearch(Search):
             self.topology = self.topology.fresh()
 
     def __str__(self) -> str:
+        rule = self.options.rule
         parts = [
-            f"mcts, {self.simulations} simulations",
-            f"{self.rule} at the root too" if self.root == "rule" else self.rule * (self.rule != "gumbel"),
+            f"mcts, {self.options.simulations} simulations",
+            f"{rule} at the root too" if self.options.root == "rule" else rule * (rule != "gumbel"),
             "the policy as prior" * self.uses_prior,
-            "mean backups" * (self.backup == "mean"),
-            "merged" * self.merge,
-            f"{self.samples} sampled outcomes of each action" * (self.topology is None),
+            "mean backups" * (self.options.backup == "mean"),
+            "merged" * self._merge,
+            f"{self._samples} sampled outcomes of each action" * (self.topology is None),
         ]
         return ", ".join(filter(None, parts))
 

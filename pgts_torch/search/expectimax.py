@@ -6,7 +6,8 @@ from torch import Tensor
 
 from pgts_torch.bellman import backup, sweep
 from pgts_torch.models.base import EnumeratingModel
-from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead
+from pgts_torch.options.search import MAX_NODES
+from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead
 from pgts_torch.search.pruned import pruned
 from pgts_torch.search.topology import Topology, topology_of
 

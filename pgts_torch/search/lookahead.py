@@ -18,11 +18,6 @@ from pgts_torch.tabular.exact import check_depth
 Leaf = Callable[[Tensor], Tensor]
 """A critic or a policy as a search calls it: states [N] to values of Q^pi [N, A] or of v^pi [N], or to pi [N, A]."""
 
-MAX_NODES = 10_000_000
-
-MAX_BYTES = 4 * 2**30
-"""How much memory a search may take at its peak, with what is remembered for the next ones."""
-
 _FAIR = 1e-3
 """By how much the probabilities of a prior may miss 1."""
 

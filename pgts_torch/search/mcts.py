@@ -2,16 +2,17 @@
 
 import math
 from collections.abc import Iterator
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel
+from pgts_torch.options.search import MAX_NODES, MCTS
 from pgts_torch.search.known import KnownStates
-from pgts_torch.search.lookahead import MAX_NODES, Leaf, Leaves, Lookahead, check_states, check_vector, unexpanded
+from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_states, check_vector, unexpanded
 from pgts_torch.search.split import Rule, Selection, sigma
 from pgts_torch.search.topology import Topology, topology_of
 from pgts_torch.search.tree import Backup, Tree
@@ -91,13 +92,13 @@ def mcts(
         NodeBudgetExceeded: more than `max_nodes` would be needed; or what is to be expanded next would not fit into
             `max_bytes`, and the model has not been queried for it.
     """
-    check_options(
+    MCTS(
         simulations=simulations,
         root=root,
         rule=rule,
         exploration=exploration,
         wave=wave,
-        has_prior=prior is not None,
+        prior="uniform" if prior is None else "policy",
         backup=backup,
         merge=merge,
     )
@@ -246,31 +247,3 @@ def _preference(known: KnownStates, state_B: Tensor, generator: torch.Generator 
     action_A = torch.arange(known.num_actions, device=known.device)
     u_BA = uniform(mix(key, state_B.unsqueeze(1), action_A)).clamp_min(torch.finfo(torch.float64).tiny)
     return log_prior_BA - (-u_BA.log()).log().to(known.dtype)
-
-
-def check_options(
-    *,
-    simulations: int,
-    root: str,
-    rule: str,
-    exploration: float | None,
-    wave: int | None,
-    has_prior: bool,
-    backup: str,
-    merge: bool,
-) -> None:
-    """PgtsError where an option of `mcts` is out of range, or has no effect beside the others."""
-    check_count("simulations", simulations)
-    for name, value, words in (("root", root, Root), ("rule", rule, Rule), ("backup", backup, Backup)):
-        if value not in get_args(words):
-            raise PgtsError(f"{name} is {value!r}; it must be one of {', '.join(map(repr, get_args(words)))}")
-    if wave is not None:
-        check_count("wave", wave)
-    if exploration is not None and rule == "gumbel":
-        raise PgtsError("rule='gumbel' has no exploration")
-    if exploration is not None and not 0 <= exploration < math.inf:
-        raise PgtsError(f"exploration is {exploration}; it must be finite and at least 0")
-    if merge and backup == "mean":
-        raise PgtsError("merge needs backup='max': a node that several paths share has no return of its own")
-    if root == "rule" and rule == "uct" and has_prior:
-        raise PgtsError("rule='uct' without root='gumbel' uses no prior")

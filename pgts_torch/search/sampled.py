@@ -10,11 +10,10 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes, backup
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
+from pgts_torch.options.search import MAX_BYTES, MAX_NODES
 from pgts_torch.search.empirical import Empirical, Share
 from pgts_torch.search.expectimax import full_width
 from pgts_torch.search.lookahead import (
-    MAX_BYTES,
-    MAX_NODES,
     Leaf,
     Leaves,
     Lookahead,

@@ -11,8 +11,9 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NodeBudgetExceeded, PgtsError
 from pgts_torch.models.base import EnumeratingModel
+from pgts_torch.options.search import MAX_BYTES
 from pgts_torch.search.levels import Levels
-from pgts_torch.search.lookahead import MAX_BYTES, check_states, check_vector
+from pgts_torch.search.lookahead import check_states, check_vector
 from pgts_torch.search.memory import Sizes, check_memory, search_bytes
 from pgts_torch.search.outcome_table import OutcomeTable, check_outcomes, has_weight
 

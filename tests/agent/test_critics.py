@@ -6,24 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pgts_torch.agent.critics import (
-    Critic,
-    ExactCritic,
-    MonteCarlo,
-    RolloutCritic,
-    TabularCritic,
-    TDLambda,
-    lambda_returns,
-)
-from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Rollout
+from pgts_torch.agent.critics import Critic, ExactCritic, RolloutCritic, TabularCritic, lambda_returns
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models import TabularModel
+from pgts_torch.options import FixedHorizon, GeometricHorizon, MonteCarlo, RolloutValues, TabularValues, TDLambda
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder, random_mdp
 from tests.agent.helpers import experience, following, log_slope, z_scores
 from tests.support import random_policy, right_with, uniform_policy, zoo
 
-METHODS = [MonteCarlo(), TDLambda(0.9)]
+METHODS = [MonteCarlo(), TDLambda(lambda_=0.9)]
 FAR = 5.0
 """Standard errors; a normal mean lies farther off with probability 6e-7, and no test compares more than 40."""
 
@@ -109,7 +102,7 @@ def test_the_error_of_monte_carlo_means_falls_with_the_square_root_of_the_episod
     for episodes in counts:
         repeats = []
         for seed in range(15):
-            critic = TabularCritic(6, 2, target=target, method=MonteCarlo(), step_size="mean")
+            critic = TabularCritic(6, 2, TabularValues(target=target, method=MonteCarlo(), step_size="mean"))
             fit(critic, mdp, pi_SA, GeometricHorizon(), episodes=episodes, seed=seed)
             repeats.append(error(critic, mdp, pi_SA))
         errors.append(mean_square(repeats))
@@ -118,7 +111,7 @@ def test_the_error_of_monte_carlo_means_falls_with_the_square_root_of_the_episod
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
-@pytest.mark.parametrize("horizon", [FixedHorizon(2), GeometricHorizon()])
+@pytest.mark.parametrize("horizon", [FixedHorizon(length=2), GeometricHorizon()])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("target", ["v", "q"])
 def test_tabular_critics_converge_to_the_values_of_a_policy_that_stands_still(target, method, horizon):
@@ -126,7 +119,7 @@ def test_tabular_critics_converge_to_the_values_of_a_policy_that_stands_still(ta
     # its bootstrapped targets: 0.02 of the start after 40. The rest is the spread of about 1000 targets.
     mdp = random_mdp(6, 2, gamma=0.5, start=None)
     pi_SA = uniform_policy(mdp)
-    critic = TabularCritic(6, 2, target=target, method=method, step_size=0.2, initial=0.0)
+    critic = TabularCritic(6, 2, TabularValues(target=target, method=method, step_size=0.2, initial=0.0))
     start = error(critic, mdp, pi_SA)
     losses = [fit(critic, mdp, pi_SA, horizon, episodes=400, seed=seed)["value"] for seed in range(40)]
     assert error(critic, mdp, pi_SA) < 0.05 < 0.06 * start
@@ -139,9 +132,9 @@ def test_tabular_critics_converge_to_the_values_of_a_policy_that_stands_still(ta
 def test_a_terminal_outcome_is_not_bootstrapped(method):
     mdp = deep_sea(3, gamma=0.9, stochastic=True)
     pi_SA = right_with(*[0.9] * 9)
-    critic = TabularCritic(9, 2, method=method, step_size="mean", initial=100.0)
+    critic = TabularCritic(9, 2, TabularValues(method=method, step_size="mean", initial=100.0))
     for seed in range(5):
-        fit(critic, mdp, pi_SA, FixedHorizon(3), episodes=2000, seed=seed)
+        fit(critic, mdp, pi_SA, FixedHorizon(length=3), episodes=2000, seed=seed)
     last_row = torch.tensor([6, 7, 8])
     truth_S = exact.evaluate(mdp, pi_SA).v_S
     torch.testing.assert_close(critic.v(last_row), truth_S[last_row], atol=0.02, rtol=0)
@@ -152,8 +145,8 @@ def test_what_was_never_visited_keeps_an_initial_number(target):
     mdp = ladder(5)
     pi_SA = right_with(0.5, 0.0, 0.5, 0.5, 0.5)
     for initial in (0.0, 7.5):
-        critic = TabularCritic(5, 2, target=target, initial=initial)
-        fit(critic, mdp, pi_SA, FixedHorizon(30), episodes=20)
+        critic = TabularCritic(5, 2, TabularValues(target=target, initial=initial))
+        fit(critic, mdp, pi_SA, FixedHorizon(length=30), episodes=20)
         asked = critic.v if target == "v" else critic.q
         assert (asked(torch.tensor([2, 3, 4])) == initial).all()
     assert not (asked(torch.tensor([0])) == 7.5).any()
@@ -163,8 +156,8 @@ def test_what_was_never_visited_keeps_an_initial_number(target):
 @pytest.mark.parametrize("target", ["v", "q"])
 def test_what_was_never_visited_is_worth_the_mean_of_the_targets(target, method):
     mdp = random_mdp(30, 2, branching=2, seed=4, gamma=0.9)
-    critic = TabularCritic(30, 2, target=target, method=method, step_size=1.0)
-    made = experience(mdp, uniform_policy(mdp), FixedHorizon(3), episodes=6)
+    critic = TabularCritic(30, 2, TabularValues(target=target, method=method, step_size=1.0))
+    made = experience(mdp, uniform_policy(mdp), FixedHorizon(length=3), episodes=6)
     critic.fit(following(uniform_policy(mdp)), made, generator=stream(0, "critic"))
     count_C, value_C = critic.state_dict()["count_C"], critic.state_dict()["value_C"]
     unseen = count_C == 0
@@ -180,9 +173,9 @@ def test_a_constant_in_all_rewards_adds_the_same_to_all_values_seen_or_not(targe
     mdp = random_mdp(30, 2, branching=2, seed=4, gamma=0.9)
 
     def values(factor: float, constant: float) -> torch.Tensor:
-        critic = TabularCritic(30, 2, target=target, method=method)
+        critic = TabularCritic(30, 2, TabularValues(target=target, method=method))
         for seed in range(3):
-            made = experience(mdp, uniform_policy(mdp), FixedHorizon(3), episodes=4, seed=seed)
+            made = experience(mdp, uniform_policy(mdp), FixedHorizon(length=3), episodes=4, seed=seed)
             made = replace(made, reward_TB=factor * made.reward_TB + constant)
             critic.fit(following(uniform_policy(mdp)), made, generator=stream(0, "critic"))
         return critic.state_dict()["value_C"]
@@ -195,20 +188,20 @@ def test_a_constant_in_all_rewards_adds_the_same_to_all_values_seen_or_not(targe
 
 def test_where_nothing_is_known_of_the_end_what_was_never_visited_is_worth_0():
     mdp = ladder(5, gamma=1.0)
-    critic = TabularCritic(5, 2, method=TDLambda(0.0))
-    fit(critic, mdp, right_with(*[1.0] * 5), FixedHorizon(1), episodes=2)
+    critic = TabularCritic(5, 2, TabularValues(method=TDLambda(lambda_=0.0)))
+    fit(critic, mdp, right_with(*[1.0] * 5), FixedHorizon(length=1), episodes=2)
     assert critic.v(torch.arange(1, 5)).tolist() == [0.0] * 4
 
 
 @pytest.mark.parametrize("initial", [float("nan"), float("inf"), "median"])
 def test_an_initial_value_that_is_none_is_refused(initial):
-    with pytest.raises(PgtsError, match="it must be a finite number or 'mean'"):
-        TabularCritic(5, 2, initial=initial)
+    with pytest.raises(PgtsError, match="it must be a number or mean"):
+        TabularValues(initial=initial)
 
 
 def test_a_step_moves_each_value_by_its_share_toward_the_mean_of_its_targets():
     made = by_hand()
-    critic = TabularCritic(4, 1, method=TDLambda(0.0), step_size=0.25, initial=0.0)
+    critic = TabularCritic(4, 1, TabularValues(method=TDLambda(lambda_=0.0), step_size=0.25, initial=0.0))
     value_S = torch.tensor([8.0, 10.0, 10.0, 10.0], dtype=torch.float64)
     critic.load_state_dict({"value_C": value_S, "count_C": torch.zeros(4, dtype=torch.float64)})
     loss = critic.fit(following(torch.ones(4, 1, dtype=torch.float64)), made, generator=stream(0, "critic"))
@@ -221,7 +214,7 @@ def test_a_step_moves_each_value_by_its_share_toward_the_mean_of_its_targets():
 @pytest.mark.parametrize("initial", [0.0, "mean"])
 def test_targets_that_are_not_finite_leave_the_table_as_it_is(initial):
     made = by_hand()
-    critic = TabularCritic(4, 1, initial=initial)
+    critic = TabularCritic(4, 1, TabularValues(initial=initial))
     before = critic.state_dict()
     spoiled = replace(made, reward_TB=made.reward_TB + math.nan)
     with pytest.raises(NotFinite):
@@ -232,8 +225,8 @@ def test_targets_that_are_not_finite_leave_the_table_as_it_is(initial):
 def test_a_q_critic_answers_v_as_the_mean_over_the_policy():
     mdp = ladder(3)
     pi_SA = right_with(0.2, 0.5, 0.9)
-    critic = TabularCritic(3, 2, target="q")
-    fit(critic, mdp, pi_SA, FixedHorizon(20), episodes=30)
+    critic = TabularCritic(3, 2, TabularValues(target="q"))
+    fit(critic, mdp, pi_SA, FixedHorizon(length=20), episodes=30)
     states = torch.arange(3)
     torch.testing.assert_close(critic.v(states), (pi_SA * critic.q(states)).sum(-1))
     with pytest.raises(PgtsError, match="learns v"):
@@ -245,7 +238,7 @@ def test_the_rollout_critic_is_unbiased_also_where_the_policy_never_goes():
     pi_SA = right_with(0.0, 0.6, 0.6, 0.6, 0.6)
     truth, repeats = exact.evaluate(mdp, pi_SA), 500
     assert (truth.d_S[1:] == 0).all()
-    critic = RolloutCritic(TabularModel(mdp), samples=4)
+    critic = RolloutCritic(TabularModel(mdp), RolloutValues(samples=4))
     critic.fit(following(pi_SA), by_hand(), generator=stream(0, "critic"))
     states = torch.arange(5).repeat(repeats)
     assert z_scores(critic.v(states).view(repeats, 5), truth.v_S).abs().max() < FAR
@@ -260,7 +253,7 @@ def test_the_error_of_the_rollout_critic_falls_with_the_square_root_of_its_sampl
     pi_SA = random_policy(mdp, seed=1)
     counts, errors, states = [4, 16, 64], [], torch.arange(6).repeat(100)
     for samples in counts:
-        critic = RolloutCritic(TabularModel(mdp), samples=samples)
+        critic = RolloutCritic(TabularModel(mdp), RolloutValues(samples=samples))
         critic.fit(following(pi_SA), by_hand(), generator=stream(samples, "critic"))
         errors.append(float((critic.v(states).view(100, 6) - exact.evaluate(mdp, pi_SA).v_S).square().mean().sqrt()))
     assert -0.55 < log_slope(counts, errors) < -0.45
@@ -269,7 +262,7 @@ def test_the_error_of_the_rollout_critic_falls_with_the_square_root_of_its_sampl
 def test_a_short_fixed_horizon_leaves_out_what_comes_after_it():
     mdp = random_mdp(6, 2, gamma=0.7)
     pi_SA = random_policy(mdp, seed=1)
-    critic = RolloutCritic(TabularModel(mdp), samples=4, horizon=FixedHorizon(3))
+    critic = RolloutCritic(TabularModel(mdp), RolloutValues(samples=4, horizon=FixedHorizon(length=3)))
     critic.fit(following(pi_SA), by_hand(), generator=stream(0, "critic"))
     v_BS = critic.v(torch.arange(6).repeat(1000)).view(1000, 6)
     assert z_scores(v_BS, truncated_values(mdp, pi_SA, 3)).abs().max() < FAR
@@ -278,7 +271,7 @@ def test_a_short_fixed_horizon_leaves_out_what_comes_after_it():
 
 def test_the_rollout_critic_counts_what_it_asks_of_its_model():
     mdp = grid(4, traps=(5,))
-    critic = RolloutCritic(TabularModel(mdp), samples=3, horizon=FixedHorizon(7))
+    critic = RolloutCritic(TabularModel(mdp), RolloutValues(samples=3, horizon=FixedHorizon(length=7)))
     critic.fit(following(uniform_policy(mdp)), by_hand(), generator=stream(0, "critic"))
     assert critic.model_calls == 0
     critic.v(torch.arange(5))
@@ -286,7 +279,7 @@ def test_the_rollout_critic_counts_what_it_asks_of_its_model():
     critic.q(torch.arange(5))
     assert critic.model_calls == 5 * 3 * 7 + 5 * 4 * 3 * 7
 
-    ending = RolloutCritic(TabularModel(deep_sea(4)), samples=2, horizon=FixedHorizon(50))
+    ending = RolloutCritic(TabularModel(deep_sea(4)), RolloutValues(samples=2, horizon=FixedHorizon(length=50)))
     ending.fit(following(uniform_policy(deep_sea(4))), by_hand(), generator=stream(0, "critic"))
     ending.v(torch.tensor([0, 15]))
     assert ending.model_calls == 2 * 4 + 2 * 1
@@ -296,13 +289,13 @@ def test_the_rollout_critic_counts_what_it_asks_of_its_model():
 def test_what_a_tabular_critic_learned_survives_the_round_trip(target):
     mdp = ladder(4)
     pi_SA = uniform_policy(mdp)
-    critic, other = (TabularCritic(4, 2, target=target, step_size="mean") for _ in range(2))
-    fit(critic, mdp, pi_SA, FixedHorizon(20), episodes=5)
+    critic, other = (TabularCritic(4, 2, TabularValues(target=target, step_size="mean")) for _ in range(2))
+    fit(critic, mdp, pi_SA, FixedHorizon(length=20), episodes=5)
     state = critic.state_dict()
     other.load_state_dict(state)
     for seed in (1, 2):
         for each in (critic, other):
-            fit(each, mdp, pi_SA, FixedHorizon(20), episodes=5, seed=seed)
+            fit(each, mdp, pi_SA, FixedHorizon(length=20), episodes=5, seed=seed)
     assert all(torch.equal(value, other.state_dict()[name]) for name, value in critic.state_dict().items())
     assert not torch.equal(state["value_C"], critic.state_dict()["value_C"])
 
@@ -329,7 +322,7 @@ def test_a_critic_that_knows_no_policy_yet_says_so():
     for critic in (
         ExactCritic(ladder()),
         RolloutCritic(TabularModel(ladder())),
-        TabularCritic(5, 2, target="q"),
+        TabularCritic(5, 2, TabularValues(target="q")),
     ):
         with pytest.raises(PgtsError, match="no policy yet"):
             critic.v(states)

@@ -10,8 +10,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrap
 
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.neural import NetworkPolicy
-from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Horizon, Rollout, rollout
+from pgts_torch.agent.rollout import Horizon, Rollout, rollout
 from pgts_torch.models.environments import EnvSource
+from pgts_torch.options import FixedHorizon, GeometricHorizon
 from pgts_torch.seeding import stream
 
 
@@ -42,7 +43,7 @@ def copies(kind: type[SyncVectorEnv] = SyncVectorEnv) -> SyncVectorEnv:
     return kind([partial(make, phase) for phase in range(6)], autoreset_mode=AutoresetMode.DISABLED)
 
 
-def made(env: VectorEnv, horizon: Horizon = FixedHorizon(100)) -> Rollout:  # noqa: B008 - frozen
+def made(env: VectorEnv, horizon: Horizon = FixedHorizon(length=100)) -> Rollout:  # noqa: B008 - frozen
     world = make_world(EnvSource.of(env), num_envs=6, gamma=0.9, observation_key=None, plain=True, device="cpu")
     policy = NetworkPolicy(world.observation_space, 2, seed=1)
     return rollout(world, policy, horizon, seed=0, names=("test",), generator=stream(0, "test"))
@@ -57,7 +58,7 @@ def test_copies_whose_episode_is_over_are_not_stepped():
     assert sum(copy.num_steps for copy in together.envs) == experience.alive_TB.numel()
 
 
-@pytest.mark.parametrize("horizon", [FixedHorizon(100), FixedHorizon(7), GeometricHorizon()], ids=str)
+@pytest.mark.parametrize("horizon", [FixedHorizon(length=100), FixedHorizon(length=7), GeometricHorizon()], ids=str)
 def test_what_copies_do_that_step_one_by_one_is_what_they_do_together(horizon):
     alone, together = made(copies(), horizon), made(VectorWrapper(copies()), horizon)
     alive_TB = alone.alive_TB
@@ -71,7 +72,7 @@ def test_what_copies_do_that_step_one_by_one_is_what_they_do_together(horizon):
 
 @pytest.mark.parametrize("together", [False, True])
 def test_a_discount_of_its_own_belongs_to_the_copy_that_names_it(together):
-    experience = made(VectorWrapper(copies()) if together else copies(), FixedHorizon(7))
+    experience = made(VectorWrapper(copies()) if together else copies(), FixedHorizon(length=7))
     named_TB = (torch.arange(1, 8)[:, None] + torch.arange(6)) % 3 == 0
     assert torch.equal(experience.discount_TB, torch.from_numpy(np.where(named_TB, 0.5, 0.9)))
 

@@ -12,6 +12,7 @@ from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.updates import SoftmaxUpdate
 from pgts_torch.bellman import Outcomes
 from pgts_torch.models import TabularModel
+from pgts_torch.options import RolloutValues, SoftmaxGradient
 from pgts_torch.search import expectimax
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, exact, ladder, random_mdp
@@ -43,7 +44,7 @@ def sampled_directions(problem: str, depth: int, critic: str) -> Tensor:
         depth=depth,
         policy=policy,
         critic=critic if critic == "exact" else {"type": critic, "samples": 64},
-        update=SoftmaxUpdate(step_size=1.0),
+        update=SoftmaxUpdate(SoftmaxGradient(step_size=1.0)),
         horizon="geometric",
     )
     directions = []
@@ -112,7 +113,7 @@ def test_the_maximum_over_noisy_leaves_is_biased_upward_and_less_with_more_sampl
 
     def errors(depth: int, samples: int) -> Tensor:
         model = TabularModel(many)
-        critic = RolloutCritic(model, samples=samples, target="q")
+        critic = RolloutCritic(model, RolloutValues(samples=samples, target="q"))
         critic.fit(SimplexPolicy(300, 8), None, generator=stream(samples, "critic"))
         look = expectimax(model, torch.arange(300), q_leaf=critic.q, depth=depth)
         return (look.q_BA.view(100, 3, 8) - exact.lookahead(mdp, truth_SA, depth)).mean((1, 2))[:, None]

@@ -8,8 +8,9 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch.agent import networks
-from pgts_torch.agent.networks import CNN, MLP, Encoder, Network, RunningNorm
+from pgts_torch.agent.networks import Encoder, Network, RunningNorm, make_trunk
 from pgts_torch.errors import PgtsError
+from pgts_torch.options import CNN, MLP
 from pgts_torch.seeding import stream
 
 VECTORS = spaces.Box(-np.inf, np.inf, (3,), np.float64)
@@ -19,7 +20,7 @@ VIEWS = spaces.Box(0, 255, (7, 7, 3), np.uint8)
 
 def network(description, space, *, outputs: int = 2, seed: int = 0) -> Network:
     generator = stream(seed, "network")
-    return Network(description.trunk(space, generator=generator), outputs, gain=0.5, generator=generator)
+    return Network(make_trunk(description, space, generator=generator), outputs, gain=0.5, generator=generator)
 
 
 def views(count: int, seed: int = 0) -> torch.Tensor:
@@ -53,7 +54,7 @@ def test_a_cnn_is_the_formula_of_its_weights(hidden):
     torch.testing.assert_close(net.evaluate(views(4)).double(), h @ weights[-2].T + weights[-1], atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize(("description", "space"), [(MLP(), VECTORS), (MLP((8,)), STATES), (CNN(), VIEWS)])
+@pytest.mark.parametrize(("description", "space"), [(MLP(), VECTORS), (MLP(hidden=(8,)), STATES), (CNN(), VIEWS)])
 def test_weights_start_orthogonal_with_gain_sqrt_2_and_the_last_layer_with_its_own(description, space):
     net = network(description, space)
     layers = [layer for layer in net.modules() if isinstance(layer, torch.nn.Linear | torch.nn.Conv2d)]
@@ -179,10 +180,10 @@ def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_cha
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: MLP(hidden=(64, 0)), r"hidden is \(64, 0\)"),
+        (lambda: MLP(hidden=(64, 0)), "hidden holds 0"),
         (lambda: MLP(hidden=64), "hidden is 64"),
         (lambda: MLP(activation="gelu"), "activation is 'gelu'"),
-        (lambda: CNN(channels=[16, 2.5]), r"channels is \[16, 2.5\]"),
+        (lambda: CNN(channels=[16, 2.5]), "channels holds 2.5"),
         (lambda: CNN(scale=0), "scale is 0"),
         (lambda: network(MLP(), VIEWS), "use a cnn"),
         (lambda: network(CNN(), VECTORS), "use an mlp"),
@@ -199,5 +200,5 @@ def test_what_no_network_can_be_made_of_or_see_is_refused(make, message):
 
 
 def test_lists_of_sizes_are_taken_as_they_stand_in_a_configuration():
-    assert MLP(hidden=[64, 64]) == MLP()
+    assert MLP(hidden=[64, 64]) == MLP(hidden=(64, 64)) == MLP()
     assert CNN(channels=[16, 32, 64], hidden=[128]) == CNN()

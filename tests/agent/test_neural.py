@@ -10,13 +10,12 @@ from torch import Tensor
 
 from pgts_torch.agent import saving
 from pgts_torch.agent.advantages import gae, score_function
-from pgts_torch.agent.critics import MonteCarlo, TDLambda
-from pgts_torch.agent.networks import CNN, MLP
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate
 from pgts_torch.agent.policies import SimplexPolicy
-from pgts_torch.agent.rollout import FixedHorizon, GeometricHorizon, Rollout
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import PgtsError
+from pgts_torch.options import CNN, MLP, FixedHorizon, GeometricHorizon, MonteCarlo, NetworkValues, TDLambda
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact, random_mdp
 from tests.agent.helpers import experience, following
@@ -45,7 +44,7 @@ def by_hand(reward: float = 1.0, shows: Tensor | None = None) -> Rollout:
 def tabular_critic(value_S: list[float] | Tensor, **options) -> NetworkCritic:
     """A critic whose v or Q is a table, with these entries."""
     value_SD = torch.as_tensor(value_S, dtype=torch.float32)
-    critic = NetworkCritic(spaces.Discrete(len(value_SD)), 2, network=MLP(hidden=()), **options)
+    critic = NetworkCritic(spaces.Discrete(len(value_SD)), 2, NetworkValues(network=MLP(hidden=()), **options))
     weight_DS = value_SD.reshape(len(value_SD), -1).T
     critic.network.take_over({"head.weight": weight_DS, "head.bias": torch.zeros(len(weight_DS))})
     return critic
@@ -87,25 +86,27 @@ def test_a_policy_starts_from_its_seed_alone_and_torch_s_own_generator_is_left_a
 
 
 def test_a_policy_survives_the_round_trip_through_a_file(tmp_path):
-    policy, other = (NetworkPolicy(VECTORS, 5, network=MLP((8,), normalize=True), seed=seed) for seed in (1, 2))
+    policy, other = (NetworkPolicy(VECTORS, 5, MLP(hidden=(8,), normalize=True), seed=seed) for seed in (1, 2))
     policy.network.trunk.encoder.absorb(100 * POINTS_SD)
     saving.write(tmp_path / "policy", policy.state_dict())
     other.load_state_dict(saving.read(tmp_path / "policy"))
     assert torch.equal(policy.probs(POINTS_SD), other.probs(POINTS_SD))
     with pytest.raises(PgtsError, match=r"head.weight is torch.float32 of shape \(5, 8\); .* \(4, 8\)"):
-        NetworkPolicy(VECTORS, 4, network=MLP((8,), normalize=True)).load_state_dict(policy.state_dict())
+        NetworkPolicy(VECTORS, 4, MLP(hidden=(8,), normalize=True)).load_state_dict(policy.state_dict())
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
-@pytest.mark.parametrize("horizon", [FixedHorizon(3), GeometricHorizon()])
-@pytest.mark.parametrize("method", [MonteCarlo(), TDLambda(0.9)])
+@pytest.mark.parametrize("horizon", [FixedHorizon(length=3), GeometricHorizon()])
+@pytest.mark.parametrize("method", [MonteCarlo(), TDLambda(lambda_=0.9)])
 @pytest.mark.parametrize("target", ["v", "q"])
 def test_a_critic_converges_to_the_values_of_a_policy_that_stands_still(target, method, horizon):
     # A fit sees about 1300 targets in each state, 330 or more for each action, of a spread of about 0.8: the tolerances
     # are 4 standard errors; of all 72 comparisons one would fail with probability 0.005.
     pi_SA = (random_policy(MDP, seed=1) + 0.5) / 2
     critic = NetworkCritic(
-        STATES, 2, network=MLP(hidden=()), target=target, method=method, learning_rate=0.03, minibatch_size=1024
+        STATES,
+        2,
+        NetworkValues(network=MLP(hidden=()), target=target, method=method, learning_rate=0.03, minibatch_size=1024),
     )
     losses = []
     for seed in range(8):
@@ -127,11 +128,13 @@ def test_fresh_targets_bring_the_values_of_a_policy_in_two_fits_and_stale_ones_d
     # Of what is missing each stale fit leaves gamma (1 - lambda) / (1 - gamma lambda) = 0.905: 0.82 after two.
     mdp = random_mdp(6, 2, gamma=0.95, start=None)
     pi_SA = random_policy(mdp, seed=1)
-    made = [experience(mdp, pi_SA, FixedHorizon(20), episodes=500, seed=seed) for seed in range(2)]
+    made = [experience(mdp, pi_SA, FixedHorizon(length=20), episodes=500, seed=seed) for seed in range(2)]
     missing = {}
     for fresh in (False, True):
-        options = {"target": target, "method": TDLambda(0.5), "learning_rate": 0.03, "fresh_targets": fresh}
-        critic = NetworkCritic(STATES, 2, network=MLP(hidden=()), num_epochs=40, minibatch_size=1000, **options)
+        options = {"target": target, "method": TDLambda(lambda_=0.5), "learning_rate": 0.03, "fresh_targets": fresh}
+        critic = NetworkCritic(
+            STATES, 2, NetworkValues(network=MLP(hidden=()), num_epochs=40, minibatch_size=1000, **options)
+        )
         for each in made:
             critic.fit(following(pi_SA), each, generator=stream(0, "critic"))
         v_S = exact.evaluate(mdp, pi_SA).v_S
@@ -144,7 +147,7 @@ def test_fresh_targets_bring_the_values_of_a_policy_in_two_fits_and_stale_ones_d
     ("method", "expected"),
     [
         # v(s_{t+1}) is 10: r + 5, and r alone where the episode terminated. The third episode was over in state 2.
-        (TDLambda(0.0), [6.0, 7.0, 9.0, 4.0]),
+        (TDLambda(lambda_=0.0), [6.0, 7.0, 9.0, 4.0]),
         # With a survival of 1: all rewards, and 10 where the first episode was cut.
         (MonteCarlo(), [17.0, 16.0, 14.0, 4.0]),
     ],
@@ -203,7 +206,7 @@ def test_values_are_in_reward_units_whatever_the_unit_is(unit):
     # v of a tabular network after the same fits, but for float32.
     values = []
     for scale in (1.0, unit):
-        critic = tabular_critic([0.0] * 4, learning_rate=0.02, num_epochs=30, method=TDLambda(0.0))
+        critic = tabular_critic([0.0] * 4, learning_rate=0.02, num_epochs=30, method=TDLambda(lambda_=0.0))
         for k in range(10):
             critic.fit(following(torch.ones(4, 2) / 2), by_hand(scale), generator=stream(k, "critic"))
         values.append(critic.v(torch.arange(3)) / scale)
@@ -212,7 +215,7 @@ def test_values_are_in_reward_units_whatever_the_unit_is(unit):
 
 
 def test_a_new_scale_of_the_targets_leaves_learned_values_where_they_were():
-    critic = NetworkCritic(VECTORS, 2, seed=1, polyak=0.5)
+    critic = NetworkCritic(VECTORS, 2, NetworkValues(polyak=0.5), seed=1)
     critic.fit(following(torch.ones(4, 2) / 2), by_hand(shows=POINTS_SD), generator=stream(0, "c"))
     before_N, lagging_N = critic.v(POINTS_SD), critic._v(critic._target_network, POINTS_SD)
     before = critic._mean, critic._scale
@@ -272,9 +275,9 @@ def test_values_are_not_taken_for_what_they_are_not(asked):
 
 def test_a_policy_and_a_critic_can_share_a_trunk():
     space = spaces.Box(0, 255, (7, 7, 3))
-    policy = NetworkPolicy(space, 2, network=CNN(normalize=True, hidden=(16,)))
-    critic = NetworkCritic(space, 2, network=policy.network.trunk)
-    alone = NetworkCritic(space, 2, network=CNN(normalize=True, hidden=(16,)))
+    policy = NetworkPolicy(space, 2, CNN(normalize=True, hidden=(16,)))
+    critic = NetworkCritic(space, 2, NetworkValues(), trunk=policy.network.trunk)
+    alone = NetworkCritic(space, 2, NetworkValues(network=CNN(normalize=True, hidden=(16,))))
     images_S = torch.randint(0, 256, (4, 7, 7, 3), generator=stream(0, "images")).float()
     made, states = by_hand(shows=images_S), torch.arange(3)
     generator, encoder = stream(0, "test"), policy.network.trunk.encoder
@@ -295,8 +298,8 @@ def test_a_policy_and_a_critic_can_share_a_trunk():
 
 @pytest.mark.parametrize(("target", "polyak"), [("v", 1.0), ("q", 0.5)])
 def test_a_saved_critic_goes_on_bit_for_bit(target, polyak, tmp_path):
-    options = {"network": MLP((8,), normalize=True), "target": target, "polyak": polyak}
-    critics = [NetworkCritic(VECTORS, 2, seed=seed, **options) for seed in (1, 2)]
+    options = {"network": MLP(hidden=(8,), normalize=True), "target": target, "polyak": polyak}
+    critics = [NetworkCritic(VECTORS, 2, NetworkValues(**options), seed=seed) for seed in (1, 2)]
     made, policy = by_hand(shows=POINTS_SD), NetworkPolicy(VECTORS, 2)
     critics[0].fit(policy, made, generator=stream(0, "critic"))
     saving.write(tmp_path / "critic", critics[0].state_dict())
@@ -305,7 +308,9 @@ def test_a_saved_critic_goes_on_bit_for_bit(target, polyak, tmp_path):
         losses = [critic.fit(policy, made, generator=stream(k, "critic")) for critic in critics]
         assert losses[0] == losses[1]
     assert torch.equal(critics[0].v(POINTS_SD), critics[1].v(POINTS_SD))
-    assert not torch.equal(critics[0].v(POINTS_SD), NetworkCritic(VECTORS, 2, target="v", seed=1).v(POINTS_SD))
+    assert not torch.equal(
+        critics[0].v(POINTS_SD), NetworkCritic(VECTORS, 2, NetworkValues(target="v"), seed=1).v(POINTS_SD)
+    )
     with pytest.raises(PgtsError, match="the state of a network critic has"):
         critics[0].load_state_dict({"network": critics[0].state_dict()["network"]})
 
@@ -329,20 +334,20 @@ def test_targets_that_are_not_finite_teach_nothing(value):
         ({"target_period": 0}, "target_period is 0"),
         ({"num_epochs": 0}, "num_epochs is 0"),
         ({"minibatch_size": 0}, "minibatch_size is 0"),
-        ({"fresh_targets": True, "polyak": 0.5}, "fresh_targets is True, but .* lags behind"),
-        ({"fresh_targets": True, "target_period": 2}, "fresh_targets is True, but .* lags behind"),
+        ({"fresh_targets": True, "polyak": 0.5}, "fresh_targets is true, but .* lags behind"),
+        ({"fresh_targets": True, "target_period": 2}, "fresh_targets is true, but .* lags behind"),
         ({"learning_rate": -1.0}, "learning_rate is -1.0"),
         ({"max_grad_norm": 0.0}, "max_grad_norm is 0.0"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(options, message):
     with pytest.raises(PgtsError, match=message):
-        NetworkCritic(VECTORS, 2, **options)
+        NetworkCritic(VECTORS, 2, NetworkValues(**options))
 
 
 def test_a_critic_that_lacks_what_it_is_asked_for_says_so():
     with pytest.raises(PgtsError, match="learns v"):
         NetworkCritic(VECTORS, 2).q(POINTS_SD)
     with pytest.raises(PgtsError, match="no policy yet"):
-        NetworkCritic(VECTORS, 2, target="q").v(POINTS_SD)
+        NetworkCritic(VECTORS, 2, NetworkValues(target="q")).v(POINTS_SD)
     assert isinstance(following(torch.ones(2, 2) / 2), SimplexPolicy)

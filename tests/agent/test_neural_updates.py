@@ -1,7 +1,8 @@
 """How network policies move: as tables do where a network is one, and as A2C and PPO where actions were sampled."""
 
-import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -10,27 +11,48 @@ from torch import Tensor
 
 from pgts_torch.agent import saving
 from pgts_torch.agent.advantages import gae, score_function
-from pgts_torch.agent.networks import MLP
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
 from pgts_torch.agent.optimisers import Optimiser
-from pgts_torch.agent.policies import Random, SoftmaxPolicy
-from pgts_torch.agent.rollout import FixedHorizon
+from pgts_torch.agent.policies import SoftmaxPolicy
 from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.agent.updates import MirrorUpdate, SoftmaxUpdate
 from pgts_torch.errors import PgtsError
+from pgts_torch.options import (
+    CMPO,
+    MLP,
+    PPO,
+    FixedHorizon,
+    Gradient,
+    Mirror,
+    NetworkValues,
+    Part,
+    Random,
+    Softmax,
+    SoftmaxGradient,
+)
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact, random_mdp
 from tests.agent.helpers import copies, made_in
 
-UPDATES = [GradientUpdate, PPOUpdate, NetworkMirrorUpdate, CMPOUpdate]
+
+def maker(kind: type[NetworkUpdate], options: type[Part], **given: Any) -> Callable[..., NetworkUpdate]:
+    return lambda **others: kind(options(**given, **others))
+
+
+UPDATES = [
+    maker(GradientUpdate, Gradient),
+    maker(PPOUpdate, PPO),
+    maker(NetworkMirrorUpdate, Mirror),
+    maker(CMPOUpdate, CMPO),
+]
 VECTORS = spaces.Box(-math.inf, math.inf, (3,))
 
 
 def tables(seed: int = 3) -> tuple[SoftmaxPolicy, NetworkPolicy]:
     """The same policy over 6 states and 4 actions, as a table and as a network whose weights are its logits."""
-    table = SoftmaxPolicy(6, 4, init=Random(), seed=seed)
-    network = NetworkPolicy(spaces.Discrete(6), 4, network=MLP(hidden=()))
+    table = SoftmaxPolicy(6, 4, Softmax(init=Random()), seed=seed)
+    network = NetworkPolicy(spaces.Discrete(6), 4, MLP(hidden=()))
     network.load_state_dict({"head.weight": table.logits_SA.T.float(), "head.bias": torch.zeros(4)})
     return table, network
 
@@ -66,10 +88,14 @@ def test_one_gradient_step_of_a_one_hot_network_is_the_tabular_softmax_update():
     states, generator = torch.tensor([5, 0, 3]), stream(0, "update")
     v_N1 = (table.probs(states) * q_NA).sum(-1, keepdim=True)
     step = moved(
-        network, GradientUpdate(learning_rate=0.3, optimizer="sgd", max_grad_norm=None), states, q_NA, weight_N
+        network,
+        GradientUpdate(Gradient(learning_rate=0.3, optimizer="sgd", max_grad_norm="never")),
+        states,
+        q_NA,
+        weight_N,
     )
     before_SA = table.logits_SA.clone()
-    SoftmaxUpdate(step_size=0.3)(table, states, q_NA - v_N1, weight_N, generator=generator)
+    SoftmaxUpdate(SoftmaxGradient(step_size=0.3))(table, states, q_NA - v_N1, weight_N, generator=generator)
     torch.testing.assert_close(step["head.weight"].T, (table.logits_SA - before_SA).float(), atol=1e-6, rtol=1e-4)
     assert step["head.weight"].abs().max() > 0.01
     assert not step["head.weight"].T[[1, 2, 4]].any()
@@ -79,9 +105,9 @@ def test_many_mirror_steps_of_a_one_hot_network_approach_the_tabular_mirror_upda
     (table, network), (q_NA, weight_N) = tables(), question()
     states, generator = torch.arange(6), stream(0, "update")
     before_SA = table.table()
-    in_reward_units = MirrorUpdate(step_size=1 / 0.7, normalize="none", floor=None)
+    in_reward_units = MirrorUpdate(Mirror(step_size=1 / 0.7, normalize="none", floor="never"))
     in_reward_units(table, states, q_NA, torch.ones(6, dtype=torch.float64), generator=generator)
-    update = NetworkMirrorUpdate(temperature=0.7, learning_rate=0.05, num_epochs=600, max_grad_norm=None)
+    update = NetworkMirrorUpdate(Mirror(temperature=0.7, learning_rate=0.05, num_epochs=600, max_grad_norm="never"))
     # The weights say which states matter when a network cannot have them all; this one can.
     losses = update(network, states, q_NA, weight_N, generator=generator)
     assert losses["policy"] < 1e-6
@@ -96,7 +122,7 @@ def test_with_sampled_advantages_the_gradient_update_steps_along_the_gradient_of
     gradients = torch.autograd.grad(loss, list(policy.network.parameters()))
     advantage_NA = score_function(action_N, advantage_N, policy.probs(observation_ND))
     weight_N = torch.full((40,), 1 / 40, dtype=torch.float64)
-    update = GradientUpdate(learning_rate=0.5, optimizer="sgd", max_grad_norm=None)
+    update = GradientUpdate(Gradient(learning_rate=0.5, optimizer="sgd", max_grad_norm="never"))
     steps = moved(policy, update, observation_ND, advantage_NA, weight_N)
     for step, gradient in zip(steps.values(), gradients, strict=True):
         torch.testing.assert_close(step, -0.5 * gradient, atol=1e-6, rtol=1e-3)
@@ -106,7 +132,7 @@ def test_with_sampled_advantages_the_gradient_update_steps_along_the_gradient_of
 def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo():
     # One state; the actions 0, 1, 0, 1 were taken with probability 1/2 each, and now have 0.7 and 0.3: rho is 1.4, 0.6.
     # min(rho A, clip(rho, 0.8, 1.2) A) by hand: 1.2 * 1 (clipped), 0.6 * 2, 1.4 * -1, 0.8 * -3 (clipped).
-    policy = NetworkPolicy(spaces.Discrete(1), 2, network=MLP(hidden=()))
+    policy = NetworkPolicy(spaces.Discrete(1), 2, MLP(hidden=()))
     policy.load_state_dict({"head.weight": torch.zeros(2, 1), "head.bias": torch.zeros(2)})
     states, action_N = torch.zeros(4, dtype=torch.int64), torch.tensor([0, 1, 0, 1])
     advantage_N = torch.tensor([1.0, 2.0, -1.0, -3.0], dtype=torch.float64)
@@ -124,7 +150,7 @@ def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo():
         def state_dict(self):
             return {}
 
-    update = PPOUpdate(num_epochs=2, minibatch_size=4, clip_range=0.2, normalize_advantage=False)
+    update = PPOUpdate(PPO(num_epochs=2, minibatch_size=4, clip_range=0.2, normalize_advantage=False))
     update._optimiser = Step()
     losses = update(policy, states, advantage_NA, torch.full((4,), 0.25), generator=stream(0, "update"))
     assert seen[0][0] == pytest.approx(-(1 + 2 - 1 - 3) / 4)
@@ -140,7 +166,7 @@ def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo():
 def test_the_clip_fraction_is_the_share_of_actions_whose_ratio_is_out_of_range_by_weight_and_by_the_old_policy():
     # Two states of weight 1 and 3, three actions of old probability 0.5, 0.25, 0.25. By hand: in the first state rho
     # is 0.7, 1.3, 1.3, all out of the range 0.8 to 1.2; in the second 0.8995, 1, 1.201: the last one, 0.25.
-    policy = NetworkPolicy(spaces.Discrete(2), 3, network=MLP(hidden=()))
+    policy = NetworkPolicy(spaces.Discrete(2), 3, MLP(hidden=()))
     old_NA = torch.tensor([[0.5, 0.25, 0.25]]).repeat(2, 1)
     new_NA = old_NA * torch.tensor([[0.7, 1.3, 1.3], [0.8995, 1.0, 1.201]])
     policy.load_state_dict({"head.weight": old_NA.log().T, "head.bias": torch.zeros(3)})
@@ -153,7 +179,7 @@ def test_the_clip_fraction_is_the_share_of_actions_whose_ratio_is_out_of_range_b
         def state_dict(self):
             return {}
 
-    update = PPOUpdate(num_epochs=1, minibatch_size=2, clip_range=0.2)
+    update = PPOUpdate(PPO(num_epochs=1, minibatch_size=2, clip_range=0.2))
     update._optimiser = Step()
     advantage_NA = torch.tensor([[1.0, -1.0, -1.0], [1.0, 0.0, -2.0]], dtype=torch.float64)
     weight_N = torch.tensor([1.0, 3.0], dtype=torch.float64)
@@ -172,7 +198,7 @@ def test_the_gradient_of_the_clipped_objective_is_that_of_autograd(entropy_coef)
     gain_NA = torch.minimum(ratio_NA * advantage_NA, ratio_NA.clamp(0.8, 1.2) * advantage_NA)
     objective = (old_NA.exp() * gain_NA).sum() - entropy_coef * (log_NA.exp() * log_NA).sum()
     expected_NA = torch.autograd.grad(objective, logits_NA, retain_graph=True)[0]
-    ours_NA, push_NA = PPOUpdate(clip_range=0.2, entropy_coef=entropy_coef).objective(
+    ours_NA, push_NA = PPOUpdate(PPO(clip_range=0.2, entropy_coef=entropy_coef)).objective(
         log_NA.detach(), old_NA, advantage_NA
     )
     torch.testing.assert_close(ours_NA, gain_NA.detach())
@@ -185,10 +211,10 @@ def test_the_first_step_of_ppo_follows_the_policy_gradient():
     policy, same = (NetworkPolicy(VECTORS, 4, seed=1) for _ in range(2))
     observation_ND, _, _ = sampled(policy, 40)
     advantage_NA, weight_N = question(40)
-    options = {"learning_rate": 0.1, "optimizer": "sgd", "max_grad_norm": None, "entropy_coef": 0.3}
-    ppo = PPOUpdate(num_epochs=1, minibatch_size=40, normalize_advantage=False, **options)
+    options = {"learning_rate": 0.1, "optimizer": "sgd", "max_grad_norm": "never", "entropy_coef": 0.3}
+    ppo = PPOUpdate(PPO(num_epochs=1, minibatch_size=40, normalize_advantage=False, **options))
     steps = moved(policy, ppo, observation_ND, advantage_NA, weight_N)
-    expected = moved(same, GradientUpdate(**options), observation_ND, advantage_NA, weight_N / weight_N.sum())
+    expected = moved(same, GradientUpdate(Gradient(**options)), observation_ND, advantage_NA, weight_N / weight_N.sum())
     for name, step in steps.items():
         torch.testing.assert_close(step, expected[name], atol=1e-6, rtol=1e-3)
 
@@ -198,7 +224,7 @@ def test_ppo_takes_as_many_steps_as_its_minibatches_and_stops_when_the_policy_ha
     for target_kl in (None, 0.02):
         policy = NetworkPolicy(VECTORS, 4, seed=1)
         observation_ND, _, _ = sampled(policy, 70)
-        update = PPOUpdate(learning_rate=0.01, num_epochs=4, minibatch_size=32, target_kl=target_kl)
+        update = PPOUpdate(PPO(learning_rate=0.01, num_epochs=4, minibatch_size=32, target_kl=target_kl))
         losses = update(policy, observation_ND, *question(70), generator=stream(0, "update"))
         counts.append(losses["num_steps"])
         divergences.append(losses["kl"])
@@ -213,14 +239,14 @@ def test_normalised_advantages_move_a_policy_alike_whatever_the_unit_of_reward()
         policy = NetworkPolicy(VECTORS, 4, seed=1)
         observation_ND, _, _ = sampled(policy, 40)
         advantage_NA, weight_N = question(40)
-        update = PPOUpdate(optimizer="sgd", max_grad_norm=None, learning_rate=0.1)
+        update = PPOUpdate(PPO(optimizer="sgd", max_grad_norm="never", learning_rate=0.1))
         steps.append(moved(policy, update, observation_ND, unit * advantage_NA, weight_N))
     for name, step in steps[0].items():
         torch.testing.assert_close(step, steps[1][name], atol=1e-5, rtol=1e-3)
     assert steps[0]["head.bias"].abs().max() > 0.01
 
 
-@pytest.mark.parametrize("update", [GradientUpdate, functools.partial(PPOUpdate, num_epochs=1)])
+@pytest.mark.parametrize("update", [UPDATES[0], maker(PPOUpdate, PPO, num_epochs=1)])
 def test_an_entropy_bonus_alone_makes_a_policy_uniform(update):
     _, policy = tables()
     states, nothing = torch.arange(6), torch.zeros(6, 4, dtype=torch.float64)
@@ -256,7 +282,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_order_others(update):
 
     first, second, other = trained(0), trained(0), trained(1)
     assert all(torch.equal(value, second[name]) for name, value in first.items())
-    assert (update is GradientUpdate) == all(torch.equal(value, other[name]) for name, value in first.items())
+    assert (update is UPDATES[0]) == all(torch.equal(value, other[name]) for name, value in first.items())
 
 
 @pytest.mark.parametrize("update", UPDATES)
@@ -287,7 +313,7 @@ def test_a_state_that_does_not_fit_an_optimiser_is_refused():
         with pytest.raises(PgtsError, match=r"cannot take over|second_D is torch.float32 of shape \(3,\)"):
             update.load_state_dict(wrong)
     with pytest.raises(PgtsError, match="sgd cannot take over"):
-        GradientUpdate(optimizer="sgd").load_state_dict(state)
+        GradientUpdate(Gradient(optimizer="sgd")).load_state_dict(state)
     update.load_state_dict({"num_steps": 1, "first_D": torch.zeros(3), "second_D": torch.zeros(3)})
     with pytest.raises(PgtsError, match="remembers 3 parameters"):
         update(policy, observation_ND, *question(5), generator=stream(0, "update"))
@@ -340,9 +366,9 @@ def test_adam_is_that_of_torch_and_gradients_are_clipped_as_torch_does():
 
 
 def test_observations_are_seen_after_the_steps_but_for_the_first_batch():
-    policy = NetworkPolicy(VECTORS, 4, network=MLP(normalize=True))
+    policy = NetworkPolicy(VECTORS, 4, MLP(normalize=True))
     observation_ND, _, _ = sampled(policy, 50)
-    encoder, update = policy.network.trunk.encoder, GradientUpdate(learning_rate=1e-12)
+    encoder, update = policy.network.trunk.encoder, GradientUpdate(Gradient(learning_rate=1e-12))
     for k, (count, divergence) in enumerate([(50, False), (100, True)]):
         losses = update(policy, observation_ND * 10**k, *question(50), generator=stream(0, "update"))
         assert float(encoder.norm.count) == count
@@ -350,16 +376,20 @@ def test_observations_are_seen_after_the_steps_but_for_the_first_batch():
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
-@pytest.mark.parametrize("update", [GradientUpdate(learning_rate=0.05), PPOUpdate(learning_rate=0.01, num_epochs=4)])
+@pytest.mark.parametrize(
+    "update", [GradientUpdate(Gradient(learning_rate=0.05)), PPOUpdate(PPO(learning_rate=0.01, num_epochs=4))]
+)
 def test_a_policy_and_a_critic_learn_from_sampled_actions_alone(update):
     mdp = random_mdp(6, 2, gamma=0.7, start=None)
-    policy = NetworkPolicy(spaces.Discrete(6), 2, network=MLP((16,)))
-    critic = NetworkCritic(spaces.Discrete(6), 2, network=MLP((16,)), learning_rate=0.01, num_epochs=4)
+    policy = NetworkPolicy(spaces.Discrete(6), 2, MLP(hidden=(16,)))
+    critic = NetworkCritic(
+        spaces.Discrete(6), 2, NetworkValues(network=MLP(hidden=(16,)), learning_rate=0.01, num_epochs=4)
+    )
     env, states, returns = copies(mdp, 16), torch.arange(6), []
     for k in range(20):
         generator = stream(k, "learning")
         returns.append(exact.evaluate(mdp, policy.probs(states)).J)
-        made = made_in(env, policy, FixedHorizon(16), gamma=math.nan, seed=k)
+        made = made_in(env, policy, FixedHorizon(length=16), gamma=math.nan, seed=k)
         v_TB, next_v_TB = (critic.v(s.reshape(-1)).view(s.shape).double() for s in (made.state_TB, made.next_state_TB))
         advantage_V = gae(made, v_TB, next_v_TB, 0.95)[made.alive_TB]
         states_V, actions_V = made.state_TB[made.alive_TB], made.action_TB[made.alive_TB]
@@ -373,16 +403,16 @@ def test_a_policy_and_a_critic_learn_from_sampled_actions_alone(update):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: GradientUpdate(learning_rate=0), "learning_rate is 0"),
-        (lambda: GradientUpdate(max_grad_norm=math.nan), "max_grad_norm is nan"),
-        (lambda: GradientUpdate(optimizer="lion"), "optimizer is 'lion'"),
-        (lambda: GradientUpdate(state_weight="all"), "state_weight is 'all'"),
-        (lambda: GradientUpdate(entropy_coef=-1), "entropy_coef is -1"),
-        (lambda: PPOUpdate(clip_range=0), "clip_range is 0"),
-        (lambda: PPOUpdate(minibatch_size=0), "minibatch_size is 0"),
-        (lambda: PPOUpdate(num_epochs=1.5), "num_epochs is 1.5"),
-        (lambda: PPOUpdate(target_kl=0), "target_kl is 0"),
-        (lambda: NetworkMirrorUpdate(temperature=math.inf), "temperature is inf"),
+        (lambda: Gradient(learning_rate=0), "learning_rate is 0"),
+        (lambda: Gradient(max_grad_norm=math.nan), "max_grad_norm is nan"),
+        (lambda: Gradient(optimizer="lion"), "optimizer is 'lion'"),
+        (lambda: Gradient(state_weight="all"), "state_weight is 'all'"),
+        (lambda: Gradient(entropy_coef=-1), "entropy_coef is -1"),
+        (lambda: PPO(clip_range=0), "clip_range is 0"),
+        (lambda: PPO(minibatch_size=0), "minibatch_size is 0"),
+        (lambda: PPO(num_epochs=1.5), "num_epochs is 1.5"),
+        (lambda: PPO(target_kl=0), "target_kl is 0"),
+        (lambda: Mirror(temperature=math.inf), "temperature is inf"),
         (lambda: PPOUpdate().check(SoftmaxPolicy(2, 2)), "PPOUpdate moves a NetworkPolicy, not a SoftmaxPolicy"),
     ],
 )

@@ -11,15 +11,15 @@ from gymnasium.vector import SyncVectorEnv
 from torch import Tensor
 
 from pgts_torch import PGTS
-from pgts_torch.agent.networks import MLP
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate
 from pgts_torch.agent.optimisers import Optimiser
-from pgts_torch.agent.policies import Biased, SimplexPolicy, SoftmaxPolicy
+from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.options import MLP, Biased, Gradient, Mirror, Projected, Softmax, SoftmaxGradient
 from pgts_torch.seeding import stream
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -211,9 +211,9 @@ def test_without_such_a_number_the_policy_moves(kind):
 @pytest.mark.parametrize(
     ("policy", "update"),
     [
-        (SoftmaxPolicy(3, 2), SoftmaxUpdate(1e308)),
-        (SoftmaxPolicy(3, 2), MirrorUpdate(1e308)),
-        (SimplexPolicy(3, 2), ProjectedUpdate(1e308)),
+        (SoftmaxPolicy(3, 2), SoftmaxUpdate(SoftmaxGradient(step_size=1e308))),
+        (SoftmaxPolicy(3, 2), MirrorUpdate(Mirror(step_size=1e308))),
+        (SimplexPolicy(3, 2), ProjectedUpdate(Projected(step_size=1e308))),
     ],
 )
 def test_a_tabular_step_that_overflows_leaves_the_table_as_it_is(policy, update):
@@ -230,11 +230,13 @@ def test_a_tabular_step_that_overflows_leaves_the_table_as_it_is(policy, update)
 
 @pytest.mark.fault("step that overflows")
 def test_a_direction_that_overflows_leaves_the_table_as_it_is():
-    policy = SoftmaxPolicy(3, 2, init=Biased(action=1, probability=0.9))
+    policy = SoftmaxPolicy(3, 2, Softmax(init=Biased(action=1, probability=0.9)))
     before, weight_N = policy.table(), torch.ones(1, dtype=torch.float64)
     advantage_NA = torch.tensor([[1.7e308, -1.7e308]], dtype=torch.float64)
     with pytest.raises(NotFinite, match=r"the next policy of state 1 is \[inf, .*\]; it must be finite"):
-        SoftmaxUpdate(0.1)(policy, torch.tensor([1]), advantage_NA, weight_N, generator=stream(0, "update"))
+        SoftmaxUpdate(SoftmaxGradient(step_size=0.1))(
+            policy, torch.tensor([1]), advantage_NA, weight_N, generator=stream(0, "update")
+        )
     assert torch.equal(policy.table(), before)
 
 
@@ -243,7 +245,9 @@ def test_a_direction_that_overflows_leaves_the_table_as_it_is():
 def test_an_action_that_is_not_allowed_may_be_worth_minus_infinity(make, options):
     policy, states, weight_N = make(4, 3), torch.tensor([1, 2]), torch.ones(2, dtype=torch.float64)
     advantage_NA = torch.tensor([[0.0, -math.inf, -math.inf], [1.0, -1.0, -math.inf]], dtype=torch.float64)
-    MirrorUpdate(1.0, **options)(policy, states, advantage_NA, weight_N, generator=stream(0, "update"))
+    MirrorUpdate(Mirror(step_size=1.0, **options))(
+        policy, states, advantage_NA, weight_N, generator=stream(0, "update")
+    )
     assert policy.table()[1].tolist() == [1.0, 0.0, 0.0]
     # State 2: pi is (1/2, 1/2) on what is allowed. The mean over both states of sum_a pi A^2, pi = 1/3, is 1/3.
     size = 1.0 if "normalize" in options else math.sqrt(1 / 3)
@@ -251,14 +255,18 @@ def test_an_action_that_is_not_allowed_may_be_worth_minus_infinity(make, options
     assert policy.table()[2].tolist() == pytest.approx([better, 1 - better, 0.0], abs=1e-12)
     assert torch.equal(policy.table()[[0, 3]], make(4, 3).table()[[0, 3]])
     with pytest.raises(NotFinite, match=r"the step along the advantages of state 1 is \[-inf, -inf, -inf\]"):
-        MirrorUpdate(1.0)(policy, states, advantage_NA.fill_(-math.inf), weight_N, generator=stream(0, "update"))
+        MirrorUpdate(Mirror(step_size=1.0))(
+            policy, states, advantage_NA.fill_(-math.inf), weight_N, generator=stream(0, "update")
+        )
 
 
 def test_the_softmax_gradient_leaves_an_action_that_is_not_allowed_and_never_taken_where_it_is():
     policy, weight_N = SoftmaxPolicy(2, 3), torch.ones(1, dtype=torch.float64)
     policy.logits_SA[1] = torch.tensor([0.0, 0.0, -math.inf])
     advantage_NA = torch.tensor([[1.0, -1.0, -math.inf]], dtype=torch.float64)
-    SoftmaxUpdate(0.5)(policy, torch.tensor([1]), advantage_NA, weight_N, generator=stream(0, "update"))
+    SoftmaxUpdate(SoftmaxGradient(step_size=0.5))(
+        policy, torch.tensor([1]), advantage_NA, weight_N, generator=stream(0, "update")
+    )
     # pi = (1/2, 1/2, 0), so the direction is pi A = (1/2, -1/2, 0).
     assert policy.logits_SA[1].tolist() == [0.25, -0.25, -math.inf]
 
@@ -302,8 +310,8 @@ def test_saved_probabilities_that_are_not_finite_are_refused(value):
 @pytest.mark.fault("step that overflows")
 @pytest.mark.parametrize(("learning_rate", "what"), [(1e20, "probability"), (1e39, "gradient")])
 def test_steps_of_a_network_that_overflow_are_taken_back(learning_rate, what):
-    policy = NetworkPolicy(spaces.Box(-math.inf, math.inf, (3,)), 2, network=MLP(activation="relu"))
-    update = GradientUpdate(learning_rate=learning_rate, optimizer="sgd", max_grad_norm=None)
+    policy = NetworkPolicy(spaces.Box(-math.inf, math.inf, (3,)), 2, MLP(activation="relu"))
+    update = GradientUpdate(Gradient(learning_rate=learning_rate, optimizer="sgd", max_grad_norm="never"))
     before = policy.state_dict()
     question = torch.ones(2, 3), torch.tensor([[1.0, -1.0], [2.0, -2.0]]), torch.ones(2)
     with pytest.raises(NotFinite) as caught:

@@ -8,8 +8,9 @@ import torch
 from pgts_torch import PGTS
 from pgts_torch.agent.critics import TabularCritic
 from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
-from pgts_torch.agent.updates import MirrorUpdate, SoftmaxUpdate
+from pgts_torch.agent.updates import SoftmaxUpdate
 from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.options import Mirror, SoftmaxGradient, TabularValues
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact, grid, ladder
 from pgts_torch.tabular.ascent import projected_step
@@ -273,13 +274,13 @@ def test_an_environment_without_a_model_is_refused_with_what_is_missing():
     [
         ({"depth": -1}, "depth is -1"),
         ({"depth": 1.5}, "depth is 1.5"),
-        ({"policy": "simplex", "update": "softmax"}, "SoftmaxUpdate moves a SoftmaxPolicy"),
+        ({"policy": "simplex", "update": "softmax"}, "update.type is softmax, which needs policy.type softmax"),
         ({"policy": SoftmaxPolicy(4, 2)}, r"\(4, 2\); the environment has \(5, 2\)"),
         ({"gamma": 1.5}, "gamma is 1.5"),
         ({"seed": -1}, "seed is -1"),
         ({"seed": None}, "seed is None; it must be a whole number"),
         ({"device": "auto"}, "device is 'auto', where torch cannot compute: Expected one of cpu"),
-        ({"num_envs": 0}, "num_envs is 0; it must be a whole number of at least 1"),
+        ({"num_envs": 0}, "num_envs is 0; it must be a whole number >= 1"),
         ({"env_kwargs": {"length": 3}}, "no argument 'length'"),
         ({"env": "pgts/Nowhere-v0"}, "pgts/Nowhere-v0 cannot be made"),
         ({"horizon": 3}, "horizon is 3"),
@@ -296,13 +297,13 @@ def test_arguments_that_do_not_fit_are_refused(kwargs, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"update": "mirror"}, "NetworkMirrorUpdate needs the advantages of all actions"),
-        ({"policy": "softmax", "update": "mirror"}, "MirrorUpdate takes one row a state"),
-        ({"depth": 1}, "depth is 1; sampled advantages look no step ahead"),
-        ({"critic": "exact"}, "the critic is ExactCritic of v; sampled advantages"),
-        ({"critic": "rollout"}, "the critic is RolloutCritic of v; sampled advantages"),
-        ({"critic": {"type": "tabular", "target": "q"}}, "the critic is TabularCritic of q; sampled advantages"),
-        ({"critic": {"type": "network", "target": "q"}}, "the critic is NetworkCritic of q; sampled advantages"),
+        ({"update": "mirror"}, "update.type is mirror, which needs the advantages of all actions"),
+        ({"policy": "softmax", "update": "mirror"}, "estimator.type is sampled, which needs policy.type mlp or cnn"),
+        ({"depth": 1}, "depth is 1; with estimator.type sampled there is no lookahead, it must be 0"),
+        ({"critic": "exact"}, "critic.type is exact of target v; sampled advantages"),
+        ({"critic": "rollout"}, "critic.type is rollout of target v; sampled advantages"),
+        ({"critic": {"type": "tabular", "target": "q"}}, "critic.type is tabular of target q; sampled advantages"),
+        ({"critic": {"type": "network", "target": "q"}}, "critic.type is network of target q; sampled advantages"),
     ],
 )
 def test_sampled_advantages_are_refused_where_they_mean_nothing(options, message):
@@ -316,17 +317,17 @@ def test_parts_may_be_given_as_objects():
     model = PGTS(
         copies(grid(4, traps=(5,)), 3),
         policy=SoftmaxPolicy(16, 4),
-        critic=TabularCritic(16, 4, target="q"),
-        update=SoftmaxUpdate(0.2),
+        critic=TabularCritic(16, 4, TabularValues(target="q")),
+        update=SoftmaxUpdate(SoftmaxGradient(step_size=0.2)),
     )
     assert model.iterate().depth == 4
-    assert model.update == SoftmaxUpdate(0.2)
+    assert model.options.update == SoftmaxGradient(step_size=0.2)
     with pytest.raises(PgtsError, match="was given as a VectorEnv of which no others can be made"):
         model.source.make(2)
 
 
 def test_the_defaults_update_every_kind_of_policy():
-    assert make().update == MirrorUpdate(1.0, "uniform", normalize="rms", floor=12.0)
+    assert make().update.options == Mirror(step_size=1.0, state_weight="uniform", normalize="rms", floor=12.0)
     assert type(make(policy="simplex").update).__name__ == "ProjectedUpdate"
 
 

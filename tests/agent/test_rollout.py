@@ -5,17 +5,13 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
 
-from pgts_torch.agent.rollout import (
-    FixedHorizon,
-    GeometricHorizon,
-    Rollout,
-    simulated_returns,
-)
+from pgts_torch.agent.rollout import Rollout, simulated_returns
 from pgts_torch.bellman import Outcomes
 from pgts_torch.envs import TabularVectorEnv
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import TabularModel
 from pgts_torch.models.environments import EnvSource, check_vector_env
+from pgts_torch.options import FixedHorizon, GeometricHorizon
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder
 from tests.agent.helpers import (
@@ -124,7 +120,7 @@ def test_the_comparison_would_see_missing_discounts(name):
     # Without terminal outcomes every discount is gamma; a wrong one shows, and so do visits that nothing discounts.
     mdp = DISCOUNTED[name]()
     pi_SA = random_policy(mdp, seed=1)
-    made = experience(mdp, pi_SA, FixedHorizon(20), episodes=8_000)
+    made = experience(mdp, pi_SA, FixedHorizon(length=20), episodes=8_000)
     undiscounted_BS = weight_by_episode(made, made.alive_TB, mdp.num_states)
     assert visit_z_scores(undiscounted_BS, exact.occupancy(mdp, pi_SA)).abs().max() > 2 * FAR
     other = TabularMDP(
@@ -143,7 +139,7 @@ def test_the_comparison_would_see_missing_discounts(name):
 
 
 def test_under_the_fixed_horizon_a_visit_weighs_the_discounts_before_it():
-    made = experience(chain(), torch.ones(3, 1, dtype=torch.float64), FixedHorizon(4), episodes=2)
+    made = experience(chain(), torch.ones(3, 1, dtype=torch.float64), FixedHorizon(length=4), episodes=2)
     assert made.state_TB[:, 0].tolist() == [0, 1, 2, 2]
     torch.testing.assert_close(made.weight_TB[:, 0], torch.tensor([1.0, 0.5, 0.4, 0.36], dtype=torch.float64))
     torch.testing.assert_close(made.returns(), torch.full((2,), 1 + 0.5 * 2 + 0.4 * 3 + 0.36 * 3, dtype=torch.float64))
@@ -156,7 +152,7 @@ def test_under_the_fixed_horizon_a_visit_weighs_the_discounts_before_it():
 def test_under_the_fixed_horizon_the_weights_estimate_the_occupancy_of_its_first_steps(name):
     mdp = DISCOUNTED[name]()
     pi_SA = random_policy(mdp, seed=1)
-    made = experience(mdp, pi_SA, FixedHorizon(4), episodes=8_000)
+    made = experience(mdp, pi_SA, FixedHorizon(length=4), episodes=8_000)
     weight_BS = weight_by_episode(made, made.weight_TB, mdp.num_states)
     assert visit_z_scores(weight_BS, truncated_occupancy(mdp, pi_SA, 4)).abs().max() < FAR
     assert visit_z_scores(weight_BS, exact.occupancy(mdp, pi_SA)).abs().max() > FAR
@@ -182,7 +178,7 @@ def test_nothing_after_the_end_of_an_episode_counts():
     assert made.follows_TB.tolist() == [[True, True], [True, False], [False, False]]
 
 
-@pytest.mark.parametrize("horizon", [FixedHorizon(12), GeometricHorizon()])
+@pytest.mark.parametrize("horizon", [FixedHorizon(length=12), GeometricHorizon()])
 @pytest.mark.parametrize("name", ["FrozenLake", "deep_sea", "garnet", "grid, absorbing"])
 def test_episodes_go_on_exactly_until_a_terminal_outcome_or_the_horizon(name, horizon):
     mdp = zoo(name)
@@ -210,7 +206,7 @@ def test_rollouts_of_gymnasiums_environments_are_transitions_of_their_tables(nam
     made = made_in(
         env,
         following(uniform_policy(mdp)),
-        FixedHorizon(250),  # longer than FrozenLake's and Taxi's own time limits
+        FixedHorizon(length=250),  # longer than FrozenLake's and Taxi's own time limits
         gamma=0.9,
         seed=0,
         names=("test",),
@@ -238,7 +234,7 @@ def test_our_environments_make_the_same_kind_of_rollout_together_and_one_by_one(
         made = made_in(
             env,
             following(uniform_policy(mdp)),
-            FixedHorizon(30),
+            FixedHorizon(length=30),
             gamma=float("nan"),
             seed=3,
             names=("test",),
@@ -251,7 +247,7 @@ def test_our_environments_make_the_same_kind_of_rollout_together_and_one_by_one(
 
 def test_the_environments_own_discount_goes_before_the_given_one():
     assert TabularVectorEnv(ladder(gamma=0.7), 1).mdp.outcomes.discount_NAK.unique().tolist() == [0.7]
-    made = experience(ladder(gamma=0.7), uniform_policy(ladder()), FixedHorizon(3), episodes=4, gamma=0.2)
+    made = experience(ladder(gamma=0.7), uniform_policy(ladder()), FixedHorizon(length=3), episodes=4, gamma=0.2)
     assert made.discount_TB.unique().tolist() == [0.7]
     assert EnvSource.of("pgts/Ladder-v0", gamma=0.6).make(2).mdp.outcomes.discount_NAK.unique().tolist() == [0.6]
     assert EnvSource.of("pgts/Ladder-v0").make(2).mdp.outcomes.discount_NAK.unique().tolist() == [0.9]
@@ -264,7 +260,7 @@ def test_a_time_limit_cuts_an_episode_without_terminating_it(name):
     made = made_in(
         env,
         following(torch.full((num_states, num_actions), 1 / num_actions, dtype=torch.float64)),
-        FixedHorizon(10),
+        FixedHorizon(length=10),
         gamma=0.9,
         seed=0,
         names=("test",),
@@ -288,7 +284,7 @@ def test_a_copy_that_is_cut_earlier_than_the_others_counts_no_longer():
     made = made_in(
         FirstCopyIsCut(copies(ladder(), 3)),
         following(uniform_policy(ladder())),
-        FixedHorizon(5),
+        FixedHorizon(length=5),
         gamma=0.9,
         seed=0,
         names=("test",),
@@ -307,7 +303,7 @@ def test_without_being_asked_an_environment_has_no_time_limit_but_ours():
         made = made_in(
             env,
             following(left_SA),
-            FixedHorizon(300),
+            FixedHorizon(length=300),
             gamma=0.9,
             seed=0,
             names=("test",),
@@ -317,7 +313,7 @@ def test_without_being_asked_an_environment_has_no_time_limit_but_ours():
 
 
 @pytest.mark.parametrize("name", ["pgts/Random-v0", "FrozenLake-v1"])
-@pytest.mark.parametrize("horizon", [FixedHorizon(20), GeometricHorizon()])
+@pytest.mark.parametrize("horizon", [FixedHorizon(length=20), GeometricHorizon()])
 def test_the_same_seed_and_names_give_the_same_rollout_whatever_was_before(name, horizon):
     env = EnvSource.of(name, gamma=0.9).make(4)
     pi_SA = torch.full((env.single_observation_space.n, env.single_action_space.n), 1.0, dtype=torch.float64)
@@ -351,7 +347,7 @@ def test_neighbouring_seeds_and_iterations_hand_disjoint_seeds_to_the_environmen
             made_in(
                 env,
                 following(uniform_policy(mdp)),
-                FixedHorizon(1),
+                FixedHorizon(length=1),
                 gamma=0.9,
                 seed=seed,
                 names=names,
@@ -415,7 +411,7 @@ def test_a_process_that_never_ends_is_stopped_by_the_guard_of_the_geometric_hori
 def test_simulated_episodes_earn_what_was_computed_by_hand():
     model, policy = TabularModel(chain()), following(torch.ones(3, 1, dtype=torch.float64))
     returns_B, num_steps = simulated_returns(
-        model, policy, torch.tensor([0, 1, 2]), FixedHorizon(3), generator=stream(0, "test")
+        model, policy, torch.tensor([0, 1, 2]), FixedHorizon(length=3), generator=stream(0, "test")
     )
     expected_B = torch.tensor([1 + 0.5 * (2 + 0.8 * 3), 2 + 0.8 * (3 + 0.9 * 3), 3 + 0.9 * (3 + 0.9 * 3)])
     torch.testing.assert_close(returns_B, expected_B.double())
@@ -425,7 +421,7 @@ def test_simulated_episodes_earn_what_was_computed_by_hand():
 def test_simulated_episodes_end_with_a_terminal_outcome_and_cost_nothing_after_it():
     mdp = deep_sea(4, gamma=1.0, move_cost=0.0)
     right, state_B = following(always(mdp, 1)), torch.tensor([0, 5, 15])
-    for horizon in (FixedHorizon(30), GeometricHorizon(max_length=4)):
+    for horizon in (FixedHorizon(length=30), GeometricHorizon(max_length=4)):
         kwargs = {"generator": stream(0, "test")}
         returns_B, num_steps = simulated_returns(TabularModel(mdp), right, state_B, horizon, **kwargs)
         assert returns_B.tolist() == [1.0, 1.0, 1.0]

@@ -13,10 +13,10 @@ import torch
 from pgts_torch import PGTS
 from pgts_torch.agent import saving
 from pgts_torch.agent.policies import SoftmaxPolicy
-from pgts_torch.agent.rollout import FixedHorizon
 from pgts_torch.agent.updates import SoftmaxUpdate
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.environments import EnvSource
+from pgts_torch.options import MCTS, FixedHorizon, Mirror, Softmax, SoftmaxGradient, TabularValues
 from tests.agent.helpers import same_bits
 
 KINDS = {
@@ -79,13 +79,23 @@ def test_a_model_is_loaded_with_everything_that_it_was_made_with(tmp_path):
     loaded = PGTS.load(path, device="cpu")
     assert torch.equal(loaded.policy.table(), made.policy.table())
     assert loaded.depth_choice.depths == made.depth_choice.depths
-    for name in ("seed", "gamma", "update", "horizon", "device"):
+    for name in ("seed", "gamma", "options", "horizon", "device"):
         assert getattr(loaded, name) == getattr(made, name)
-    assert loaded.search.max_nodes == 5000
+    assert loaded.search.options.max_nodes == 5000
     assert loaded.world.env.num_envs == 3
     assert torch.equal(loaded.mdp.outcomes.reward_NA, made.mdp.outcomes.reward_NA)
     loaded.save(path)
     assert PGTS.load(path).iterate().experience.num_steps == made.iterate().experience.num_steps
+
+
+def test_a_model_is_loaded_with_the_options_that_it_was_made_with(tmp_path):
+    path = tmp_path / "model.pt"
+    options = {"policy": Softmax(), "critic": TabularValues(target="q"), "update": Mirror(floor="never")}
+    made = make(**options, search=MCTS(simulations=3), horizon=FixedHorizon(length=4))
+    made.save(path)
+    assert PGTS.load(path).options == made.options
+    assert made.options.update.floor == "never"
+    assert PGTS.load(path).search.options.simulations == 3
 
 
 def test_a_seed_and_a_discount_from_numpy_are_saved(tmp_path):
@@ -212,8 +222,7 @@ def test_a_model_of_an_environment_that_is_an_object_is_loaded_with_one(env, tmp
     ("name", "part"),
     [
         ("policy", lambda: SoftmaxPolicy(5, 2)),
-        ("update", lambda: SoftmaxUpdate(0.3)),
-        ("horizon", lambda: FixedHorizon(4)),
+        ("update", lambda: SoftmaxUpdate(SoftmaxGradient(step_size=0.3))),
     ],
 )
 def test_a_model_with_a_part_that_no_file_can_describe_is_not_saved(name, part, tmp_path):
@@ -229,6 +238,6 @@ def test_what_could_not_be_read_again_does_not_replace_what_can(tmp_path):
     make().save(path)
     whole = path.read_bytes()
     with pytest.raises(PgtsError, match="something other than tensors and plain values"):
-        make(stop_at=Fraction(1, 2)).save(path)
+        make(reward_range=(Fraction(-5), Fraction(5))).save(path)
     assert path.read_bytes() == whole
     assert len(list(tmp_path.iterdir())) == 1

@@ -125,11 +125,11 @@ def test_training_knows_how_noisy_a_sampled_lookahead_is(share):
 @pytest.mark.parametrize(
     ("search", "message"),
     [
-        ("breadth", "search is 'breadth'; it must be one of auto, expectimax, sampled, mcts"),
-        ({"type": "auto", "max_width": 3}, "search 'auto' does not take these options: \\['max_width'\\]"),
-        ({"type": "mcts", "share": "level"}, "search 'mcts' does not take"),
+        ("breadth", "search.kind is 'breadth'; it must be auto, expectimax, mcts or sampled"),
+        ({"type": "auto", "max_width": 3}, "search.max_width does not belong to search.kind auto"),
+        ({"type": "mcts", "share": "level"}, "search.share does not belong to search.kind mcts"),
         ({"type": "mcts", "samples": 0}, "samples is 0"),
-        ({"type": "expectimax", "prior": "policy"}, "search 'expectimax' does not take"),
+        ({"type": "expectimax", "prior": "policy"}, "search.prior does not belong to search.kind expectimax"),
     ],
 )
 def test_a_search_that_does_not_exist_or_an_option_that_it_does_not_heed_is_refused(search, message):

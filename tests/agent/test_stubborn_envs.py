@@ -11,11 +11,12 @@ from gymnasium import spaces
 
 from pgts_torch import PGTS, evaluate
 from pgts_torch.agent.policies import SoftmaxPolicy
-from pgts_torch.agent.rollout import FixedHorizon, simulated_returns
+from pgts_torch.agent.rollout import simulated_returns
 from pgts_torch.errors import Failed, MissingModel, NotFinite, PgtsError
 from pgts_torch.experiment.cli import main
 from pgts_torch.models import check_model
 from pgts_torch.models.tensor import TensorModel
+from pgts_torch.options import FixedHorizon
 from pgts_torch.search import expectimax, mcts, sampled
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, exact, stationary, stationary_sets
@@ -307,4 +308,4 @@ def test_a_discount_of_a_model_outside_0_to_1_is_refused(wrong):
     with pytest.raises(PgtsError, match=message):
         mcts(model, root_B, depth=1, v_leaf=zeros, simulations=2)
     with pytest.raises(PgtsError, match=message):
-        simulated_returns(model, SoftmaxPolicy(3, 2), root_B, FixedHorizon(2), generator=stream(0, "returns"))
+        simulated_returns(model, SoftmaxPolicy(3, 2), root_B, FixedHorizon(length=2), generator=stream(0, "returns"))

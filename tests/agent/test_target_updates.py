@@ -6,15 +6,15 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from pgts_torch.agent.networks import MLP
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.target_updates import CMPOUpdate, advantage_scale
 from pgts_torch.errors import PgtsError
+from pgts_torch.options import CMPO, MLP
 from pgts_torch.seeding import stream
 
 
 def policy(num_states: int = 4, num_actions: int = 3) -> NetworkPolicy:
-    made = NetworkPolicy(spaces.Discrete(num_states), num_actions, network=MLP(hidden=()))
+    made = NetworkPolicy(spaces.Discrete(num_states), num_actions, MLP(hidden=()))
     generator = stream(0, "logits")
     weight_AS = torch.randn(num_actions, num_states, generator=generator)
     made.load_state_dict({"head.weight": weight_AS, "head.bias": torch.zeros(num_actions)})
@@ -30,7 +30,7 @@ def question(num_states: int = 4, num_actions: int = 3) -> tuple[torch.Tensor, t
 def after(advantage_NA: torch.Tensor, weight_N: torch.Tensor, noise: float = 0.0, **options) -> torch.Tensor:
     """The probabilities after one update."""
     made, states = policy(), torch.arange(4)
-    CMPOUpdate(**options)(made, states, advantage_NA, weight_N, generator=stream(0, "update"), noise=noise)
+    CMPOUpdate(CMPO(**options))(made, states, advantage_NA, weight_N, generator=stream(0, "update"), noise=noise)
     return made.probs(states)
 
 
@@ -48,7 +48,7 @@ def test_a_network_that_can_be_any_policy_ends_at_the_clipped_target():
     assert (exponent_NA.abs() == 0.5).any()
     assert (exponent_NA.abs() < 0.5).any()
     target_NA = (policy().probs(torch.arange(4)).log() + exponent_NA).softmax(-1)
-    options = {"learning_rate": 0.05, "num_epochs": 600, "max_grad_norm": None}
+    options = {"learning_rate": 0.05, "num_epochs": 600, "max_grad_norm": "never"}
     found_NA = after(advantage_NA, weight_N, clip=0.5, temperature=1.0, **options)
     assert (found_NA - target_NA).abs().max() < 1e-3
     unclipped_NA = after(advantage_NA, weight_N, clip=10.0, temperature=1.0, **options)
@@ -77,4 +77,4 @@ def test_what_is_smaller_than_the_noise_moves_little_and_nothing_where_all_actio
 @pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
 def test_an_option_out_of_range_is_refused(option, value):
     with pytest.raises(PgtsError, match=f"{option} is {value}"):
-        CMPOUpdate(**{option: value})
+        CMPO(**{option: value})

@@ -5,25 +5,38 @@ import math
 import pytest
 import torch
 
-from pgts_torch.agent.policies import Random, SimplexPolicy, SoftmaxPolicy
+from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate
 from pgts_torch.errors import PgtsError
+from pgts_torch.options import Mirror, Projected, Random, Simplex, Softmax, SoftmaxGradient
 from pgts_torch.seeding import stream
 from pgts_torch.tabular.ascent import mirror_step, projected_step, softmax_step
 
 
+def projected(**options) -> ProjectedUpdate:
+    return ProjectedUpdate(Projected(**options))
+
+
+def softmax(**options) -> SoftmaxUpdate:
+    return SoftmaxUpdate(SoftmaxGradient(**options))
+
+
 def in_reward_units(**options) -> MirrorUpdate:
     """The mirror step of the exact formula."""
-    return MirrorUpdate(normalize="none", floor=None, **options)
+    return MirrorUpdate(Mirror(normalize="none", floor="never", **options))
 
 
 CASES = [
-    (ProjectedUpdate, SimplexPolicy, projected_step),
-    (SoftmaxUpdate, SoftmaxPolicy, softmax_step),
+    (projected, SimplexPolicy, projected_step),
+    (softmax, SoftmaxPolicy, softmax_step),
     (in_reward_units, SimplexPolicy, mirror_step),
     (in_reward_units, SoftmaxPolicy, mirror_step),
 ]
 STATES = torch.tensor([5, 0, 3])
+
+
+def random_policy(kind):
+    return kind(7, 4, (Simplex if kind is SimplexPolicy else Softmax)(init=Random()), seed=3)
 
 
 def question(seed: int = 0):
@@ -36,7 +49,7 @@ def question(seed: int = 0):
 @pytest.mark.parametrize(("update", "kind", "step"), CASES)
 @pytest.mark.parametrize("step_size", [0.01, 0.1, 0.3])
 def test_an_update_is_the_exact_formula_at_the_visited_states(update, kind, step, step_size):
-    policy = kind(7, 4, init=Random(), seed=3)
+    policy = random_policy(kind)
     before_SA, (q_NA, weight_N) = policy.table(), question()
     update(step_size=step_size).step(policy, STATES, q_NA, weight_N)
     expected_NA = step(before_SA[STATES], q_NA, weight_N, step_size)
@@ -47,7 +60,7 @@ def test_an_update_is_the_exact_formula_at_the_visited_states(update, kind, step
 
 @pytest.mark.parametrize(("update", "kind", "step"), CASES)
 def test_an_update_is_one_step_and_draws_nothing(update, kind, step):
-    called, stepped = kind(7, 4, init=Random(), seed=3), kind(7, 4, init=Random(), seed=3)
+    called, stepped = random_policy(kind), random_policy(kind)
     generator = stream(0, "untouched")
     assert update()(called, STATES, *question(), generator=generator) == {}
     update().step(stepped, STATES, *question())
@@ -57,7 +70,7 @@ def test_an_update_is_one_step_and_draws_nothing(update, kind, step):
 
 @pytest.mark.parametrize(("update", "kind", "step"), CASES)
 def test_states_that_were_not_visited_stay_bit_for_bit(update, kind, step):
-    policy = kind(7, 4, init=Random(), seed=3)
+    policy = random_policy(kind)
     before = {name: value.clone() for name, value in policy.state_dict().items()}
     update(step_size=5.0).step(policy, STATES, *question())
     others = torch.tensor([1, 2, 4, 6])
@@ -68,7 +81,7 @@ def test_states_that_were_not_visited_stay_bit_for_bit(update, kind, step):
 
 @pytest.mark.parametrize(("update", "kind", "step"), CASES)
 def test_after_many_large_steps_a_policy_is_still_one(update, kind, step):
-    policy = kind(7, 4, init=Random(), seed=3)
+    policy = random_policy(kind)
     for seed in range(200):
         update(step_size=50.0).step(policy, STATES, *question(seed))
     pi_SA = policy.table()
@@ -85,21 +98,21 @@ def test_an_update_moves_toward_the_better_action(update, kind, step):
 
 
 def test_mirror_steps_on_logits_and_on_probabilities_are_the_same():
-    on_probs = SimplexPolicy(7, 4, init=Random(), seed=3)
-    on_logits = SoftmaxPolicy(7, 4, init=Random(), seed=3)
+    on_probs = SimplexPolicy(7, 4, Simplex(init=Random()), seed=3)
+    on_logits = SoftmaxPolicy(7, 4, Softmax(init=Random()), seed=3)
     for seed in range(20):
         for policy in (on_probs, on_logits):
-            MirrorUpdate(step_size=0.3).step(policy, STATES, *question(seed))
+            MirrorUpdate(Mirror(step_size=0.3)).step(policy, STATES, *question(seed))
     torch.testing.assert_close(on_probs.table(), on_logits.table())
 
 
 def test_the_softmax_update_is_the_gradient_of_the_weighted_mean_value():
-    policy = SoftmaxPolicy(7, 4, init=Random(), seed=3)
+    policy = SoftmaxPolicy(7, 4, Softmax(init=Random()), seed=3)
     q_NA, weight_N = question()
     logits_SA = policy.logits_SA.clone().requires_grad_()
     (weight_N * (logits_SA[STATES].softmax(-1) * q_NA).sum(-1)).sum().backward()
     before_SA = policy.logits_SA.clone()
-    SoftmaxUpdate(step_size=0.7).step(policy, STATES, q_NA, weight_N)
+    SoftmaxUpdate(SoftmaxGradient(step_size=0.7)).step(policy, STATES, q_NA, weight_N)
     torch.testing.assert_close(policy.logits_SA - before_SA, 0.7 * logits_SA.grad)
 
 
@@ -122,13 +135,13 @@ def test_a_policy_that_an_update_can_move_is_taken(update, kind, step):
     assert isinstance(policy, update().policies)
 
 
-@pytest.mark.parametrize("update", [ProjectedUpdate, SoftmaxUpdate, MirrorUpdate])
-def test_steps_and_weights_that_make_no_sense_are_refused(update):
+@pytest.mark.parametrize("options", [Projected, SoftmaxGradient, Mirror])
+def test_steps_and_weights_that_make_no_sense_are_refused(options):
     for step_size in (0, -0.1, float("nan"), float("inf")):
         with pytest.raises(PgtsError, match=f"step_size is {step_size}"):
-            update(step_size=step_size)
+            options(step_size=step_size)
     with pytest.raises(PgtsError, match="state_weight is 'all'"):
-        update(state_weight="all")
+        options(state_weight="all")
 
 
 def moved(update: MirrorUpdate, advantage: list[list[float]], logits: list[list[float]], noise: float = 0.0):
@@ -145,7 +158,7 @@ def moved(update: MirrorUpdate, advantage: list[list[float]], logits: list[list[
 def test_a_normalised_step_is_in_units_of_the_root_mean_square_under_the_policy():
     # State 0: pi = 1/2, A = -+ 3, mean square 9. State 1: pi = 1/4, 3/4, A = 3, -1, mean square 3. Root mean: sqrt 6.
     logits = [[0.0, 0.0], [0.0, math.log(3)]]
-    (first,), (second,) = moved(MirrorUpdate(step_size=2.0), [[3.0, -3.0], [3.0, -1.0]], logits)
+    (first,), (second,) = moved(MirrorUpdate(Mirror(step_size=2.0)), [[3.0, -3.0], [3.0, -1.0]], logits)
     assert first == pytest.approx(-6 * 2 / math.sqrt(6))
     assert second == pytest.approx(-4 * 2 / math.sqrt(6))
     assert first != pytest.approx(-6 * 2 / 3)  # what each state for itself would make of it
@@ -158,7 +171,7 @@ def test_noise_that_is_larger_than_the_advantages_makes_the_step_shorter(noise, 
 
 
 def test_no_probability_of_a_row_that_moves_falls_below_the_floor_and_what_is_below_comes_back():
-    update = MirrorUpdate(floor=3.0)
+    update = MirrorUpdate(Mirror(floor=3.0))
     policy = SimplexPolicy(2, 3)
     sure = torch.tensor([[1.0, 0.0, 0.0]] * 2, dtype=torch.float64)
     policy.load_state_dict({"probs_SA": sure})
@@ -166,7 +179,7 @@ def test_no_probability_of_a_row_that_moves_falls_below_the_floor_and_what_is_be
     update.step(policy, torch.arange(2), advantage_NA, torch.ones(2))
     assert policy.probs_SA[0].log().tolist() == pytest.approx([-math.log1p(2 * math.exp(-3)) - x for x in (0, 3, 3)])
     assert torch.equal(policy.probs_SA[1], sure[1])
-    MirrorUpdate(floor=None).step(policy, torch.arange(2), advantage_NA.flip(0), torch.ones(2))
+    MirrorUpdate(Mirror(floor="never")).step(policy, torch.arange(2), advantage_NA.flip(0), torch.ones(2))
     assert torch.equal(policy.probs_SA[1], sure[1])  # without a floor a mirror step leaves zeros at zero
 
 
@@ -181,7 +194,7 @@ def test_an_action_that_is_not_allowed_stays_so():
 
 def test_options_of_the_mirror_step_that_make_no_sense_are_refused():
     for floor in (0.0, -1.0, math.inf, math.nan):
-        with pytest.raises(PgtsError, match=f"floor is {floor}; it must be finite and above 0, or None"):
-            MirrorUpdate(floor=floor)
+        with pytest.raises(PgtsError, match=f"floor is {floor}; it must be a number > 0 or never"):
+            Mirror(floor=floor)
     with pytest.raises(PgtsError, match="normalize is 'max'; it must be rms or none"):
-        MirrorUpdate(normalize="max")
+        Mirror(normalize="max")

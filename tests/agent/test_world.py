@@ -14,10 +14,11 @@ from torch import Tensor
 from pgts_torch import PGTS
 from pgts_torch.agent import make_world as worlds
 from pgts_torch.agent.build import make_policy
-from pgts_torch.agent.rollout import FixedHorizon, rollout
+from pgts_torch.agent.rollout import rollout
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel, with_torques
+from pgts_torch.options import MLP, FixedHorizon
 from pgts_torch.seeding import draw_keys, seed_sequence, stream
 from tests.agent import cells
 from tests.agent.helpers import same_bits
@@ -131,11 +132,11 @@ def test_what_can_be_asked_about_an_environment_decides_its_world(make, kind):
 @pytest.mark.parametrize("id", ["CartPole-v1", "CliffWalking-v1"])
 def test_the_states_of_a_rollout_are_numbered_at_once_as_one_after_the_other(id, monkeypatch):
     world, other, asked = world_of(id), world_of(id), []
-    policy = make_policy("mlp", world, seed=0)
+    policy = make_policy(MLP(), world, seed=0)
     monkeypatch.setattr(
         world, "numbers", lambda read_N: asked.append(len(read_N)) or type(world).numbers(world, read_N)
     )
-    made = rollout(world, policy, FixedHorizon(6), seed=0, names=("test",), generator=stream(0, "test"))
+    made = rollout(world, policy, FixedHorizon(length=6), seed=0, names=("test",), generator=stream(0, "test"))
     assert asked == [7 * 3]
     observation, _ = other.env.reset(seed=seed_sequence(0, "test", "env").generate_state(3).tolist())
     for state_B, action_B in zip(made.state_TB, made.action_TB, strict=True):
@@ -389,7 +390,7 @@ def test_cartpole_is_learned_with_a_lookahead_of_two_steps_and_not_without_train
         made = rollout(
             model.world.of(model.source.make(24)),
             model.policy,
-            FixedHorizon(200),
+            FixedHorizon(length=200),
             seed=1,
             names=("test",),
             generator=stream(1, "test"),

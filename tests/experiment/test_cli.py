@@ -18,7 +18,7 @@ from pgts_torch.experiment import strict_yaml, summary
 from pgts_torch.experiment.cli import COMMANDS, main
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import load
-from pgts_torch.experiment.schema import Schema
+from pgts_torch.options.schema import Schema
 from tests.forks import PATIENCE, started
 
 ROOT = Path(__file__).parents[2]

@@ -4,6 +4,7 @@ import math
 import random
 import time
 from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,24 +18,20 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from torch import nn
 
-import pgts_torch  # noqa: F401  (registers the environments)
+from pgts_torch import PGTS
 from pgts_torch.agent import build
-from pgts_torch.agent.critics import TDLambda
-from pgts_torch.agent.networks import CNN, MLP
+from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import TabularWorld
 from pgts_torch.experiment import strict_yaml
-from pgts_torch.experiment.config import TABLE_OPTIONS, Config, dump
+from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import MAX_BYTES, MAX_MISTAKES, ConfigError, load
-from pgts_torch.experiment.schema import Option, Schema
-from pgts_torch.experiment.sections import (
-    SEARCH_OPTIONS,
-    FixedHorizonConfig,
-    SampledAdvantagesConfig,
-    SearchConfig,
-    TabularCriticConfig,
-)
 from pgts_torch.models.environments import EnvSource
+from pgts_torch.options import CMPO, FixedHorizon, Mirror, TabularValues
+from pgts_torch.options.arguments import read
+from pgts_torch.options.schema import Option, Schema
 from pgts_torch.tabular import ladder
 from tests import reliability
 
@@ -58,7 +55,7 @@ def mistakes(tmp_path: Path) -> Callable[..., list[str]]:
 
 
 SIZES = "a list of at most 16 whole numbers in [1, 65536]"
-SEARCH_KEYS = ", ".join(SearchConfig.model_fields)
+KINDS = "auto, expectimax, mcts or sampled"
 
 
 @pytest.mark.fault("empty file", "not UTF-8", "aliases", "python tags", "nesting 3,000 deep", "integer of 5,000 digits")
@@ -157,8 +154,8 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ),
         ("run: {overwrite: yes}", "run.overwrite is 'yes'; it must be true or false"),
         ("run: {dir: 5}", "run.dir is 5; it must be a folder or null (in quotes, to make it text)"),
-        ("search: 4", "search is 4; it must be a mapping with the keys " + SEARCH_KEYS),
-        ("search:", "search is empty; it must be a mapping with the keys " + SEARCH_KEYS),
+        ("search: 4", f"search is 4; it must be a mapping with the key kind ({KINDS})"),
+        ("search:", f"search is empty; it must be a mapping with the key kind ({KINDS})"),
         ("critic: 4", "critic is 4; it must be a mapping with the key type (auto, exact, network, rollout or tabular)"),
         ("critic: {type: neural}", "critic.type is 'neural'; it must be auto, exact, network, rollout or tabular"),
         ("critic: {type: [1]}", "critic.type is a list; it must be auto, exact, network, rollout or tabular"),
@@ -362,7 +359,7 @@ def test_the_readable_forms_of_yaml_1_2_mean_what_they_say(tmp_path: Path) -> No
     path = tmp_path / "c.yaml"
     path.write_bytes(b"\xef\xbb\xbftotal_steps: 1_000\r\nseed: 010\r\nupdate: {step_size: 5e-2}\r\nname: no\r\n")
     config = load(path)
-    assert (config.total_steps, config.seed, config.update_description()["step_size"], config.name) == (
+    assert (config.total_steps, config.seed, config.update.step_size, config.name) == (
         1000,
         10,
         0.05,
@@ -374,7 +371,7 @@ def test_an_override_changes_one_key_and_a_mapping_replaces_a_section(tmp_path: 
     path = tmp_path / "c.yaml"
     path.write_text("critic: {type: tabular, target: q, step_size: 0.3}\nsearch: {depth: 2, max_nodes: 7}\n")
     config = load(path, ["--critic.step_size", "mean", "--search", "{depth: 3}"])
-    assert config.critic.model_dump() == TabularCriticConfig(target="q", step_size="mean").model_dump()
+    assert config.critic.model_dump() == TabularValues(target="q", step_size="mean").model_dump()
     assert config.search == Config().search.model_copy(update={"depth": 3})
     assert load(path, ["--critic", "{type: exact}"]).critic.model_dump() == {"type": "exact", "target": "v"}
 
@@ -398,7 +395,7 @@ def test_a_bare_flag_turns_a_switch_on() -> None:
 
 def test_a_section_without_type_has_the_default_one() -> None:
     horizon = load(None, ["--rollout.horizon.length", "7"]).rollout.horizon
-    assert horizon == FixedHorizonConfig(length=7)
+    assert horizon == FixedHorizon(length=7)
 
 
 def test_a_configuration_cannot_be_changed() -> None:
@@ -452,7 +449,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a whole number >= 0 or adaptive": st.just("adaptive") | st.integers(0, 2**63 - 1),
     "a whole number >= 1 or null": st.none() | st.integers(1, 2**63 - 1),
     "true or false or null": st.none() | st.booleans(),
-    "none, level or search or null": st.sampled_from([None, "none", "level", "search"]),
+    "a whole number >= 1, or a list of such and null, one for each level": st.sampled_from([1, 7, [3, None]]),
     "a whole number >= 0 or null": st.none() | st.integers(0, 2**63 - 1),
     "a number >= 0 or null": st.none() | st.floats(0, allow_infinity=False),
     "a number in [0, 1]": st.floats(0, 1),
@@ -512,19 +509,18 @@ def configurations(draw: st.DrawFn) -> Config:
     if is_table or types["critic.type"] != "network":
         given["env.observation_key"] = None
     if types["update.type"] == "mirror":
-        ignored = [
-            key
-            for key in given
-            if key.startswith("update.") and (key.removeprefix("update.") in TABLE_OPTIONS) != is_table
-        ]
-        given |= {key: None for key in ignored if key not in ("update.type", "update.state_weight")}
+        heeded = {"type", *Mirror.standing("tables" if is_table else "networks")}
+        ignored = [key for key in given if key.startswith("update.") and key.removeprefix("update.") not in heeded]
+        given |= dict.fromkeys(ignored)
     if given["eval.every"] is None:
         given |= {"eval.stop_at_return": None, "eval.keep_best": False}
     if given["search.depth"] != "adaptive":
         given["search.max_depth"] = given["search.tolerance"] = None
-    for name, kind in SEARCH_OPTIONS.items():
-        if given["search.kind"] != kind:
-            given[f"search.{name}"] = None
+    if types["critic.type"] == "network" and (given["critic.polyak"] < 1 or given["critic.target_period"] > 1):
+        given["critic.fresh_targets"] = None
+    if given["search.kind"] == "mcts":
+        given |= {"search.exploration": None} if given["search.rule"] == "gumbel" else {"search.prior": "uniform"}
+        given |= {"search.merge": False} if given["search.backup"] == "mean" else {}
     if types["estimator.type"] == "sampled":
         given = {key: value for key, value in given.items() if not key.startswith("search.")} | {"search.depth": 0}
     return Config.model_validate(_nested(given))
@@ -608,9 +604,9 @@ PARTS = [
     ["--policy.init.type", "biased", "--critic.method.type", "monte_carlo"],
     ["--critic.type", "exact", "--rollout.horizon.type", "geometric"],
     ["--critic.type", "rollout", "--critic.horizon.type", "fixed"],
-    ["--critic.type", "rollout", "--critic.horizon.type", "geometric"],
-    ["--critic.type", "network", "--critic.method.type", "monte_carlo"],
-    ["--policy.type", "mlp", "--critic.type", "tabular"],
+    ["--critic.type", "rollout", "--critic.horizon.type", "geometric", "--search.kind", "expectimax"],
+    ["--critic.type", "network", "--critic.method.type", "monte_carlo", "--search.kind", "mcts"],
+    ["--policy.type", "mlp", "--critic.type", "tabular", "--search.kind", "sampled"],
     ["--policy.type", "mlp", "--critic.network.type", "mlp", "--critic.network.hidden", "[]"],
     ["--policy.type", "mlp", "--critic.network.type", "shared", "--update.type", "gradient"],
     ["--policy.type", "softmax", "--update.type", "softmax"],
@@ -623,63 +619,59 @@ PARTS = [
 """Command lines that together name every type there is."""
 
 
-@pytest.mark.parametrize("arguments", PARTS, ids=" ".join)
-def test_the_library_builds_what_is_configured(arguments: list[str]) -> None:
+def made(arguments: list[str]) -> tuple[Policy, Critic, Update]:
+    """What the library makes of a configuration."""
     config = load(None, arguments)
     world: Any = PICTURED if config.policy.type == "cnn" else NUMBERED
-    policy = build.make_policy(config.policy_description(), world, seed=0)
-    critic = build.make_critic(config.critic_description(), world, policy, seed=0)
-    assert critic.target == config.critic.plain().get("target", "v")
-    build.make_update(config.update_description(), policy).check(policy)
-    build.make_horizon(config.rollout.horizon.plain())
-    build.make_estimator(config.estimator.plain())
-    build.make_search(config.search.description(), NUMBERED)
+    options = build.chosen(read(config.arguments()), world)
+    policy = build.make_policy(options.policy, world, seed=0)
+    critic = build.make_critic(options.critic, world, policy, options.estimator, seed=0)
+    build.make_search(options.search, NUMBERED)
+    return policy, critic, build.make_update(options.update, policy)
+
+
+@pytest.mark.parametrize("arguments", PARTS, ids=" ".join)
+def test_the_library_builds_what_is_configured(arguments: list[str]) -> None:
+    policy, critic, update = made(arguments)
+    config = load(None, arguments)
+    assert critic.target == getattr(config.critic, "target", "v")
+    assert policy.options == config.policy or config.policy.type == "auto"
+    update.check(policy)
 
 
 def test_these_parts_name_every_type_there_is() -> None:
     named: dict[str, set[str]] = {}
     for arguments in PARTS:
         data = load(None, arguments).model_dump(by_alias=True)
-        for key in (key for key in _leaves(data) if key.endswith(".type")):
+        for key in (key for key in _leaves(data) if key.endswith((".type", ".kind"))):
             named.setdefault(key, set()).add(_look_up(data, key))
     assert named == {option.key: {tag for tag, _ in option.choices} for option in OPTIONS if option.choices}
 
 
 def test_what_is_configured_reaches_the_part() -> None:
-    config = load(None, ["--policy.type", "mlp", "--policy.hidden", "[7, 5]", "--update.max_grad_norm", "never"])
-    policy = build.make_policy(config.policy_description(), NUMBERED, seed=0)
+    sizes = ["--policy.type", "mlp", "--policy.hidden", "[7, 5]"]
+    policy, own, update = made([*sizes, "--update.max_grad_norm", "never"])
     assert isinstance(policy, NetworkPolicy)
     assert [layer.out_features for layer in policy.network.modules() if isinstance(layer, nn.Linear)] == [7, 5, 2]
-    assert build.make_update(config.update_description(), policy).max_grad_norm is None  # type: ignore[attr-defined]
-    own = build.make_critic(config.critic_description(), NUMBERED, policy, seed=0)
+    assert update.options == CMPO(max_grad_norm="never")
     assert isinstance(own, NetworkCritic)
     assert [layer.out_features for layer in own.network.modules() if isinstance(layer, nn.Linear)] == [7, 5, 1]
-    shared = load(None, ["--policy.type", "mlp", "--critic.network.type", "shared"])
-    critic = build.make_critic(shared.critic_description(), NUMBERED, policy, seed=0)
+    assert own.options.learning_rate == 1e-3
+    other, critic, _ = made([*sizes, "--critic.network.type", "shared"])
+    assert isinstance(other, NetworkPolicy)
     assert isinstance(critic, NetworkCritic)
-    assert critic.network.trunk is policy.network.trunk is not own.network.trunk
+    assert critic.network.trunk is other.network.trunk is not own.network.trunk
+    _, critic, _ = made(["--policy.type", "mlp", "--search.depth", "0", "--estimator.type", "sampled"])
+    assert critic.options.learning_rate == 3e-4
 
 
-def test_the_defaults_of_networks_are_those_of_the_library() -> None:
-    policy = build.make_policy("mlp", NUMBERED, seed=0)
-    for kind in ("gradient", "ppo", "mirror", "cmpo"):
-        configured = load(None, ["--policy.type", "mlp", "--update.type", kind]).update.plain()
-        own, given = (build.make_update(update, policy) for update in (kind, configured))
-        assert _plain_options(own) == _plain_options(given)
-    critic = load(None, ["--policy.type", "mlp"]).critic_description()
-    own_critic, given_critic = (build.make_critic(each, NUMBERED, policy, seed=0) for each in ("network", critic))
-    assert _plain_options(own_critic) == _plain_options(given_critic)
-    assert MLP(**_without_type(load(None, ["--policy.type", "mlp"]).policy.plain())) == MLP()
-    assert CNN(**_without_type(load(None, ["--policy.type", "cnn"]).policy.plain())) == CNN()
-    assert build.make_estimator("sampled") == build.make_estimator(SampledAdvantagesConfig().plain())
-
-
-def _plain_options(part: Any) -> dict[str, Any]:
-    return {name: value for name, value in vars(part).items() if isinstance(value, int | float | str | None | TDLambda)}
-
-
-def _without_type(description: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in description.items() if name != "type"}
+@pytest.mark.parametrize("path", [None, *SHIPPED], ids=lambda path: path.stem if path else "defaults")
+def test_the_arguments_of_a_configuration_are_its_options(path: Path | None) -> None:
+    config = load(path)
+    options = read(config.arguments())
+    for name in ("policy", "rollout", "search", "estimator", "update"):
+        assert getattr(options, name) == getattr(config, name)
+    assert config.arguments().keys() == signature(PGTS).parameters.keys()
 
 
 @pytest.mark.parametrize("policy", ["mlp", "cnn"])
@@ -694,7 +686,6 @@ def test_a_network_policy_brings_a_network_critic_with_it(policy: str, tmp_path:
 def test_the_environment_chooses_what_is_not_configured() -> None:
     config = Config()
     assert {config.policy.type, config.critic.type, config.update.type} == {"auto"}
-    assert config.policy_description() is config.critic_description() is config.update_description() is None
     assert Config.model_validate({"policy": {}, "critic": {}, "update": {}}) == config
 
 
@@ -797,4 +788,4 @@ def test_numbers_that_are_not_finite_are_refused_wherever_they_stand() -> None:
         for value in (".nan", ".inf", "1e999", "-.inf"):
             with pytest.raises(ConfigError):
                 load(None, [f"--{key}", value])
-    assert math.isfinite(load(None, ["--update.step_size", "1e300"]).update.plain()["step_size"])
+    assert math.isfinite(load(None, ["--update.step_size", "1e300"]).update.step_size)

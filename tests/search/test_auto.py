@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pgts_torch.errors import NodeBudgetExceeded
+from pgts_torch.options import Auto, Sampled
 from pgts_torch.search import Lookahead, auto
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.seeding import stream
@@ -57,7 +58,7 @@ def tries(tried: list[int | None], search: AutoSearch, **larger: int) -> list[in
 
 
 def test_a_width_is_halved_until_the_search_fits(widths):
-    search, tried = AutoSearch(ListingModel(zoo("ladder")), max_nodes=300), widths(lambda width: 6 * width)
+    search, tried = AutoSearch(ListingModel(zoo("ladder")), Auto(max_nodes=300)), widths(lambda width: 6 * width)
     assert tries(tried, search) == [None, 300, 150, 75, 37]
     assert "37 states a level" in str(search)
 
@@ -65,7 +66,7 @@ def test_a_width_is_halved_until_the_search_fits(widths):
 @pytest.mark.parametrize(("nodes", "following"), [(150, 74), (151, 37)])
 def test_the_width_is_doubled_where_twice_as_many_nodes_would_fit(nodes, following, widths):
     tried = widths(lambda width: nodes if width <= 37 else TOO_LARGE)
-    search = AutoSearch(ListingModel(zoo("ladder")), max_nodes=300)
+    search = AutoSearch(ListingModel(zoo("ladder")), Auto(max_nodes=300))
     assert tries(tried, search)[-1] == 37
     assert tries(tried, search)[0] == following
 
@@ -73,7 +74,7 @@ def test_the_width_is_doubled_where_twice_as_many_nodes_would_fit(nodes, followi
 @pytest.mark.parametrize(("fits", "max_nodes", "following"), [(150, 300, 300), (300, 300, 300), (149, 299, 298)])
 def test_a_width_is_never_more_than_the_nodes_of_a_search(fits, max_nodes, following, widths):
     tried = widths(lambda width: 10 if width <= fits else TOO_LARGE)
-    search = AutoSearch(ListingModel(zoo("ladder")), max_nodes=max_nodes)
+    search = AutoSearch(ListingModel(zoo("ladder")), Auto(max_nodes=max_nodes))
     assert tries(tried, search)[-1] == fits
     assert tries(tried, search)[0] == following
 
@@ -84,7 +85,7 @@ def test_a_width_is_never_more_than_the_nodes_of_a_search(fits, max_nodes, follo
 )
 def test_full_width_is_tried_again_for_fewer_roots_or_levels_only(roots, depth, again, widths):
     tried = widths(lambda width: width)
-    search = AutoSearch(ListingModel(zoo("ladder")), max_nodes=300)
+    search = AutoSearch(ListingModel(zoo("ladder")), Auto(max_nodes=300))
     assert tries(tried, search, roots=3, depth=3)[0] is None
     assert (tries(tried, search, roots=roots, depth=depth)[0] is None) == again
 
@@ -97,9 +98,9 @@ def samples(monkeypatch) -> Callable[[Callable[[int], int]], list[int]]:
         tried: list[int] = []
 
         class Stated:
-            def __init__(self, model: Any, *, samples: int, max_nodes: int, max_bytes: int) -> None:
-                tried.append(samples)
-                self.nodes, self.max_nodes = nodes_of(samples), max_nodes
+            def __init__(self, model: Any, options: Sampled) -> None:
+                tried.append(options.samples)
+                self.nodes, self.max_nodes = nodes_of(options.samples), options.max_nodes
 
             def look_ahead(self, _: Any, root_B: Tensor, __: Any) -> Lookahead:
                 if self.nodes > self.max_nodes:
@@ -116,7 +117,7 @@ def samples(monkeypatch) -> Callable[[Callable[[int], int]], list[int]]:
 def test_at_first_so_many_samples_are_drawn_as_fit_if_no_two_paths_meet(max_nodes, first, samples):
     # 2 actions, 2 levels below the root: 1 + 2 C + 4 C^2 nodes, 21 for C = 2 and 73 for C = 4.
     tried = samples(lambda C: 10)
-    asked(AutoSearch(DrawingModel(zoo("ladder")), max_nodes=max_nodes))
+    asked(AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=max_nodes)))
     assert tried == [first]
 
 
@@ -124,7 +125,7 @@ def test_at_first_so_many_samples_are_drawn_as_fit_if_no_two_paths_meet(max_node
 def test_samples_are_doubled_where_paths_met_so_often_that_twice_as_many_would_fit(nodes, following, samples):
     # Twice as many samples have at most 4 times as many nodes on 2 levels: 60 and 64 of 60.
     tried = samples(lambda C: nodes)
-    search = AutoSearch(DrawingModel(zoo("ladder")), max_nodes=60)
+    search = AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=60))
     asked(search)
     asked(search)
     assert tried == [2, following]
@@ -132,7 +133,7 @@ def test_samples_are_doubled_where_paths_met_so_often_that_twice_as_many_would_f
 
 def test_samples_are_never_more_than_32(samples):
     tried = samples(lambda C: 1)
-    search = AutoSearch(DrawingModel(zoo("ladder")), max_nodes=60)
+    search = AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=60))
     for _ in range(7):
         asked(search)
     assert tried == [2, 4, 8, 16, 32, 32, 32]
@@ -141,7 +142,7 @@ def test_samples_are_never_more_than_32(samples):
 @pytest.mark.parametrize(("roots", "depth", "again"), [(2, 2, False), (1, 1, False), (3, 2, True), (2, 3, True)])
 def test_a_search_of_more_roots_or_of_more_levels_chooses_its_samples_again(roots, depth, again, samples):
     tried = samples(lambda C: 1)
-    search = AutoSearch(DrawingModel(zoo("ladder")), max_nodes=200)
+    search = AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=200))
     for _ in range(3):
         asked(search, roots=2, depth=2)
     assert tried == [2, 4, 8]
@@ -151,7 +152,7 @@ def test_a_search_of_more_roots_or_of_more_levels_chooses_its_samples_again(root
 
 def test_a_sampled_search_that_turns_out_too_large_is_done_again_with_half(samples):
     tried = samples(lambda C: 10 * C)
-    search = AutoSearch(DrawingModel(zoo("ladder")), max_nodes=300)
+    search = AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=300))
     asked(search)  # 8 samples have 273 nodes if no two paths meet
     assert tried == [8]
     tried.clear()

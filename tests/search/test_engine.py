@@ -7,6 +7,7 @@ from torch import Tensor
 
 from pgts_torch.errors import MissingModel, NodeBudgetExceeded, PgtsError
 from pgts_torch.models import EnumeratingModel, SamplingModel, SimulatorModel, TabularModel, Transitions
+from pgts_torch.options import MCTS, Auto, Sampled
 from pgts_torch.search import Lookahead, mcts, sampled
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
@@ -44,7 +45,9 @@ def truth(depth: int = 3) -> Tensor:
     return exact.lookahead(GARNET, q_SA, depth)[ROOTS]
 
 
-@pytest.mark.parametrize("make", [ExpectimaxSearch, AutoSearch, lambda model: MCTSSearch(model, simulations=100_000)])
+@pytest.mark.parametrize(
+    "make", [ExpectimaxSearch, AutoSearch, lambda model: MCTSSearch(model, MCTS(simulations=10**5))]
+)
 def test_a_search_that_can_see_everything_is_exact_and_asks_nothing_twice(make):
     search = make(TabularModel(GARNET))
     first, second = look(search), look(search, seed=1)
@@ -56,7 +59,7 @@ def test_a_search_that_can_see_everything_is_exact_and_asks_nothing_twice(make):
 
 
 def test_a_sampled_search_is_the_function_of_that_name_and_counts_its_calls():
-    search = SampledSearch(DrawingModel(GARNET), samples=3, share="search")
+    search = SampledSearch(DrawingModel(GARNET), Sampled(samples=3, share="search"))
     v_S = some_v(GARNET)
     expected = sampled(
         TabularModel(GARNET),
@@ -84,7 +87,7 @@ def test_where_all_paths_fit_the_automatic_search_looks_at_all_of_them_and_says_
 
 def test_where_they_do_not_fit_it_keeps_to_the_budget_and_asks_nothing_twice():
     model = watched(GARNET)
-    search = AutoSearch(model, max_nodes=300)
+    search = AutoSearch(model, Auto(max_nodes=300))
     first = look(search)
     assert first.nodes <= 300
     assert float(first.pruned_BA.max()) > 0
@@ -99,7 +102,7 @@ def test_where_they_do_not_fit_it_keeps_to_the_budget_and_asks_nothing_twice():
 
 
 def test_a_model_that_only_draws_is_sampled_and_more_often_where_paths_met():
-    search = AutoSearch(DrawingModel(ladder(5)), max_nodes=400)
+    search = AutoSearch(DrawingModel(ladder(5)), Auto(max_nodes=400))
     samples = []
     for seed in range(6):
         search(torch.tensor([0]), depth=3, v_leaf=torch.zeros_like, generator=stream(seed, "search"))
@@ -112,7 +115,7 @@ def test_a_model_that_only_draws_is_sampled_and_more_often_where_paths_met():
 
 
 def test_the_samples_of_a_model_in_which_paths_rarely_meet_stay_within_the_budget():
-    search = AutoSearch(DrawingModel(random_mdp(5000, 4, branching=50, seed=2)), max_nodes=2_000)
+    search = AutoSearch(DrawingModel(random_mdp(5000, 4, branching=50, seed=2)), Auto(max_nodes=2_000))
     for seed in range(5):
         root_B = torch.arange(3)
         seen = search(
@@ -126,12 +129,12 @@ def test_the_samples_of_a_model_in_which_paths_rarely_meet_stay_within_the_budge
 
 def test_an_automatic_search_counts_also_the_calls_of_what_turned_out_too_large():
     model = watched(GARNET)
-    search = AutoSearch(model, max_nodes=300)
+    search = AutoSearch(model, Auto(max_nodes=300))
     assert look(search).model_calls == search.model_calls == len(model.asked) * GARNET.num_actions > 0
 
 
 def test_one_search_that_was_too_large_does_not_make_the_automatic_one_narrow_for_good():
-    search = AutoSearch(TabularModel(GARNET), max_nodes=250)
+    search = AutoSearch(TabularModel(GARNET), Auto(max_nodes=250))
     v_S = some_v(GARNET)
 
     def pruned(root_B: Tensor, depth: int) -> float:
@@ -145,7 +148,7 @@ def test_one_search_that_was_too_large_does_not_make_the_automatic_one_narrow_fo
 
 
 def test_a_larger_search_of_a_model_that_only_draws_takes_fewer_samples():
-    search = AutoSearch(DrawingModel(random_mdp(5000, 4, branching=50, seed=2)), max_nodes=2_000)
+    search = AutoSearch(DrawingModel(random_mdp(5000, 4, branching=50, seed=2)), Auto(max_nodes=2_000))
     samples = []
     for roots, depth in ((1, 0), (3, 2)):
         seen = search(
@@ -162,12 +165,12 @@ def test_a_larger_search_of_a_model_that_only_draws_takes_fewer_samples():
 @pytest.mark.parametrize("model", [TabularModel(GARNET), DrawingModel(GARNET)])
 def test_a_budget_that_is_too_small_for_anything_is_an_error(model):
     with pytest.raises(NodeBudgetExceeded):
-        look(AutoSearch(model, max_nodes=2))
+        look(AutoSearch(model, Auto(max_nodes=2)))
 
 
 def test_a_tree_search_of_a_model_that_only_draws_is_one_of_what_was_drawn():
     """With enough simulations it is the sampled lookahead with one set of samples for each state."""
-    search = MCTSSearch(DrawingModel(GARNET), simulations=100_000, samples=2)
+    search = MCTSSearch(DrawingModel(GARNET), MCTS(simulations=100_000, samples=2))
     v_S = some_v(GARNET)
     expected = sampled(
         TabularModel(GARNET),
@@ -184,9 +187,9 @@ def test_a_tree_search_of_a_model_that_only_draws_is_one_of_what_was_drawn():
     assert seen.model_calls <= expected.model_calls
     assert not torch.equal(look(search, seed=1).q_BA, seen.q_BA)
     assert str(search) == "mcts, 100000 simulations, merged, 2 sampled outcomes of each action"
-    assert torch.equal(look(MCTSSearch(TabularModel(GARNET), simulations=100_000, samples=2)).q_BA, seen.q_BA)
+    assert torch.equal(look(MCTSSearch(TabularModel(GARNET), MCTS(simulations=100_000, samples=2))).q_BA, seen.q_BA)
     with pytest.raises(PgtsError, match="samples is 0"):
-        MCTSSearch(DrawingModel(GARNET), samples=0)
+        MCTS(samples=0)
 
 
 MCTS_OPTIONS = [
@@ -209,7 +212,7 @@ def test_each_option_of_a_tree_search_is_that_of_the_function_and_changes_the_an
     given = {"depth": 4, "v_leaf": lambda s: v_S[s]}
 
     def searched(**options) -> Lookahead:
-        search = MCTSSearch(TabularModel(GARNET), simulations=12, **options)
+        search = MCTSSearch(TabularModel(GARNET), MCTS(simulations=12, **options))
         return search(root_B, **given, prior=lambda s: pi_SA[s], generator=stream(0, "search"))
 
     of_function = dict(options)
@@ -226,34 +229,37 @@ def test_each_option_of_a_tree_search_is_that_of_the_function_and_changes_the_an
 def test_a_tree_search_says_which_options_it_has():
     model = TabularModel(GARNET)
     alpha_zero = {"root": "rule", "rule": "puct", "prior": "policy", "backup": "mean"}
-    assert str(MCTSSearch(model, **alpha_zero)) == (
+    assert str(MCTSSearch(model, MCTS(**alpha_zero))) == (
         "mcts, 64 simulations, puct at the root too, the policy as prior, mean backups"
     )
-    assert str(MCTSSearch(model, rule="uct", wave=1)) == "mcts, 64 simulations, uct, merged"
+    assert str(MCTSSearch(model, MCTS(rule="uct", wave=1))) == "mcts, 64 simulations, uct, merged"
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"root": "puct"}, "root is 'puct'; it must be one of 'gumbel', 'rule'"),
-        ({"rule": "ucb"}, "rule is 'ucb'; it must be one of 'gumbel', 'puct', 'uct'"),
-        ({"backup": "min"}, "backup is 'min'; it must be one of 'max', 'mean'"),
-        ({"prior": "best"}, "prior is 'best'; it must be one of 'uniform', 'policy'"),
+        ({"root": "puct"}, "root is 'puct'; it must be gumbel or rule"),
+        ({"rule": "ucb"}, "rule is 'ucb'; it must be gumbel, puct or uct"),
+        ({"backup": "min"}, "backup is 'min'; it must be max or mean"),
+        ({"prior": "best"}, "prior is 'best'; it must be uniform or policy"),
         ({"wave": 0}, "wave is 0"),
-        ({"exploration": 1.0}, "rule='gumbel' has no exploration"),
-        ({"rule": "puct", "exploration": -1.0}, "exploration is -1.0; it must be finite and at least 0"),
-        ({"backup": "mean", "merge": True}, "merge needs backup='max'"),
-        ({"root": "rule", "rule": "uct", "prior": "policy"}, "rule='uct' without root='gumbel' uses no prior"),
+        ({"exploration": 1.0}, "search.rule gumbel has none, it must be puct or uct"),
+        ({"rule": "puct", "exploration": -1.0}, "exploration is -1.0; it must be a number >= 0"),
+        ({"backup": "mean", "merge": True}, "search.merge is true, which needs search.backup max"),
+        (
+            {"root": "rule", "rule": "uct", "prior": "policy"},
+            "search.prior is policy, which search.rule uct with search.root rule does not use",
+        ),
     ],
 )
 def test_an_option_of_a_tree_search_that_is_out_of_range_or_has_no_effect_is_refused(options, message):
     with pytest.raises(PgtsError, match=message):
-        MCTSSearch(TabularModel(GARNET), **options)
+        MCTS(**options)
 
 
 def test_a_search_from_the_prior_of_the_policy_needs_the_policy():
     with pytest.raises(PgtsError, match="the prior of the search is that of the policy: give prior"):
-        look(MCTSSearch(TabularModel(GARNET), prior="policy"))
+        look(MCTSSearch(TabularModel(GARNET), MCTS(prior="policy")))
 
 
 class ListingModel(EnumeratingModel):
@@ -291,7 +297,7 @@ def test_a_simulator_that_turns_out_to_be_random_is_sampled():
         made = gymnasium.make("FrozenLake-v1", is_slippery=slippery)
         made.reset(seed=0)
         model = SimulatorModel(made, gamma=0.9)
-        search = AutoSearch(model, max_nodes=10_000)
+        search = AutoSearch(model, Auto(max_nodes=10_000))
         search(model.roots([made], [observation]), depth=2, v_leaf=torch.zeros_like, generator=stream(0, "search"))
         assert str(search).startswith(picked)
         assert (search.topology is None) is slippery

@@ -5,16 +5,17 @@ import torch
 from torch import Tensor
 
 from pgts_torch.errors import NodeBudgetExceeded
-from pgts_torch.experiment.sections import SearchConfig
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.models.tabular import TabularModel
+from pgts_torch.options import MCTS, Auto, Expectimax, Sampled
+from pgts_torch.options.search import MAX_BYTES
 from pgts_torch.search import expectimax, mcts, sampled
 from pgts_torch.search import known as known_module
 from pgts_torch.search import topology as topology_module
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
 from pgts_torch.search.known import KnownStates
-from pgts_torch.search.lookahead import MAX_BYTES, Leaves, Lookahead
+from pgts_torch.search.lookahead import Leaves, Lookahead
 from pgts_torch.search.memory import Sizes
 from pgts_torch.search.split import Selection
 from pgts_torch.search.topology import Topology, tree_nodes
@@ -151,7 +152,7 @@ def test_a_lookahead_is_refused_before_the_level_that_would_not_fit_is_asked_for
 
 
 def test_the_search_that_chooses_narrows_until_it_fits():
-    search = AutoSearch(TabularModel(GARNET), max_bytes=10**6)
+    search = AutoSearch(TabularModel(GARNET), Auto(max_bytes=10**6))
     look = search(ROOT, depth=5, v_leaf=zeros, generator=stream(0, "search"))
     assert max(look.nodes_per_level) > 50
     assert float(look.pruned_BA.max()) > 0
@@ -180,8 +181,11 @@ def test_samples_that_would_not_fit_are_refused_before_one_is_drawn(monkeypatch)
         sampled(model, ROOT, depth=0, v_leaf=zeros, samples=900_000, generator=stream(0, "s"), max_bytes=10**8)
 
 
-@pytest.mark.parametrize("kind", [AutoSearch, ExpectimaxSearch, SampledSearch, MCTSSearch])
-def test_every_kind_of_search_has_the_limit_also_after_a_reset(kind):
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [(AutoSearch, Auto), (ExpectimaxSearch, Expectimax), (SampledSearch, Sampled), (MCTSSearch, MCTS)],
+)
+def test_every_kind_of_search_has_the_limit_also_after_a_reset(kind, options):
     def refuses(search: Search, root_B: Tensor) -> bool:
         try:
             search(root_B, depth=1, v_leaf=zeros, generator=stream(0, "search"))
@@ -190,12 +194,12 @@ def test_every_kind_of_search_has_the_limit_also_after_a_reset(kind):
         return False
 
     model = TabularModel(GARNET)
-    search = kind(model, max_bytes=150_000)
+    search = kind(model, options(max_bytes=150_000))
     for _ in range(2):
         assert refuses(search, torch.arange(40))
         search.reset()
     assert not refuses(kind(model), torch.arange(40))
-    assert SearchConfig().max_bytes == MAX_BYTES
+    assert Auto().max_bytes == MAX_BYTES
 
 
 @pytest.mark.fault("lookahead of too many nodes")

@@ -13,9 +13,9 @@ from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.report.curves import panels
 from pgts_torch.experiment.resume import flat
-from pgts_torch.experiment.schema import Schema
 from pgts_torch.experiment.summary import Summary, from_json, rows
 from pgts_torch.files import PARTIAL
+from pgts_torch.options.schema import Schema
 
 Values = Mapping[str, Any]
 

@@ -1,17 +1,13 @@
-"""What the keys of a configuration are made of: values with their ranges, and sections.
-
-The docstring under a field is its meaning in `pgts train --help`; the annotation is its range there and in messages.
-"""
+"""The types of options: values with their ranges."""
 
 import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
 INT64_MAX = 2**63 - 1
-NEVER = "never"
 
 Count = Annotated[int, Field(ge=1, le=INT64_MAX)]
 Natural = Annotated[int, Field(ge=0, le=INT64_MAX)]
@@ -19,8 +15,19 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 UnitInterval = Annotated[float, Field(ge=0, le=1)]
 Share = Annotated[float, Field(gt=0, le=1)]
-Sizes = Annotated[list[Annotated[int, Field(ge=1, le=2**16)]], Field(max_length=16)]
 Clip = Positive | Literal["never"]
+
+
+def limit(clip: float | str) -> float | None:
+    """The number; None: there is none."""
+    return None if isinstance(clip, str) else clip
+
+
+def _as_list(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+Sizes = Annotated[list[Annotated[int, Field(ge=1, le=2**16)]], Field(max_length=16), BeforeValidator(_as_list)]
 
 
 def _text(pattern: str, requirement: str, max_length: int) -> Any:
@@ -94,27 +101,22 @@ def _check_ascending(pair: list[float]) -> list[float]:
 Ascending = Annotated[
     list[float],
     Field(min_length=2, max_length=2, json_schema_extra={"requirement": "a list of two ascending numbers"}),
+    BeforeValidator(_as_list),
     AfterValidator(_check_ascending),
 ]
 
 
-class Section(BaseModel):
-    """Keys that belong together."""
-
-    model_config = ConfigDict(
-        strict=True,
-        extra="forbid",
-        frozen=True,
-        allow_inf_nan=False,
-        validate_default=True,
-        use_attribute_docstrings=True,
-    )
-
-    def plain(self) -> dict[str, Any]:
-        """The section as `agent.build` reads it: without the keys that leave the choice to it."""
-        return _given(self.model_dump(by_alias=True))
+def _check_samples(value: Any) -> Any:
+    levels = value if isinstance(value, list) and value else [value]
+    if not all((type(count) is int and 1 <= count <= INT64_MAX) or count is None for count in levels) or value is None:
+        raise ValueError
+    return value
 
 
-def _given(values: dict[str, Any]) -> dict[str, Any]:
-    kept = {name: _given(value) if isinstance(value, dict) else value for name, value in values.items()}
-    return {name: None if value == NEVER else value for name, value in kept.items() if value is not None}
+Samples = Annotated[
+    Any,
+    BeforeValidator(_as_list),
+    AfterValidator(_check_samples),
+    Field(json_schema_extra={"requirement": "a whole number >= 1, or a list of such and null, one for each level"}),
+]
+"""None in a list: all outcomes of that level."""

@@ -1,17 +1,18 @@
-"""The keys of a configuration as a person reads them: dotted, with requirement, default and meaning.
+"""Options as a person reads them: dotted keys, each with its requirement, default and meaning.
 
 Everything is read from the JSON schema of the pydantic model, so help and messages cannot drift from what is accepted.
 """
 
 import difflib
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 from pydantic import BaseModel
 
-from pgts_torch.experiment.fields import INT64_MAX
+from pgts_torch.options.fields import INT64_MAX
 
 Node = dict[str, Any]
 KeyPath = tuple[str, ...]
@@ -60,9 +61,45 @@ class Schema:
         return {name: self._follow(child) for name, child in node.get("properties", {}).items()}
 
     def variants(self, node: Node) -> dict[str, Node]:
-        """The sections that `type` chooses from, in the order of the model; {} for anything else."""
+        """The sections that a tag (`type`, or `kind`) chooses from, in the order of the model; {} for anything else."""
         nodes = [self._follow(variant) for variant in node.get("oneOf", ())]
-        return {variant["properties"]["type"]["const"]: variant for variant in nodes}
+        return {variant["properties"][self.tag(node)]["const"]: variant for variant in nodes}
+
+    def tag(self, node: Node) -> str:
+        """The key by which a node with variants chooses."""
+        return node["discriminator"]["propertyName"]
+
+    def tag_value(self, variant: Node) -> tuple[str, str]:
+        """That key of one variant, and its value."""
+        return next((name, child["const"]) for name, child in variant["properties"].items() if "const" in child)
+
+    def with_tags(self, node: Node, data: Any, *, words: bool = False) -> Any:
+        """The data of a section; where it leaves out by which tag it is one of several variants, the default's holds.
+
+        Args:
+            words: also read what `PGTS` takes: a tag alone, "ppo"; `type` for any tag; None where a file says never.
+        """
+        variants = self.variants(node)
+        if words and variants and isinstance(data, str):
+            data = {self.tag(node): data}
+        if words and data is None and "never" in requirement(node).split():
+            return "never"
+        if not isinstance(data, Mapping):
+            return data
+        data = dict(data)
+        if variants:
+            tag = self.tag(node)
+            if words and "type" in data:
+                data[tag] = data.pop("type")
+            data.setdefault(tag, node["default"][tag])
+            node = variants.get(data[tag], {}) if isinstance(data[tag], str) else {}
+        fields = self.fields(node)
+        if words and "lambda" in fields and "lambda_" in data:
+            data["lambda"] = data.pop("lambda_")
+        return {
+            name: self.with_tags(fields[name], value, words=words) if name in fields else value
+            for name, value in data.items()
+        }
 
     def find(self, path: Sequence[str]) -> list[Node]:
         """The nodes that a path may mean, one for each variant that has it. What is inside kwargs asks for nothing."""
@@ -101,6 +138,11 @@ class Schema:
         close = difflib.get_close_matches(key, same_end or self._keys, n=1, cutoff=0.0 if same_end else 0.7)
         return close[0] if close else None
 
+    def hint(self, key: str, prefix: str = "") -> str:
+        """What to do about a key that is unknown."""
+        nearest = self.nearest(key)
+        return f"; did you mean {prefix}{nearest}?" if nearest else "; `pgts train --help` lists all keys"
+
     @cached_property
     def _keys(self) -> list[str]:
         """All dotted keys, sections too."""
@@ -112,8 +154,9 @@ class Schema:
             child = (*path, name)
             key = ".".join(child)
             if variants := self.variants(node):
-                yield self._choice(node, f"{key}.type", variants)
-                yield from self._options_of_variants(f"{key}.type", variants, child)
+                tag = f"{key}.{self.tag(node)}"
+                yield self._choice(node, tag, variants)
+                yield from self._options_of_variants(tag, variants, child)
             elif self.fields(node):
                 yield from self._options(node, child)
             else:
@@ -128,6 +171,8 @@ class Schema:
                     distinct.setdefault(repr(option), (option, []))[1].append(tag)
         options = [
             replace(option, when=" and ".join(filter(None, [f"{key} {'|'.join(tags)}", option.when])))
+            if len(tags) < len(variants)
+            else option
             for option, tags in distinct.values()
         ]
         first = {option.when: n for n, option in reversed(list(enumerate(options)))}
@@ -135,7 +180,7 @@ class Schema:
 
     def _choice(self, node: Node, key: str, variants: dict[str, Node]) -> Option:
         choices = tuple((tag, _sentence(variant)) for tag, variant in variants.items())
-        return Option(key, requirement(node), node["default"]["type"], _sentence(node), choices)
+        return Option(key, requirement(node), node["default"][self.tag(node)], _sentence(node), choices)
 
     def _follow(self, node: Node) -> Node:
         """The node with what its reference points at; what stands beside the reference goes first."""
@@ -204,4 +249,11 @@ def _either(values: list[str]) -> str:
 
 
 def _sentence(node: Node) -> str:
-    return " ".join(node.get("description", "").split())
+    """The meaning; and what null stands for in which case."""
+    meaning = " ".join(node.get("description", "").split())
+    if "null" not in node:
+        return meaning
+    standing = [
+        f"{value if isinstance(value, str) else json.dumps(value)} for {case}" for case, value in node["null"].items()
+    ]
+    return f"{meaning} null: {', '.join(standing)}; without effect for others."

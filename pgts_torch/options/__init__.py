@@ -1,0 +1,61 @@
+"""The options of a training: each class is an argument of `PGTS`, a section of a configuration and what is saved.
+
+    PGTS("CartPole-v1", policy=MLP(hidden=[32]), update=PPO(clip_range=0.1), estimator=SampledAdvantages(), depth=0)
+
+Nothing here imports torch.
+"""
+
+from pgts_torch.options.critics import (
+    AutoCritic,
+    ExactValues,
+    MonteCarlo,
+    NetworkTDLambda,
+    NetworkValues,
+    OwnNetwork,
+    RolloutValues,
+    SharedNetwork,
+    TabularValues,
+    TDLambda,
+)
+from pgts_torch.options.part import Part
+from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, Random, Simplex, Softmax, Uniform
+from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, LookaheadAdvantages, SampledAdvantages
+from pgts_torch.options.search import MCTS, Auto, Expectimax, Sampled
+from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient
+
+__all__ = [
+    "CMPO",
+    "CNN",
+    "MCTS",
+    "MLP",
+    "PPO",
+    "Auto",
+    "AutoCritic",
+    "AutoPolicy",
+    "AutoUpdate",
+    "Biased",
+    "ExactValues",
+    "Expectimax",
+    "FixedHorizon",
+    "GeometricHorizon",
+    "Gradient",
+    "LookaheadAdvantages",
+    "Mirror",
+    "MonteCarlo",
+    "NetworkTDLambda",
+    "NetworkValues",
+    "OwnNetwork",
+    "Part",
+    "Projected",
+    "Random",
+    "RolloutValues",
+    "Sampled",
+    "SampledAdvantages",
+    "SharedNetwork",
+    "Simplex",
+    "Softmax",
+    "SoftmaxGradient",
+    "TDLambda",
+    "TabularValues",
+    "Uniform",
+]

@@ -1,0 +1,60 @@
+"""The arguments of `PGTS` as options, and back."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.options.mistakes import explain, schema_of
+from pgts_torch.options.part import Part
+from pgts_torch.options.rollouts import Rollouts
+from pgts_torch.options.search import Depth
+from pgts_torch.options.training import Training
+
+_FLAT = {"env": ("observation_key",), "rollout": tuple(Rollouts.model_fields), "search": tuple(Depth.model_fields)}
+"""The sections whose options `PGTS` takes one by one."""
+
+_PARTS = ("policy", "critic", "estimator", "update")
+
+_PREFIX = re.compile(rf"\b(?:env|rollout|search)\.({'|'.join(name for names in _FLAT.values() for name in names)})\b")
+
+
+def read(arguments: Mapping[str, Any]) -> Training:
+    """The options among the arguments of `PGTS`: parts as options, words, plain mappings or objects that were made from
+    options; None, and an object of the caller's own kind, is auto.
+
+    Raises:
+        PgtsError: one line for each mistake.
+    """
+    data: dict[str, Any] = {
+        section: {name: arguments[name] for name in names if name in arguments} for section, names in _FLAT.items()
+    }
+    parts = {name: getattr(arguments[name], "options", arguments[name]) for name in _PARTS}
+    data |= {name: value for name, value in parts.items() if value is not None}
+    schema = schema_of(Training)
+    search = schema.with_tags(schema.fields(schema.root)["search"], _plain(arguments["search"]), words=True)
+    data["search"] |= search if isinstance(search, dict) else {"kind": search}
+    return checked(schema.with_tags(schema.root, data, words=True))
+
+
+def checked(options: Mapping[str, Any]) -> Training:
+    """A training of these options; PgtsError, in which they are called as `PGTS` calls them."""
+    try:
+        return Training.model_validate(dict(options))
+    except ValidationError as error:
+        lines = dict.fromkeys(_PREFIX.sub(r"\1", mistake.message) for mistake in explain(Training, error))
+        raise PgtsError("\n".join(lines)) from None
+
+
+def described(options: Training) -> dict[str, Any]:
+    """What `read` reads the same options from, as plain values."""
+    plain = options.plain()
+    kind = {name: value for name, value in plain["search"].items() if name not in Depth.model_fields}
+    flat = {name: getattr(getattr(options, section), name) for section, names in _FLAT.items() for name in names}
+    return flat | {name: plain[name] for name in _PARTS} | {"search": kind, "horizon": plain["rollout"]["horizon"]}
+
+
+def _plain(value: Any) -> Any:
+    return value.plain() if isinstance(value, Part) else value

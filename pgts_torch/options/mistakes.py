@@ -1,0 +1,123 @@
+"""What is wrong with options, in words."""
+
+import functools
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from pgts_torch.options.fields import INT64_MAX
+from pgts_torch.options.schema import KeyPath, Node, Place, Schema, is_text, requirement
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One mistake.
+
+    Args:
+        message: a whole sentence.
+        kind: pydantic's word for it; "conflict" where options do not go together.
+        keys: the options of which any could be changed, the likeliest first.
+        is_value: whether the message begins with the key, of which a value was refused.
+    """
+
+    message: str
+    kind: str
+    keys: tuple[KeyPath, ...]
+    is_value: bool = False
+
+
+@functools.cache
+def schema_of(model: type[BaseModel]) -> Schema:
+    return Schema(model)
+
+
+def explain(
+    model: type[BaseModel],
+    error: ValidationError,
+    written: Callable[[KeyPath], str | None] = lambda key: None,
+) -> Iterator[Mistake]:
+    """Each mistake in our words.
+
+    Args:
+        written: a scalar as it was written, where it was read from a text.
+    """
+    for each in error.errors(include_url=False):
+        yield _Sentence(schema_of(model), written).of(each)
+
+
+@dataclass(frozen=True)
+class _Sentence:
+    schema: Schema
+    written: Callable[[KeyPath], str | None]
+
+    def of(self, error: ErrorDetails) -> Mistake:
+        place = self.schema.locate(error["loc"])
+        if error["type"] == "conflict":
+            keys = tuple(tuple(key.split(".")) for key in error["ctx"]["keys"]) or (place.path,)
+            return Mistake(error["ctx"]["reason"], "conflict", keys)
+        if place.node is None:
+            return Mistake(self._unknown(place), error["type"], (place.path,))
+        path, value = place.path, error["input"]
+        if error["type"] == "union_tag_invalid":
+            tag = self.schema.tag(place.node)
+            path, value = (*path, tag), value[tag] if isinstance(value, dict) else getattr(value, tag)
+        is_item = isinstance(error["loc"][-1], int)
+        must = what(place.node) if path == place.path else requirement(place.node)
+        shown = show(value, self.written(path))
+        sentence = f"{'.'.join(path)} {'holds' if is_item else 'is'} {shown}; it must be {must}"
+        return Mistake(sentence + _advice(place.node, value), error["type"], (path,), is_value=True)
+
+    def _unknown(self, place: Place) -> str:
+        key = ".".join(place.path)
+        if self.schema.find(place.path):
+            name, value = self.schema.tag_value(place.parent)
+            tag = ".".join((*place.path[:-1], name))
+            return f"{key} does not belong to {tag} {value}; it must be left out, or {tag} changed"
+        return f"{escape(key)} is unknown{self.schema.hint(key)}"
+
+
+def what(node: Node) -> str:
+    """What a value, or a section, must be."""
+    if "oneOf" in node:
+        return f"a mapping with the key {node['discriminator']['propertyName']} ({requirement(node)})"
+    return requirement(node)
+
+
+def _advice(node: Node, value: Any) -> str:
+    """How to write what was probably meant."""
+    if isinstance(value, bool):
+        return ""
+    if isinstance(value, int) and value > INT64_MAX:
+        return " and below 2**63" if node.get("maximum") == INT64_MAX else ""
+    if isinstance(value, float) and value.is_integer() and node.get("type") == "integer" and abs(value) < 1e15:
+        return f" (write {int(value)})"
+    if isinstance(value, int | float) and is_text(node):
+        return " (in quotes, to make it text)"
+    return ""
+
+
+def show(value: Any, text: str | None = None) -> str:
+    """A value in one short line; a number as it was written, text in quotes."""
+    if isinstance(value, dict | list):
+        return "a mapping" if isinstance(value, dict) else "a list"
+    if text == "":
+        return "empty"
+    if isinstance(value, str):
+        return quote(value)
+    if text is None:
+        text = json.dumps(value) if isinstance(value, int | None) else repr(value)
+    return escape(text)
+
+
+def quote(text: str) -> str:
+    return f"'{escape(text)}'"
+
+
+def escape(text: str, length: int = 60) -> str:
+    """Printable ASCII and letters as they are, everything else escaped; cut where it is long."""
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: length + 1])
+    return shown if len(shown) <= length else f"{shown[:length]}..."

@@ -1,0 +1,64 @@
+"""What all options have in common: a frozen class that is an argument, a section of a file and a saved description."""
+
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pgts_torch.errors import PgtsError
+from pgts_torch.options.mistakes import explain
+
+
+class Part(BaseModel):
+    """Options that belong together. The docstring under a field is its meaning in `pgts train --help`, the annotation
+    its range there and in messages.
+
+    Raises:
+        PgtsError: one line for each option that is unknown or out of range.
+    """
+
+    model_config = ConfigDict(
+        strict=True,
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        validate_default=True,
+        use_attribute_docstrings=True,
+    )
+
+    if not TYPE_CHECKING:  # type checkers see the fields
+
+        def __init__(self, **options: Any) -> None:
+            if "lambda_" in options:  # lambda is a word of Python
+                options["lambda"] = options.pop("lambda_")
+            try:
+                super().__init__(**options)
+            except ValidationError as error:
+                lines = dict.fromkeys(f"{type(self).__name__}: {each.message}" for each in explain(type(self), error))
+                raise PgtsError("\n".join(lines)) from None
+
+        # Nested options are then validated in one go, with the path of each mistake.
+        __init__.__pydantic_base_init__ = True
+
+    def plain(self) -> dict[str, Any]:
+        """As plain values, without those that are null."""
+        return self.model_dump(by_alias=True, exclude_none=True)
+
+    @classmethod
+    def standing(cls, case: str) -> dict[str, Any]:
+        """What null stands for in such a case, by option (`null`)."""
+        extras = {name: field.json_schema_extra for name, field in cls.model_fields.items()}
+        nulls: dict[str, Any] = {
+            name: extra.get("null", {}) for name, extra in extras.items() if isinstance(extra, dict)
+        }
+        return {name: cases[case] for name, cases in nulls.items() if case in cases}
+
+    def filled(self, case: str) -> Any:
+        """These options, with what null stands for in such a case."""
+        standing = {name: value for name, value in self.standing(case).items() if getattr(self, name) is None}
+        return self.model_copy(update=standing)
+
+
+def null(**standing: Any) -> Any:
+    """The default of an option that is null, which stands for a value that depends on the case, as in
+    `null(tables="uniform", networks="visits")`. In other cases the option has no effect."""
+    return Field(default=None, json_schema_extra={"null": standing})

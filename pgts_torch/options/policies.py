@@ -1,0 +1,120 @@
+"""What policies are made of: tables, and networks."""
+
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from pgts_torch.options.fields import Count, Natural, Positive, Share, Sizes, conflict
+from pgts_torch.options.part import Part
+
+
+class Uniform(Part):
+    """All actions equally likely."""
+
+    type: Literal["uniform"] = "uniform"
+
+
+class Random(Part):
+    """Action probabilities drawn from the uniform distribution over the simplex."""
+
+    type: Literal["random"] = "random"
+
+
+class Biased(Part):
+    """One action preferred in every state; the others share the rest."""
+
+    type: Literal["biased"] = "biased"
+
+    action: Natural = 0
+    """The preferred action."""
+
+    probability: Share = 0.99
+    """Its probability; 1 only with policy.type simplex."""
+
+
+Init = Uniform | Random | Biased
+
+
+class AutoPolicy(Part):
+    """By the environment: a softmax table where its states are numbered, else a network, cnn for images and mlp."""
+
+    type: Literal["auto"] = "auto"
+
+
+class Softmax(Part):
+    """A table of logits, for environments whose observations are numbered states."""
+
+    type: Literal["softmax"] = "softmax"
+
+    init: Init = Field(default=Uniform(), discriminator="type")
+    """The policy before the first update."""
+
+    @field_validator("init")
+    @classmethod
+    def _finite_logits(cls, init: Any) -> Any:
+        if isinstance(init, Biased) and init.probability == 1:
+            raise conflict(
+                "policy.init.probability is 1, which policy.type softmax cannot represent (infinite logits); "
+                "it must be below 1, or policy.type simplex",
+                "policy.init.probability",
+                "policy.type",
+            )
+        return init
+
+
+class Simplex(Part):
+    """A table of the probabilities themselves, likewise."""
+
+    type: Literal["simplex"] = "simplex"
+
+    init: Init = Field(default=Uniform(), discriminator="type")
+    """The policy before the first update."""
+
+
+class MLP(Part):
+    """Fully connected layers over numbered states or vectors."""
+
+    type: Literal["mlp"] = "mlp"
+
+    hidden: Sizes = Field(default=[64, 64])
+    """Sizes of the hidden layers."""
+
+    activation: Literal["tanh", "relu"] = "tanh"
+    """What follows each of them."""
+
+    normalize: bool = False
+    """Subtract the running mean of the observations and divide by their running deviation; not for numbered states."""
+
+
+class CNN(Part):
+    """Convolutions over images (height, width, channels), then fully connected layers."""
+
+    type: Literal["cnn"] = "cnn"
+
+    channels: Sizes = Field(default=[16, 32, 64])
+    """Channels of the convolutions, one after the other."""
+
+    kernel_size: Count = 2
+    """Height and width of each of them."""
+
+    stride: Count = 1
+    """Steps of each of them."""
+
+    hidden: Sizes = Field(default=[128])
+    """Sizes of the fully connected layers."""
+
+    activation: Literal["tanh", "relu"] = "relu"
+    """What follows each layer."""
+
+    normalize: bool = False
+    """Subtract the running mean of each channel and divide by its running deviation."""
+
+    scale: Positive | None = None
+    """What observations are divided by; null: 255 for bytes, else 1. MiniGrid's codes are at most 10."""
+
+
+Table = Softmax | Simplex
+Network = MLP | CNN
+
+TABLES, NETWORKS = ("softmax", "simplex"), ("mlp", "cnn")
+"""Their types; which of them auto is, the environment says."""

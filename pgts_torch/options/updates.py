@@ -1,0 +1,146 @@
+"""How the policy moves toward the lookahead values."""
+
+from typing import Literal
+
+from pgts_torch.options.fields import Clip, Count, NonNegative, Positive
+from pgts_torch.options.part import Part, null
+
+StateWeight = Literal["occupancy", "visits", "uniform"]
+
+
+class AutoUpdate(Part):
+    """By the policy: mirror and projected for the tables; cmpo for networks, ppo where advantages are sampled."""
+
+    type: Literal["auto"] = "auto"
+
+
+class TableUpdate(Part):
+    """One step at the visited rows of a table."""
+
+    step_size: Positive = 0.1
+    """eta, by which the weighted lookahead values are multiplied."""
+
+    state_weight: StateWeight = "occupancy"
+    """What a visited state counts for: its discounted occupancy, its share of all visits, or 1."""
+
+
+class Projected(TableUpdate):
+    """Euclidean projection onto the simplex, the paper's; needs policy.type simplex."""
+
+    type: Literal["projected"] = "projected"
+
+
+class SoftmaxGradient(TableUpdate):
+    """Gradient in the logits; needs policy.type softmax."""
+
+    type: Literal["softmax"] = "softmax"
+
+
+class NetworkUpdate(Part):
+    """Gradient steps on the parameters of a network."""
+
+    learning_rate: Positive = 3e-4
+    """Step size of the optimizer."""
+
+    optimizer: Literal["adam", "sgd"] = "adam"
+    """Adam, or plain gradient descent."""
+
+    max_grad_norm: Clip = 0.5
+    """Longer gradients are shortened to it."""
+
+    state_weight: StateWeight = "visits"
+    """What a visited state counts for: its discounted occupancy, its share of all visits, or 1."""
+
+
+class Gradient(NetworkUpdate):
+    """One step up the gradient of all actions' advantages; needs a network policy."""
+
+    type: Literal["gradient"] = "gradient"
+
+    entropy_coef: NonNegative = 0.0
+    """What a nat of entropy is worth, in reward units."""
+
+
+class Epochs(NetworkUpdate):
+    """Many steps, on parts of the visited states."""
+
+    num_epochs: Count = 10
+    """Passes over the visited states in each iteration."""
+
+    minibatch_size: Count = 64
+    """States in each step."""
+
+
+class PPO(Epochs):
+    """Many steps up a clipped objective (Schulman et al. 2017); needs a network policy."""
+
+    type: Literal["ppo"] = "ppo"
+
+    clip_range: Positive = 0.2
+    """How far the probability of an action may move, as a share of itself, before it is pushed no further."""
+
+    entropy_coef: NonNegative = 0.0
+    """What a nat of entropy is worth, in units of the advantages."""
+
+    target_kl: Positive | None = None
+    """No further step once pi has moved this far from the old one, in nats; null: never."""
+
+    normalize_advantage: bool = True
+    """Divide advantages by the root of their mean square."""
+
+
+class CMPO(Epochs):
+    """A step toward better actions of a length that no reward scale changes (Hessel et al. 2021); needs a network
+    policy and the advantages of all actions."""
+
+    type: Literal["cmpo"] = "cmpo"
+
+    learning_rate: Positive = 1e-3
+    """Step size of the optimizer."""
+
+    temperature: Positive = 0.1
+    """By which advantages are divided, in units of their mean size; small ones make long steps."""
+
+    clip: Positive = 3.0
+    """The most that an action gains or loses in log pi in one iteration."""
+
+
+class Mirror(Part):
+    """Mirror ascent with the KL divergence; for all policies. The steps of tables do not depend on the scale of the
+    rewards."""
+
+    type: Literal["mirror"] = "mirror"
+
+    state_weight: StateWeight | None = null(tables="uniform", networks="visits")
+    """What a visited state counts for: its discounted occupancy, its share of all visits, or 1."""
+
+    step_size: Positive | None = null(tables=1.0)
+    """eta, by which the weighted advantages are multiplied. Only for tables, as the next two."""
+
+    normalize: Literal["rms", "none"] | None = null(tables="rms")
+    """rms: advantages are divided by their root mean square, or by the standard error of the lookahead where that is
+    larger; none: they count in reward units, as in the paper."""
+
+    floor: Clip | None = null(tables=12.0)
+    """The most that the log of a probability may fall below the largest one of its state."""
+
+    temperature: Positive | None = null(networks=1.0)
+    """By which the lookahead values are divided, in reward units. Only for networks, as all that follow."""
+
+    learning_rate: Positive | None = null(networks=3e-4)
+    """Step size of the optimizer."""
+
+    optimizer: Literal["adam", "sgd"] | None = null(networks="adam")
+    """Adam, or plain gradient descent."""
+
+    max_grad_norm: Clip | None = null(networks=0.5)
+    """Longer gradients are shortened to it."""
+
+    num_epochs: Count | None = null(networks=10)
+    """Passes over the visited states in each iteration."""
+
+    minibatch_size: Count | None = null(networks=64)
+    """States in each step."""
+
+
+Update = Projected | SoftmaxGradient | Mirror | Gradient | PPO | CMPO
