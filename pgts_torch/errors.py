@@ -1,10 +1,10 @@
-"""The errors that a caller can cause. Each message names the culprit, its value and what is required."""
+"""The errors that a caller can cause. Each message names what is wrong, its value and what is required."""
 
 
 class PgtsError(ValueError):
-    """Something that the caller gave cannot be used.
+    """An argument, a file or an environment of the caller cannot be used.
 
-    rank: the process in which it happened, where several train together; None: in this one.
+    rank: where several processes train together, the one in which it happened; None: this one.
     """
 
     rank: int | None = None
@@ -31,10 +31,10 @@ class RankLost(PgtsError):
 
 
 class NotFinite(PgtsError):
-    """A number that training stands on is infinite or not a number. The policy has not been moved by it.
+    """A number in training is infinite or NaN. The policy has not been updated with it.
 
-    what: which number: observation, state, reward, discount, value, lookahead, advantage, weight, probability, loss or
-        gradient.
+    what: the kind of number: observation, state, reward, discount, value, lookahead, advantage, weight, probability,
+        loss or gradient.
     """
 
     def __init__(self, message: str, *, what: str = "number") -> None:
@@ -43,16 +43,16 @@ class NotFinite(PgtsError):
 
 
 class Failed(PgtsError):
-    """Something of the caller's, as an environment, raised an error or answered wrongly."""
+    """Code of the caller, such as an environment, raised an error or returned something invalid."""
 
 
 class ModelMismatch(PgtsError):
-    """The environment did what its model rules out, or not as often as the model says: one of the two is wrong, and a
-    lookahead is not to be trusted. The policy has not been moved by it."""
+    """A step of the environment is impossible in its model, or more or less frequent than the model says: one of the
+    two is wrong, and so may be a lookahead. The policy has not been updated with it."""
 
 
 def text_of(error: BaseException) -> str:
-    """Kind and text of an error of the caller's, the text alone of one of ours. Some texts cannot be printed."""
+    """The message of a PgtsError; for other errors also the name of their class. Some have no printable text."""
     if isinstance(error, PgtsError):
         return str(error)
     try:
@@ -62,29 +62,29 @@ def text_of(error: BaseException) -> str:
 
 
 def failure(where: str, error: BaseException) -> NotFinite | ModelMismatch | Failed:
-    """The error that says where another one happened; NotFinite and ModelMismatch stay what they are.
+    """Return an error whose message says where another one happened; NotFinite and ModelMismatch keep their class.
 
-    Also of SystemExit and the like, which environments raise too; only Ctrl-C is raised again, for it is the user's.
+    SystemExit and the like are handled too, because environments raise them; KeyboardInterrupt is raised again.
     """
     if isinstance(error, KeyboardInterrupt):
         raise error
     if not isinstance(error, PgtsError):
         return Failed(f"{where}: {text_of(error)}")
-    story = f"{where}: {error}"
-    told: NotFinite | ModelMismatch | Failed
+    text = f"{where}: {error}"
+    located: NotFinite | ModelMismatch | Failed
     if isinstance(error, NotFinite):
-        told = NotFinite(story, what=error.what)
+        located = NotFinite(text, what=error.what)
     else:
-        told = ModelMismatch(story) if isinstance(error, ModelMismatch) else Failed(story)
-    told.rank = error.rank
-    return told
+        located = ModelMismatch(text) if isinstance(error, ModelMismatch) else Failed(text)
+    located.rank = error.rank
+    return located
 
 
 class Stopped(Exception):
-    """A signal has ended a training early; what was learned is saved.
+    """A signal has ended training early, after a checkpoint.
 
     Args:
-        message: what can be done about it.
+        message: how to go on.
         signal: its number.
     """
 

@@ -1,8 +1,8 @@
-"""Randomness without a global state: named streams from one seed, and keys that name a single draw. What others draw
-from the generators that a whole process shares is made a function of the seed, too (`SharedGenerators`).
+"""Random numbers without global state: named streams from one seed, and keys for single samples. `SharedGenerators`
+makes the random generators of the whole process, which other code may use, a function of the seed as well.
 
-A stream is drawn from in order. A key belongs to one thing, for instance to sample 3 of an action in a state, and what
-is drawn for it does not depend on what else is drawn: a batch may be split or reordered.
+Numbers of a stream depend on the order in which they are taken. A key belongs to one sample, for instance to sample 3
+of an action in a state, and its number depends on nothing else: a batch may be split or reordered.
 """
 
 import pickle
@@ -58,10 +58,10 @@ def stream(seed: int, *names: str | int, device: torch.device | str = "cpu") -> 
 
 @final
 class SharedGenerators:
-    """While the context lasts the generators that a process shares, of `random`, `numpy.random` and torch, are those of
-    a stream; afterwards, also after an error, they are as they were.
+    """A context in which the global generators of `random`, `numpy.random` and torch are seeded from a stream. At its
+    end, also after an error, their states are restored.
 
-    drawn: after the context: the modules from whose generators somebody has drawn in it.
+    drawn: after the context: the modules whose generators were used in it.
 
     Args:
         seed, names: the stream, as in `stream`. Without a seed the generators go on from where they are.
@@ -93,7 +93,7 @@ class SharedGenerators:
 
 
 def _shared_states() -> dict[str, Any]:
-    """By module the state of its shared generator, in values that can be compared."""
+    """The state of each module's global generator, in values that can be compared."""
     return {
         "random": random.getstate(),
         "numpy.random": pickle.dumps(np.random.get_state(legacy=False)),  # noqa: NPY002

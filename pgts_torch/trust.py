@@ -1,4 +1,4 @@
-"""Names of modules in what was saved: importing one runs its code, so somebody must have said that it may be."""
+"""Names of modules in saved files: importing a module runs its code, so it needs the caller's consent."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -7,18 +7,18 @@ from typing import Any
 from pgts_torch.errors import PgtsError
 
 _NAMES_MODULE = re.compile(r"\s*([^\W\d]\w*(?:\.[^\W\d]\w*)*)\s*:\s*[^\W\d]")
-"""MODULE:ID, as an id of Gymnasium or an entry point has it; not a URL or a time."""
+"""MODULE:ID, as in ids of Gymnasium and entry points; it does not match a URL or a time."""
 
 
 def check_imports(source: object, env: Any, kwargs: Any) -> None:
-    """Make sure that to make an environment imports nothing that only a saved file names.
+    """Refuse a saved environment whose id or arguments name a module to import.
 
     Args:
-        source: the file, as errors name it.
-        env, kwargs: the id, and the arguments of the environment.
+        source: the file, as named in errors.
+        env, kwargs: the id and the arguments of the environment.
 
     Raises:
-        PgtsError: a text in them names a module.
+        PgtsError: a string in them names a module.
     """
     for text in _texts([env, kwargs]):
         is_id = text is env and ":" in text

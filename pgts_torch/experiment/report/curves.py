@@ -1,4 +1,4 @@
-"""The curves of metrics.jsonl: which of them share a panel, and how a panel is drawn."""
+"""The curves of metrics.jsonl, grouped into panels, and the plot of a panel."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
@@ -26,21 +26,21 @@ SHARED = {
         "eval/sampled_length": "sampled",
     },
 }
-"""Panels of several tags, each with its name in the legend."""
+"""Panels with several tags, by title; each tag with its name in the legend."""
 
 HEADINGS = {"search": "Lookahead", "exact": "Lookahead", "losses": "Learning", "charts": "Learning"}
-"""Of the panels of a single tag, by what it begins with."""
+"""The headings of panels with a single tag, by its prefix."""
 
 INTERVAL = "_half_width"
 INK, GREY = "#010203", "#8a8a8a"
-"""The colour of text, which is light on a dark page; and that of lines behind the curves."""
+"""The colours of text, replaced by a light one on dark pages, and of axes and grid."""
 
 COLOURS, WIDTHS = ("#2b7bba", "#e07b18", "#3a9a5b"), (2.8, 1.8, 1.2)
-"""Curves that lie on each other stay visible: the last is thin and on top."""
+"""Later curves are thinner and on top, so that curves that coincide stay visible."""
 
 
 class Curve(TypedDict):
-    """One tag over environment steps, with half-widths of 95 % confidence intervals; None: not finite, or not known."""
+    """A tag over environment steps, with half-widths of 95 % confidence intervals; None: not finite, or unknown."""
 
     tag: str
     label: str
@@ -50,7 +50,7 @@ class Curve(TypedDict):
 
 
 class Panel(TypedDict):
-    """Curves with one axis, and a value to compare them with."""
+    """Curves on common axes, and the level of a horizontal line."""
 
     title: str
     curves: Sequence[Curve]
@@ -58,7 +58,7 @@ class Panel(TypedDict):
 
 
 def panels(lines: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[Panel]], dict[str, float], list[str]]:
-    """Panels by heading, tags that never change with their value, and tags that are never finite."""
+    """Return panels by heading, the tags that never change with their value, and the tags that are never finite."""
     tags = list(dict.fromkeys(tag for line in lines for tag in line if tag != "step"))
     finite = {tag for line in lines for tag, value in line.items() if value is not None}
     groups: dict[str, list[Panel]] = {heading: [] for heading in ("Return", *HEADINGS.values(), "More")}
@@ -89,7 +89,7 @@ def _curve(lines: Sequence[Mapping[str, Any]], tag: str, label: str) -> Curve:
 
 
 def draw(panel: Panel) -> Figure:
-    """The curves of a panel, with a legend where there is more than one line."""
+    """Plot the curves of a panel, with a legend where there is more than one line."""
     figure = Figure(figsize=(5, 2.9), layout="constrained")
     axes = figure.subplots()
     for curve, colour, width in zip(panel["curves"], COLOURS, WIDTHS[-len(panel["curves"]) :], strict=False):

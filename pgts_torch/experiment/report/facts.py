@@ -1,4 +1,4 @@
-"""What the folder of a run says about it. Whatever is missing, damaged or just being written becomes a note."""
+"""Read the folder of a run for its report. Files that are missing, damaged or being written become notes."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -25,15 +25,15 @@ PROGRESS = {
     "search/certificate": "certificate, J* - J <=",
     "charts/episodic_return": "return of episodes",
 }
-"""What is said of the last iteration of a run that has not come to its end."""
+"""The values of the last iteration that are reported for an unfinished run."""
 
 
 def gather(run: Path, *, trust_imports: bool = False) -> tuple[dict[str, Any], PGTS | None]:
-    """What a run folder says, as plain values, and what its newest intact checkpoint holds.
+    """Return the content of a run folder as plain values, and the model of its newest intact checkpoint.
 
-    Among the values: `state`, finished, unfinished or failed; `rows`, what the run came to or how far it is, names and
-    values as text; `curves` by heading; `config`, each key with its default under the types that were chosen (None for
-    kwargs); `notes`, what is missing or damaged.
+    Among the values: `state`, finished, unfinished or failed; `rows`, its results or its progress, names and values as
+    text; `curves` by heading; `config`, each key with its default under the types that were chosen (None for kwargs);
+    `notes`, what is missing or damaged.
 
     Raises:
         PgtsError: the configuration cannot be read.
@@ -76,12 +76,12 @@ def gather(run: Path, *, trust_imports: bool = False) -> tuple[dict[str, Any], P
 
 
 def number(value: Any) -> float | None:
-    """A value that can be drawn, else None: differences of two of them are finite, too."""
+    """Return a value that can be plotted, so that differences of two values are finite, too; else None."""
     return value if isinstance(value, int | float) and abs(value) <= 1e300 else None
 
 
 def _read(path: Path, parse: Callable[[Any], Any], notes: list[str]) -> Any:
-    """What `parse` makes of the JSON in a file; None where there is none, or another form."""
+    """Return the result of `parse` on the JSON in a file; None where there is no file, or it has another form."""
     try:
         return parse(json.loads(path.read_bytes()))
     except FileNotFoundError:
@@ -92,12 +92,12 @@ def _read(path: Path, parse: Callable[[Any], Any], notes: list[str]) -> Any:
 
 def _summary(content: Any) -> Summary:
     summary = from_json(content)
-    rows(summary)  # raises an error where something cannot be said
+    rows(summary)  # raises an error where a value cannot be formatted
     return summary
 
 
 def _metrics(run: Path, notes: list[str]) -> list[Values]:
-    """The lines of metrics.jsonl that can be read; what is not a number that can be drawn is None."""
+    """Return the lines of metrics.jsonl that can be read; values that cannot be plotted are None."""
     lines, unread = list[Values](), 0
     with suppress(OSError):
         for raw in (run / ownership.METRICS_FILE).read_bytes().splitlines():
@@ -114,7 +114,7 @@ def _metrics(run: Path, notes: list[str]) -> list[Values]:
 
 
 def _last_checkpoint(run: Path, notes: list[str]) -> tuple[Path, checkpoint.Notes | None]:
-    """The newest checkpoint that is intact, and what it says."""
+    """Return the newest intact checkpoint and its notes."""
     for path in reversed(checkpoint.listed(run)):
         try:
             return path, checkpoint.read(path)[0]
@@ -135,8 +135,11 @@ def _progress(last: checkpoint.Notes | None, latest: Values) -> Iterator[tuple[s
 
 
 def _certificate(summary: Summary | None, latest: Values) -> Values:
-    """An upper bound on J* - J^pi (None: there is none), whether it is proved, what is missing where that is known, and
-    whether there was an iteration that could say."""
+    """The certificate, and the exact optimality gap beside it.
+
+    bound: on J* - J^pi; None: there is none.   is_proved: whether it is a proof.   missing: J* - J^pi, where known.
+    is_known: whether an iteration has reported it.
+    """
     if summary is None:
         bound, missing = latest.get("search/certificate"), latest.get("exact/optimality_gap")
         proved, known = latest.get("search/proved") == 1, "search/certificate" in latest
@@ -162,10 +165,10 @@ def _applies(when: str, values: Values) -> bool:
 
 
 def _files(run: Path) -> Iterator[tuple[str, int]]:
-    """Names and bytes of what a run has left; a checkpoint counts as one."""
+    """Yield name and size in bytes of each file of a run, and of each checkpoint as a whole."""
     hidden = (ownership.CHECKPOINTS, ownership.LOCK_FILE, ownership.MARK_FILE, ownership.REPORT_FILE)
     for path in sorted([*run.iterdir(), *checkpoint.listed(run)]):
         if path.name not in hidden and not path.name.endswith(PARTIAL):
             parts = path.glob("*") if path.parent != run else [path]
-            with suppress(FileNotFoundError):  # a run that is being trained removes old checkpoints
+            with suppress(FileNotFoundError):  # a run that is still training removes old checkpoints
                 yield str(path.relative_to(run)), sum(part.stat().st_size for part in parts)

@@ -1,4 +1,4 @@
-"""The page about a run: no script, nothing from elsewhere, every text escaped."""
+"""The HTML page about a run. It has no scripts, loads nothing from elsewhere, and all text is escaped."""
 
 import base64
 import io
@@ -23,7 +23,7 @@ from pgts_torch.experiment.resume import resuming
 from pgts_torch.tabular import exact
 
 SIGN = b'<meta name="generator" content="pgts report">'
-"""What is in each page."""
+"""A tag by which a page of `pgts report` is recognised."""
 
 DARK = f'@media (prefers-color-scheme: dark) {{ [style*="{INK}"] {{ fill: #e4e7ec !important }} }}</style>'
 
@@ -32,11 +32,11 @@ def write(run: Path, out: Path | None, *, trust_imports: bool = False) -> dict[s
     """Write the page about a run, by default into its folder.
 
     Returns:
-        What the page shows, but for the pictures of the policy, as plain values; and where it is, as "page".
+        The content of the page as plain values, without the pictures of the policy; "page" is its path.
 
     Raises:
-        PgtsError: the configuration of the run cannot be read, or the page cannot be written, as where a file is that
-            is no such page.
+        PgtsError: the configuration of the run cannot be read, or the page cannot be written, for instance because
+            another file is in its place.
     """
     torch.set_num_threads(1)
     out = files.target(run / REPORT_FILE if out is None else out, lambda raw: SIGN in raw, "a page of pgts report")
@@ -62,7 +62,7 @@ def write(run: Path, out: Path | None, *, trust_imports: bool = False) -> dict[s
 
 
 def _policy(algorithm: PGTS) -> dict[str, Any]:
-    """v^pi and pi of a tabular policy."""
+    """The template values about a tabular policy, with pictures of v^pi and pi."""
     mdp, pi_SA = algorithm.mdp, algorithm.policy_table().cpu()
     return {
         "step": algorithm.num_env_steps,
@@ -76,8 +76,8 @@ def _policy(algorithm: PGTS) -> dict[str, Any]:
 
 
 def image(figure: Figure, *, transparent: bool = False) -> str:
-    """The figure as the `src` of an image, the same bytes each time; a transparent one fits a light and a dark page."""
-    # The salt makes the same ids each time. Up to a pixel, curves of many points are drawn with few.
+    """Return a figure as the `src` of an image, the same bytes each time; a transparent one fits a dark page, too."""
+    # The salt makes ids reproducible. Simplification by up to a pixel keeps curves of many points small.
     file = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "pgts", "path.simplify_threshold": 1.0}):
         figure.savefig(file, format="svg", dpi=150, transparent=transparent, metadata={"Date": None, "Creator": None})
@@ -86,13 +86,13 @@ def image(figure: Figure, *, transparent: bool = False) -> str:
 
 
 def typeset(text: str) -> str:
-    """The signs of ASCII arithmetic as they are printed: minus, at most, plus or minus."""
+    """Replace <=, +- and minus signs of ASCII text by their typographic characters."""
     text = text.replace("<=", "\N{LESS-THAN OR EQUAL TO}").replace("+-", "\N{PLUS-MINUS SIGN}")
     return re.sub(r"(?<![A-Za-z0-9])-(?=[ 0-9])|(?<=[0-9]e)-(?=[0-9])", "\N{MINUS SIGN}", text)
 
 
 def tiles(rows: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """Each name, the number that its text begins with, for large letters, and the rest; those with numbers first."""
+    """Return (name, number, text) for each row, where the text begins with a number; those with numbers first."""
     found = []
     for name, text in rows.items():
         number, _, rest = text.partition(" ")
