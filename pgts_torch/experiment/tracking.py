@@ -1,6 +1,7 @@
 """Write the files of a run while it trains: metrics, TensorBoard events, texts and pictures."""
 
 import hashlib
+import io
 import json
 import math
 import os
@@ -13,6 +14,8 @@ from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, final
+
+import numpy as np
 
 from pgts_torch import files
 from pgts_torch.errors import PgtsError
@@ -184,11 +187,19 @@ class RunFolder(Folder):
 
     def picture(self, name: str, figure: "Figure", step: int) -> None:
         """Write `name`.png, and the same picture to TensorBoard."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.image import imsave
+
+        figure.set_dpi(120)
+        canvas, png = FigureCanvasAgg(figure), io.BytesIO()
+        canvas.draw()  # once for both: it takes as long as a short training
+        pixels = np.asarray(canvas.buffer_rgba())
+        imsave(png, pixels, format="png", dpi=120)
         with self._writing(f"{name}.png"):
-            figure.savefig(self.path / f"{name}.png", dpi=120)
+            files.replace(self.path / f"{name}.png", png.getvalue())
         if self._events is not None:
             with self._writing("events"):
-                self._events.add_figure(name, figure, step)
+                self._events.add_image(name, pixels, step, dataformats="HWC")
 
 
 @final
