@@ -273,12 +273,13 @@ def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> _Row:
             raise PgtsError(f"P[{s}][{a}] leads to state {next_state}; states are 0 to {S - 1}")
         if p < 0 or not np.isfinite(p):
             raise PgtsError(f"P[{s}][{a}] has probability {p}; probabilities are finite and at least 0")
+        reward = float(reward)  # a float32 would turn the largest value into infinity
         if not abs(reward) <= _LARGEST_VALUE:
             raise PgtsError(f"P[{s}][{a}] has reward {reward}; rewards must be finite, at most {_LARGEST_VALUE:.2g}")
         if p > 0:
-            key = (int(next_state), bool(terminated), float(reward))
+            key = (int(next_state), bool(terminated), reward)
             successors[key] = successors.get(key, 0.0) + float(p)
-            expected_reward += float(p) * (float(reward) - first_reward)
+            expected_reward += float(p) * (reward - first_reward)
     if not successors:
         raise PgtsError(f"P[{s}][{a}] has no outcome with positive probability")
     total = sum(successors.values())

@@ -314,6 +314,22 @@ def test_an_empty_table_is_refused(sizes):
         mdp_of(a_valid_table(*sizes))
 
 
+def test_a_table_P_of_numpy_scalars_is_that_of_plain_numbers():
+    plain = {0: {0: [(0.25, 1, 0.5, False), (0.75, 0, -2.0, False)]}, 1: {0: [(1.0, 1, 1e30, True)]}}
+    numpy = {
+        np.int64(s): {np.int8(a): [(np.float32(p), np.int32(n), np.float32(r), np.bool_(end)) for p, n, r, end in rows]}
+        for s, actions in plain.items()
+        for a, rows in actions.items()
+    }
+    numpy[1][0] = plain[1][0]  # 1e30 is no float32
+    mdp, same = (TabularMDP.from_transitions(P, 0.5) for P in (plain, numpy))
+    assert torch.equal(mdp.outcomes.reward_NA, same.outcomes.reward_NA)
+    assert np.array_equal(weights(mdp), weights(same))
+    numpy[1][0] = [(1.0, 1, np.float32("inf"), True)]
+    with pytest.raises(PgtsError, match=r"P\[1\]\[0\] has reward inf; rewards must be finite"):
+        TabularMDP.from_transitions(numpy, 0.5)
+
+
 def test_a_float32_table_is_refused():
     table = a_valid_table()
     with pytest.raises(PgtsError, match=r"prob_NAK is torch.float32; the exact world is float64"):
