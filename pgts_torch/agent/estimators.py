@@ -29,6 +29,11 @@ class Estimator(ABC):
 
     comes_first: bool
 
+    @property
+    @abstractmethod
+    def model_calls(self) -> int:
+        """For how many (state, action) the model has been queried so far, by the critic too."""
+
     @abstractmethod
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
         """Return the advantages of the policy that collected these episodes.
@@ -52,6 +57,10 @@ class LookaheadEstimator(Estimator):
 
     def __init__(self, look: PolicyLookahead, choose: DepthChoice, weight: StateWeight) -> None:
         self._look, self._choose, self._weight = look, choose, weight
+
+    @property
+    def model_calls(self) -> int:
+        return self._look.search.model_calls + self._look.critic.model_calls
 
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
         self._look.restart()
@@ -90,6 +99,10 @@ class SampledEstimator(Estimator):
 
     def __init__(self, policy: Policy, critic: Critic, lambda_: float, weight: StateWeight) -> None:
         self._policy, self._critic, self._lambda, self._weight = policy, critic, lambda_, weight
+
+    @property
+    def model_calls(self) -> int:
+        return self._critic.model_calls
 
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
         alive_TB, observation_N = experience.alive_TB, experience.observation_V

@@ -94,11 +94,11 @@ class Ranks:
             results.append(result)
         return results
 
-    def total(self, count: int, policy: Mapping[str, Any]) -> int:
-        """The sum of `count` over all ranks; PgtsError if their policies differ."""
+    def total(self, count: int, policy: Callable[[], Mapping[str, Any]]) -> int:
+        """The sum of `count` over all ranks; PgtsError if their policies, of which `policy` is the state, differ."""
         if self.size == 1:
             return count
-        received = self.gather("policies", lambda: (count, checksum(policy)))
+        received = self.gather("policies", lambda: (count, checksum(policy())))
         if len({policy_sum for _, policy_sum in received}) > 1:
             raise PgtsError("the ranks have different policies: do they run on different hardware or versions?")
         return sum(each for each, _ in received)

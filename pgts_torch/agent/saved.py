@@ -1,6 +1,7 @@
 """The state of a training, and the file it is saved in: what a model of the same arguments goes on from."""
 
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Mapping
+from inspect import signature
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -112,13 +113,12 @@ def _restore_search(training: Training, searches: Any) -> None:
 
 
 def load_training(
-    path: str | Path, make: Callable[..., T], *, parameters: Set[str], env: Any, device: str | None, trust_imports: bool
+    path: str | Path, make: type[T], *, env: Any, device: torch.device | str | None, trust_imports: bool
 ) -> T:
     """The training in a file that holds its arguments and its state.
 
     Args:
-        make: makes a training from arguments.
-        parameters: the names of arguments that it takes.
+        make: its class.
         env: the environment, where it was given to the saved training as an object; else None.
         device: where to load it; None: the device it was saved from.
         trust_imports: whether the module that the id of its environment may name is imported.
@@ -130,7 +130,7 @@ def load_training(
     if content.keys() != {"arguments", "state"}:
         raise PgtsError(f"{path} holds {sorted(map(str, content))}, not a model")
     arguments = content["arguments"]
-    check_keys(f"{path}: arguments", arguments, {"env"}, others=parameters)
+    check_keys(f"{path}: arguments", arguments, {"env"}, others=set(signature(make).parameters))
     saved_env = arguments["env"]
     if (env is None) == (saved_env is None):
         raise PgtsError(
@@ -140,7 +140,7 @@ def load_training(
         )
     if not trust_imports:
         check_imports(path, saved_env, arguments.get("env_kwargs"))
-    arguments |= {"env": saved_env if env is None else env} | ({} if device is None else {"device": device})
+    arguments |= {"env": saved_env if env is None else env} | ({} if device is None else {"device": str(device)})
     try:
         training = make(**arguments)
     except NO_STATE as error:
