@@ -7,6 +7,8 @@ import torch
 
 from pgts_torch import PGTS
 from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.loading import load
+from pgts_torch.experiment.run import build
 from pgts_torch.models import TabularModel
 from pgts_torch.search import mcts
 from pgts_torch.seeding import stream
@@ -94,6 +96,19 @@ def test_the_prior_of_the_policy_is_that_of_the_policy_as_it_is_now():
     changed = model.lookahead(roots).q_BA
     assert torch.equal(changed, direct())
     assert not torch.equal(changed, before)
+
+
+def test_the_tree_search_of_a_configuration_is_that_with_the_same_options():
+    options = {("kind" if name == "type" else name): str(value) for name, value in ALPHA_ZERO.items()}
+    arguments = [word for name, value in options.items() for word in (f"--search.{name}", value)]
+    configured = build(load(None, ["--env.id", "pgts/Random-v0", "--search.depth", "3", *arguments]))
+    roots = torch.arange(configured.mdp.num_states)
+    given, default = (
+        PGTS("pgts/Random-v0", depth=3, search=search) for search in (ALPHA_ZERO, {"type": "mcts", "simulations": 12})
+    )
+    assert str(configured.search) == str(given.search)
+    assert torch.equal(configured.lookahead(roots).q_BA, given.lookahead(roots).q_BA)
+    assert not torch.equal(default.lookahead(roots).q_BA, given.lookahead(roots).q_BA)
 
 
 def test_samples_prove_nothing_but_a_narrow_search_does():
