@@ -4,7 +4,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any, final
 
 import gymnasium
@@ -16,8 +15,6 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, failure
-from pgts_torch.models.actions import all_actions
-from pgts_torch.models.adapters import adapter_for
 from pgts_torch.models.answers import Answers, Step, copied
 from pgts_torch.models.base import (
     CONTRADICTED,
@@ -30,10 +27,9 @@ from pgts_torch.models.base import (
     Transitions,
     step_text,
 )
-from pgts_torch.models.environments import EnvSource, Given, draws_its_own
-from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name, generator_state
-from pgts_torch.models.steps import check_step, discount_of, names_discounts, number_of
-from pgts_torch.models.wrappers import transforms_of
+from pgts_torch.models.environments import Given, draws_its_own
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
+from pgts_torch.models.stepper import Stepper
 from pgts_torch.seeding import SharedGenerators
 
 _KEY_OF_CERTAINTY = 0
@@ -97,33 +93,21 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         if action_repeat > 1 and highest_value < math.inf:
             raise PgtsError(f"highest_value is {highest_value}; under repeated actions no bound of v* stays one")
         self.action_repeat = action_repeat
-        made = EnvSource.of(env).make_one()
-        self.name = env_name(made)
-        self.env: Any = made.unwrapped
-        self.adapter = adapter or adapter_for(made)
-        self.transforms, self._space = transforms_of(made), made.observation_space
-        # Actions as the outermost wrapper takes them, and as the bare instance does, which is the one that is stepped.
-        outer = all_actions(made.action_space) if actions is None else actions
-        self.actions = [self.transforms.action(action) for action in outer]
-        if not self.actions:
-            raise PgtsError("actions is empty; a model needs at least one")
+        self._stepper = Stepper(env, gamma=gamma, actions=actions, adapter=adapter)
+        self.name, self.env, self.actions = self._stepper.name, self._stepper.env, self._stepper.actions
+        self.adapter, self.transforms = self._stepper.adapter, self._stepper.transforms
         self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value
         self.device, self.dtype = torch.empty(0, device=device).device, dtype
-        self.simulator_steps = 0
-        """How often the simulator was stepped."""
         self._observe = observe
-        try:
-            # Only to have a state at all: the first snapshot replaces it.
-            self.env.reset(seed=0)
-        except BaseException as error:
-            raise failure(f"{self.name} failed in reset with seed 0", error) from error
-        # What makes the observation of the present state, where steps do not.
-        self._show = self.adapter.skip_observations(self.env)
-        self._draws_its_own = draws_its_own(made)
-        self._names_discounts = names_discounts(self.env)
+        self._draws_its_own = draws_its_own(self._stepper.made)
         self._sure = Answers()
         self.generation = -1
         self.clear()
+
+    @property
+    def simulator_steps(self) -> int:  # type: ignore[override]
+        """How often the simulator was stepped."""
+        return self._stepper.steps
 
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
@@ -215,7 +199,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
                     f"{self.name}: the observation of state {state} was not given, or `observe` made it None"
                 )
             rows.append(self._observations[state])
-        space = self._space
+        space = self._stepper.space
         if self._observe is None and not isinstance(space, spaces.Box | spaces.Discrete):
             try:
                 rows = [spaces.flatten(space, row) for row in rows]
@@ -346,22 +330,12 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             return known
         taken = self.actions[action]
         try:
-            self.adapter.set_state(self.env, at.data)
-            # Over the repeats: the discounted sum of rewards, the product of discounts, whether chance was involved.
-            total, discount, random = 0.0, 1.0, False
-            for _ in range(repeat):
-                observation, reward, weight, drew, truncated = self._stepped(taken, None if random else key)
-                total, random = total + discount * reward, random or drew
-                discount *= weight
-                if discount == 0 or truncated:
-                    break
-            # Truncation is part of the state, unless the episode has also ended: then nothing follows anyway.
-            reached = self.adapter.get_state(self.env)
-            child = self._known(replace(reached, cut=True) if truncated and discount else reached, None)
+            total, discount, reached, random = self._stepper.follow(
+                at.data, taken, key, repeat=repeat, rewards=self.reward_range
+            )
+            child = self._known(reached, None)
             if self._observations[child] is None:
-                # The observation after the last repeat, or that made for the state now.
-                inner = observation if self._show is None else self._checked(self._show(), total)
-                self._see(child, self._outside(inner))
+                self._see(child, self._stepper.observation(total))
         except BaseException as error:
             where = f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}"
             raise failure(where, error) from error
@@ -369,41 +343,6 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         if not random:
             self._sure.add(query, step)
         return step
-
-    def _stepped(self, taken: Any, key: int | None) -> tuple[Any, float, float, bool, bool]:
-        """Observation, reward, discount, whether chance decided and whether the episode was truncated, of one step.
-
-        Args:
-            key: the seed of the environment's generator; None: it goes on, in later steps of the same outcome.
-        """
-        # Where the adapter cannot tell whether chance decides, the generator does: it has moved if it was drawn from.
-        known = self.adapter.is_random(self.env, taken)
-        if known is not False and key is not None:
-            self.adapter.seed(self.env, key)
-        before = generator_state(self.env) if known is None else None
-        observation, reward, terminated, truncated, info = self.env.step(taken)
-        self.simulator_steps += 1
-        drew = generator_state(self.env) != before if known is None else known
-        # What is not finite or does not fit its space is found before it is transformed.
-        if self._show is None:
-            self._checked(observation, number_of("reward", reward))
-        reward = number_of("reward", self.transforms.reward(reward))
-        if self.reward_range is not None:
-            self.reward_range.check(reward)
-        discount = 0.0 if terminated else discount_of(info, self.gamma, named=self._names_discounts)
-        return observation, reward, discount, drew, bool(truncated)
-
-    def _outside(self, inner: Any) -> Any:
-        """What the wrappers make of an observation, in the dtype that their space declares."""
-        if not self.transforms.observations:
-            return inner
-        outside = self.transforms.observation(inner)
-        return np.asarray(outside, self._space.dtype) if isinstance(self._space, spaces.Box) else outside
-
-    def _checked(self, observation: Any, reward: float) -> Any:
-        """The observation; PgtsError unless it and the reward are what the environment declares."""
-        check_step(self.env.observation_space, observation, reward)
-        return observation
 
     def _check(self, what: str, number: int, count: int) -> None:
         if not 0 <= number < count:
