@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from inspect import signature
 
 import pytest
 
@@ -206,6 +207,11 @@ def test_what_was_chosen_by_the_environment_and_does_not_fit_is_one_clear_line()
         assert str(caught.value) == (
             "update.step_size is 0.5, which the mirror update of a network does not heed; policy.type is mlp"
         )
+
+
+def test_the_defaults_of_pgts_are_those_of_the_options():
+    arguments = {name: each.default for name, each in signature(PGTS).parameters.items()}
+    assert read(arguments) == Training()
 
 
 def test_options_cannot_be_changed_and_are_equal_by_value():

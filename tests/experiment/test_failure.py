@@ -89,7 +89,7 @@ def test_a_run_whose_environment_contradicts_its_model_writes_down_what_happened
     def contradicted(*args):
         raise ModelMismatch("state 1 under action 0 led to 3")
 
-    monkeypatch.setattr(PGTS, "_visit", contradicted)
+    monkeypatch.setattr("pgts_torch.agent.pgts.visit", contradicted)
     folder = tmp_path / "run"
     assert train(folder) == 2
     record = json.loads((folder / "failure.json").read_text())
