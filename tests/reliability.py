@@ -119,7 +119,7 @@ FAULTS: dict[str, dict[str, str]] = {
     "Checkpoints": {
         "flipped bit in a checkpoint": DAMAGED,
         "truncated checkpoint": DAMAGED,
-        "file of a checkpoint missing": DAMAGED,
+        "last checkpoint missing": "the checkpoint before leads to the same bits",
         "checkpoints mixed up": DAMAGED,
         "damaged last checkpoint": DAMAGED,
         "malicious pickle in a checkpoint": "refused, not run",

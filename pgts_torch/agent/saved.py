@@ -127,7 +127,7 @@ def load_training(
         PgtsError: as `PGTS.load`.
     """
     content = saving.read(path)
-    if content.keys() != {"arguments", "state"}:
+    if content.keys() - {"notes"} != {"arguments", "state"}:
         raise PgtsError(f"{path} holds {sorted(map(str, content))}, not a model")
     arguments = content["arguments"]
     check_keys(f"{path}: arguments", arguments, {"env"}, others=set(signature(make).parameters))

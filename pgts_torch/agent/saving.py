@@ -1,7 +1,8 @@
-"""One file that knows whether it is whole: a checksum, then tensors and plain values."""
+"""One file that proves itself: its format, a SHA-256 of all the rest, then tensors and plain values."""
 
 import hashlib
 import io
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +14,13 @@ from pgts_torch import files
 from pgts_torch.errors import PgtsError
 
 _NAME = b"pgts_torch "
-_MAGIC, _MAGIC_0_1 = _NAME + b"4\n", _NAME + b"3\n"
+_HEADER = re.compile(re.escape(_NAME) + rb"(\d{1,9})\n")
+_FORMAT, _FORMAT_0_1 = 5, 3
 _DIGEST = hashlib.sha256().digest_size
+
+
+class Damaged(PgtsError):
+    """A file does not hold what was written."""
 
 
 def target(path: str | Path) -> Path:
@@ -33,31 +39,44 @@ def write(path: str | Path, content: dict[str, Any]) -> None:
     torch.save(content, buffer)
     payload = buffer.getvalue()
     _parse(payload, path)  # what could not be read again must not replace what can
-    files.replace(path, _MAGIC + hashlib.sha256(payload).digest() + payload)
+    files.replace(path, sealed(payload))
 
 
 def read(path: str | Path) -> dict[str, Any]:
     """What `write` wrote. Nothing in the file is executed.
 
     Raises:
-        PgtsError: no such file, not one of ours, or damaged.
+        Damaged: it is not one of ours, or its checksum does not fit.
+        PgtsError: no such file, or one of another format.
     """
-    return decode(files.read(path), path)
-
-
-def decode(raw: bytes, path: str | Path) -> dict[str, Any]:
-    """What the content of a file holds; `path` is its name in errors, which are those of `read`."""
-    is_old = raw.startswith(_MAGIC_0_1)
-    if not (is_old or raw.startswith(_MAGIC)):
-        raise PgtsError(f"{path} is not a file saved by pgts_torch")
-    digest, payload = raw[len(_MAGIC) : len(_MAGIC) + _DIGEST], raw[len(_MAGIC) + _DIGEST :]
-    if hashlib.sha256(payload).digest() != digest:
-        raise PgtsError(f"{path} is damaged: its checksum does not fit its content")
+    raw = files.read(path)
+    header = _HEADER.match(raw)
+    if header is None:
+        raise Damaged(f"{path} is not a file saved by pgts_torch")
+    number, start = int(header[1]), header.end()
+    payload = raw[start + _DIGEST :]
+    if _seal(number, payload) != raw[start : start + _DIGEST]:
+        raise Damaged(f"{path} is damaged: its checksum does not fit its content")
+    if number not in (_FORMAT, _FORMAT_0_1):
+        raise PgtsError(f"{path} has the format {number}; this version of pgts_torch reads {_FORMAT}")
     content = _parse(payload, path)
-    if is_old:
+    if number == _FORMAT_0_1:
         warnings.warn(f"{path} was saved by version 0.1; trained on, it follows the defaults of this one", stacklevel=2)
         _upgrade(content)
     return content
+
+
+def sealed(payload: bytes, number: int = _FORMAT) -> bytes:
+    """The file that holds this, in the format with this number."""
+    return _NAME + b"%d\n" % number + _seal(number, payload) + payload
+
+
+def _seal(number: int, payload: bytes) -> bytes:
+    """The SHA-256 of a file: of its format too, except before format 5."""
+    start = _NAME + b"%d\n" % number if number >= _FORMAT else b""
+    seal = hashlib.sha256(start)
+    seal.update(payload)
+    return seal.digest()
 
 
 def _upgrade(content: dict[str, Any]) -> None:

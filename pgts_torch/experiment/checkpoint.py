@@ -1,10 +1,6 @@
-"""Checkpoints of a run: a directory each, which is whole or not there, and proves it before anything in it is used.
+"""Checkpoints of a run: a file each, `checkpoints/STEP.pt`, which is whole or not there, and proves it before anything
+in it is used. It is what `PGTS.save` writes, with notes beside the model: `PGTS.load` reads it."""
 
-`checkpoints/STEP/` holds the model as `PGTS.save` writes it and a manifest with its SHA-256, written last; one rename
-puts the directory in its place. The manifest is sealed by a SHA-256 of its own.
-"""
-
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -14,25 +10,17 @@ from typing import Any
 from pgts_torch import files
 from pgts_torch.agent import saving
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.agent.saving import Damaged
 from pgts_torch.agent.states import NO_STATE, check_keys
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.experiment.ownership import (
     CHECKPOINTS,
-    MANIFEST_FILE,
-    METRICS_FILE,
-    MODEL_FILE,
-    digest,
+    checkpoint_name,
     read_mark,
-    remove_checkpoint,
     remove_partial,
-    sealed,
-    unsealed,
     write_mark,
 )
 from pgts_torch.experiment.ownership import checkpoints as listed
-
-_FORMAT = 3
-_FORMAT_0_1 = 2
 
 
 @dataclass(frozen=True)
@@ -58,21 +46,19 @@ class Notes:
     progress: Mapping[str, Any]
 
 
-class Damaged(PgtsError):
-    """A checkpoint does not hold what was written."""
-
-
 def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
     """Add a checkpoint to a run folder, and `tidy` it. Of several processes all must call it, and the first one writes.
 
     Raises:
         PgtsError: it cannot be written; then the others are as they were.
     """
-    path = run / CHECKPOINTS / f"{notes.env_steps:012d}"
-    content = algorithm.content()
+    path = run / CHECKPOINTS / checkpoint_name(notes.env_steps)
+    content = algorithm.content() | {"notes": asdict(notes)}
 
     def put() -> None:
-        _put(path, content, notes)
+        with files.named(f"the checkpoint {path} cannot be written"):
+            path.parent.mkdir(exist_ok=True)
+        saving.write(path, content)
         tidy(run, path, keep=keep)
         if (mark := read_mark(run)) is not None and not mark.has_checkpoints:
             write_mark(run, replace(mark, has_checkpoints=True))
@@ -81,63 +67,29 @@ def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
     return path
 
 
-def _put(path: Path, content: dict[str, Any], notes: Notes) -> None:
-    partial = path.with_name(f".{path.name}{files.PARTIAL}")
-    try:
-        path.parent.mkdir(exist_ok=True)
-        remove_checkpoint(partial)
-        partial.mkdir()
-        saving.write(partial / MODEL_FILE, content)
-        digests = {MODEL_FILE: digest((partial / MODEL_FILE).read_bytes())}
-        files.replace(partial / MANIFEST_FILE, sealed({"format": _FORMAT, "files": digests, "notes": asdict(notes)}))
-        _sync(partial)
-        remove_checkpoint(path)
-        if files.kind(path) is None:
-            partial.rename(path)
-        else:  # somebody else's things are in it; without its manifest a checkpoint is damaged, so that comes last
-            for name in (MODEL_FILE, MANIFEST_FILE):
-                (partial / name).rename(path / name)
-            _sync(path)
-        _sync(path.parent)
-    except OSError as error:
-        raise PgtsError(f"the checkpoint {path} cannot be written: {error.strerror}") from error
-    finally:
-        remove_checkpoint(partial)
-
-
 def read(path: Path) -> tuple[Notes, dict[str, Any]]:
     """The notes of a checkpoint and what `PGTS.save` wrote; nothing is decoded before its checksum is right.
 
     Raises:
-        Damaged: a file is missing, or does not hold what was written.
+        Damaged: it does not hold what was written.
         PgtsError: it is of another format.
     """
+    content = saving.read(path)
     try:
-        manifest, model = files.read(path / MANIFEST_FILE), files.read(path / MODEL_FILE)
-    except PgtsError as error:
-        raise Damaged(f"the checkpoint {path} is damaged: {error}") from error
-    content = unsealed(manifest)
-    if content is None:
-        raise Damaged(f"the checkpoint {path} is damaged: the checksum of {MANIFEST_FILE} does not fit")
-    if content.get("format") not in (_FORMAT, _FORMAT_0_1):
-        raise PgtsError(f"the checkpoint {path} has the format {content.get('format')}; this version reads {_FORMAT}")
-    if content.get("files") != {MODEL_FILE: digest(model)}:
-        raise Damaged(f"the checkpoint {path} is damaged: the checksum of {MODEL_FILE} does not fit")
-    try:
-        notes = _notes(content["notes"], is_old=content["format"] == _FORMAT_0_1)
+        notes = _notes(content.pop("notes"))
     except NO_STATE as error:
         reason = error if isinstance(error, PgtsError) else f"{type(error).__name__}: {error}"
         raise PgtsError(f"the checkpoint {path} is not of the form that this version writes: {reason}") from error
-    return notes, saving.decode(model, path / MODEL_FILE)
+    if path.name != checkpoint_name(notes.env_steps):
+        raise Damaged(f"{path} is damaged: it is the checkpoint of step {notes.env_steps}")
+    return notes, content
 
 
 _NOTES = {"config": dict, "versions": dict, "files": dict, "progress": dict, "finished": bool}
 
 
-def _notes(content: dict[str, Any], *, is_old: bool) -> Notes:
-    """The notes in a manifest, PgtsError where they cannot be; version 0.1 had no checksum of the files beside it."""
-    if is_old:
-        content["files"] = {METRICS_FILE: [content.pop("metrics_bytes"), None]}
+def _notes(content: dict[str, Any]) -> Notes:
+    """The notes in a checkpoint; PgtsError where they cannot be."""
     counts = ("iterations", "env_steps", "model_calls", "world_size")
     check_keys("its notes", content, {*_NOTES, *counts})
     for name in counts:
@@ -147,7 +99,7 @@ def _notes(content: dict[str, Any], *, is_old: bool) -> Notes:
             raise PgtsError(f"{name} is {content[name]!r}; it must be a {kind.__name__}")
     for name, (size, sha256) in content["files"].items():
         check_count(f"the length of {name}", size, least=0)
-        if not isinstance(sha256, str | None):
+        if not isinstance(sha256, str):
             raise PgtsError(f"the SHA-256 of {name} is {sha256!r}")
     return Notes(**content)
 
@@ -180,16 +132,5 @@ def tidy(run: Path, last: Path, *, keep: int) -> None:
     kept = [path for path in listed(run) if path.name <= last.name][-keep:]
     for path in listed(run):
         if path not in kept:
-            remove_checkpoint(path)
+            path.unlink(missing_ok=True)
     remove_partial(run)
-
-
-def _sync(folder: Path) -> None:
-    """Have the names in a folder on the disk; Windows does so by itself."""
-    if os.name == "nt":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

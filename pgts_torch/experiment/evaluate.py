@@ -7,7 +7,8 @@ import torch
 from pgts_torch.agent.evaluate import Evaluation, evaluate
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.checkpoint import MODEL_FILE, newest
+from pgts_torch.experiment.checkpoint import newest
+from pgts_torch.experiment.ownership import EARLIER_MODEL, earlier_checkpoints
 
 KINDS = {"deterministic": True, "sampled": False}
 """The kinds of evaluation: with the most probable actions (True), or with sampled ones."""
@@ -24,8 +25,10 @@ def evaluate_run(run: str | Path, *, episodes: int, seed: int, trust_imports: bo
 
 
 def last_checkpoint(run: Path) -> Path:
-    """Return the path of the model in the newest intact checkpoint of a run folder; PgtsError if there is none."""
+    """Return the path of the newest intact checkpoint of a run folder; PgtsError if there is none."""
     found = newest(run)
+    if found is None and (earlier := earlier_checkpoints(run)):
+        return earlier[-1] / EARLIER_MODEL
     if found is None:
         raise PgtsError(f"{run} holds no checkpoint; it must be the folder of a run")
-    return found[0] / MODEL_FILE
+    return found[0]

@@ -27,7 +27,6 @@ BEST_FILE = "best.pt"
 PICTURE_FILE = "policy.png"
 REPORT_FILE = "report.html"
 CHECKPOINTS = "checkpoints"
-MODEL_FILE, MANIFEST_FILE = "model.pt", "manifest.json"
 EVENTS_SUFFIX = ".pgts"
 
 _OWN_FILES = (
@@ -42,6 +41,10 @@ _OWN_FILES = (
     CONFIG_FILE,
 )
 _EVENTS = re.compile(r"events\.out\.tfevents\.\d+\..+")
+EARLIER_MODEL = "model.pt"
+_EARLIER_FILES = (EARLIER_MODEL, "manifest.json")
+"""What is in each checkpoint of version 0.1."""
+
 _FORMAT = 1
 
 
@@ -90,7 +93,7 @@ def read_mark(run: Path) -> Mark | None:
 
 def _earlier_mark(run: Path) -> Mark | None:
     """The mark of a run of version 0.1, which is recognised by a sealed manifest, its metrics or its versions."""
-    proofs = [_is_manifest(path / MANIFEST_FILE) for path in checkpoints(run)]
+    proofs = [_is_manifest(path / _EARLIER_FILES[1]) for path in earlier_checkpoints(run)]
     if not (any(proofs) or _are_metrics(run / METRICS_FILE) or _are_versions(run / VERSIONS_FILE)):
         return None
     config, has_checkpoints = _content(run / CONFIG_FILE), files.kind(run / CHECKPOINTS) == "folder"
@@ -181,7 +184,7 @@ def is_lock(raw: bytes) -> bool:
 def _is_partial(name: str) -> bool:
     """Whether this is the temporary name of a file of a run that is being written."""
     own = re.fullmatch(rf"\.(.+)\.\d+{re.escape(files.PARTIAL)}", name)
-    return own is not None and own[1] in (*_OWN_FILES, MODEL_FILE, MANIFEST_FILE)
+    return own is not None and (own[1] in _OWN_FILES or re.fullmatch(r"\d{12,}\.pt", own[1]) is not None)
 
 
 def is_events(name: str, mark: Mark = Mark()) -> bool:
@@ -194,11 +197,14 @@ def clear(run: Path, mark: Mark) -> list[str]:
 
     The summary is removed first and the configuration last, so that a half cleared run is an unfinished one.
     """
-    for path in checkpoints(run):
-        remove_checkpoint(path)
     remove_partial(run)
-    with suppress(OSError):  # missing, or files of the user are in it
-        (run / CHECKPOINTS).rmdir()
+    folders = [*earlier_checkpoints(run), *_in_checkpoints(run, rf"\.\d{{12,}}{re.escape(files.PARTIAL)}")]
+    for path in [*checkpoints(run), *(part for folder in folders for part in _earlier_files(folder))]:
+        with suppress(OSError):
+            path.unlink()
+    for path in [*folders, run / CHECKPOINTS]:
+        with suppress(OSError):  # missing, or files of the user are in it
+            path.rmdir()
     ours = [name for name in _names(run) if name != MARK_FILE and _is_removable(run / name, mark)]
     for name in sorted(ours, key=lambda name: (name == CONFIG_FILE, name != SUMMARY_FILE)):
         with files.named(f"{run / name} cannot be removed"):
@@ -222,39 +228,39 @@ def _is_removable(path: Path, mark: Mark) -> bool:
     return path.name in _OWN_FILES or is_events(path.name, mark)
 
 
+def checkpoint_name(env_steps: int) -> str:
+    """The name of the checkpoint of this step: names are in the order of steps."""
+    return f"{env_steps:012d}.pt"
+
+
 def checkpoints(run: Path) -> list[Path]:
-    """The checkpoint folders of a run, oldest first, intact or damaged."""
-    if files.kind(run / CHECKPOINTS) != "folder":
-        return []
-    named = [run / CHECKPOINTS / name for name in _names(run / CHECKPOINTS) if re.fullmatch(r"\d{12,}", name)]
-    return [path for path in named if files.kind(path) == "folder" and _has_model(path)]
+    """The checkpoints of a run, oldest first, intact or damaged."""
+    return [path for path in _in_checkpoints(run, r"\d{12,}\.pt") if files.kind(path) == "file"]
 
 
-def _has_model(path: Path) -> bool:
-    return any(files.kind(path / name) is not None for name in (MODEL_FILE, MANIFEST_FILE))
+def earlier_checkpoints(run: Path) -> list[Path]:
+    """Those of version 0.1, each a folder of a model and a manifest, oldest first. They can be evaluated, but a
+    training does not go on from them."""
+    return [path for path in _in_checkpoints(run, r"\d{12,}") if any(map(files.kind, _earlier_files(path)))]
 
 
-def remove_checkpoint(path: Path) -> None:
-    """Remove the files of a checkpoint, and its folder if it is then empty. What cannot be removed stays."""
-    if files.kind(path) != "folder":
-        return
-    with suppress(OSError):
-        for name in _names(path):
-            if name in (MODEL_FILE, MANIFEST_FILE) or _is_partial(name):
-                (path / name).unlink()
-        path.rmdir()
+def _earlier_files(path: Path) -> list[Path]:
+    return [path / name for name in _EARLIER_FILES] if files.kind(path) == "folder" else []
+
+
+def _in_checkpoints(run: Path, name: str) -> list[Path]:
+    """What has such a name in the folder of checkpoints."""
+    folder = run / CHECKPOINTS
+    names = _names(folder) if files.kind(folder) == "folder" else []
+    return [folder / each for each in names if re.fullmatch(name, each)]
 
 
 def remove_partial(run: Path) -> None:
     """Remove half written files of a killed process. The caller must hold the lock."""
-    for name in filter(_is_partial, _names(run)):
-        if files.kind(run / name) == "file":
+    for path in [*(run / name for name in _names(run)), *_in_checkpoints(run, r"\..*")]:
+        if _is_partial(path.name) and files.kind(path) == "file":
             with suppress(OSError):
-                (run / name).unlink()
-    if files.kind(run / CHECKPOINTS) == "folder":
-        for name in _names(run / CHECKPOINTS):
-            if re.fullmatch(rf"\.\d{{12,}}{re.escape(files.PARTIAL)}", name):
-                remove_checkpoint(run / CHECKPOINTS / name)
+                path.unlink()
 
 
 def sealed(content: Mapping[str, Any]) -> bytes:

@@ -25,6 +25,7 @@ from pgts_torch.experiment.ownership import (
     SUMMARY_FILE,
     Mark,
     digest,
+    earlier_checkpoints,
     is_events,
     read_mark,
 )
@@ -72,7 +73,7 @@ class Start:
         """Have the algorithm go on from here; PgtsError, naming the part, where the state is none of such a model."""
         try:
             algorithm.load_state_dict(dict(self.state))
-            if not algorithm.num_env_steps == self.notes.env_steps == int(self.path.name):
+            if algorithm.num_env_steps != self.notes.env_steps:
                 raise PgtsError(f"its model is of step {algorithm.num_env_steps}, its notes of {self.notes.env_steps}")
         except PgtsError as error:
             raise PgtsError(f"{self.path}: {error}") from error
@@ -100,6 +101,10 @@ def find(
     except PgtsError as error:
         raise PgtsError(f"{error}\n{_ADVICE}") from error
     if found is None:
+        if earlier := earlier_checkpoints(run):
+            raise PgtsError(
+                f"{earlier[-1]} was written by version 0.1, which trains otherwise: go on with that one, or {_ADVICE}"
+            )
         if mark is not None and mark.has_checkpoints:
             raise PgtsError(f"run.dir {run} has lost its checkpoints and cannot go on: bring them back, or {_ADVICE}")
         if files.kind(run / CONFIG_FILE) is not None:
@@ -107,8 +112,6 @@ def find(
             print(f"note: the run in {run} was ended before its first checkpoint; it starts anew", file=sys.stderr)
         return None
     path, notes, content = found
-    if notes.files.get(METRICS_FILE, (0, ""))[1] is None:
-        raise PgtsError(f"{path} was written by version 0.1, which trains otherwise: go on with that one, or {_ADVICE}")
     _check_config(config, notes.config, run)
     _check_metrics(run, notes, path)
     _complain(_other_versions(notes.versions, path), strict=strict)
@@ -201,19 +204,19 @@ def _shown(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _changed(path: Path, size: int, sha256: str | None) -> str:
+def _changed(path: Path, size: int, sha256: str) -> str:
     """What has happened to a file since it had this length and SHA-256, beside that it has grown; or nothing."""
     if files.kind(path) != "file":
         return f"{path} is missing"
     if (now := path.stat().st_size) < size:
         return f"{path} has {now} bytes; it had {size}"
-    if sha256 is not None and GrowingDigest(path).now(size) != (size, sha256):
+    if GrowingDigest(path).now(size) != (size, sha256):
         return f"{path} was changed"
     return ""
 
 
 def _check_metrics(run: Path, notes: checkpoint.Notes, taken: Path) -> None:
-    size, sha256 = notes.files.get(METRICS_FILE, (0, None))
+    size, sha256 = notes.files.get(METRICS_FILE, (0, ""))
     if size and (change := _changed(run / METRICS_FILE, size, sha256)):
         raise PgtsError(f"{change} when {taken} was written; {_ADVICE}".replace("changed when", "changed since"))
 

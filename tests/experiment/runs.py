@@ -1,9 +1,12 @@
 """A small run of the command line, what it leaves, and how it is struck while it trains."""
 
+import io
 import json
 import os
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
@@ -38,10 +41,17 @@ def train_under_fire(folder: Path, *numbers: int, rank: int = 0) -> int:
     return main(arguments(folder))
 
 
+def dumped(content: Any) -> bytes:
+    """Every bit of what a checkpoint holds beside its notes."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue()
+
+
 def left(folder: Path) -> dict[str, Any]:
     """Every byte that a run leaves, without what the clock, the process and the name of the folder change."""
     files: dict[str, Any] = {name: (folder / name).read_bytes() for name in ("best.pt", "versions.json")}
-    files |= {str(path.relative_to(folder)): (path / "model.pt").read_bytes() for path in checkpoint.listed(folder)}
+    files |= {path.name: dumped(checkpoint.read(path)[1]) for path in checkpoint.listed(folder)}
     summary = json.loads((folder / "summary.json").read_text())
     lines = read_metrics(folder)
     for line in lines:

@@ -1,6 +1,5 @@
 """Only files that a run has made are ever replaced or removed, whatever else lies in its folder."""
 
-import json
 import os
 import subprocess
 import time
@@ -10,15 +9,16 @@ from pathlib import Path
 import pytest
 
 from pgts_torch import PGTS, EvalCallback
+from pgts_torch.agent import saving
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint, opening, run
-from pgts_torch.experiment.checkpoint import MODEL_FILE
 from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.locking import RunLock
-from pgts_torch.experiment.ownership import MANIFEST_FILE, MARK_FILE, digest, sealed
+from pgts_torch.experiment.ownership import MARK_FILE, digest, sealed
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
+from tests.experiment.runs import dumped
 from tests.forks import ForkedCommand
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -124,7 +124,7 @@ def test_a_run_that_is_overwritten_leaves_nothing_of_the_one_before(here, capsys
     run.train(load(None, ["--run.dir=run", "--run.overwrite", *SHORT, "--total_steps=5", "--seed=3"]))
     after = tree(here / "run")
     new = {".lock", "checkpoints", "config.yaml", MARK_FILE, "metrics.jsonl", "policy.png", "summary.json"}
-    saved = {f"checkpoints/000000000005{name}" for name in ("", "/manifest.json", "/model.pt")}
+    saved = {"checkpoints/000000000005.pt"}
     assert after.keys() == new | saved | {"versions.json"}
     assert {"best.pt", "report.html", "checkpoints/.000000000020.partial"} < before.keys()
     assert "note" not in capsys.readouterr().err
@@ -134,12 +134,15 @@ def age(folder: Path) -> None:
     """Make of a run folder what version 0.1 would have left."""
     (folder / MARK_FILE).unlink()
     for path in checkpoint.listed(folder):
-        model = path / MODEL_FILE
-        model.write_bytes(model.read_bytes().replace(b"pgts_torch 4", b"pgts_torch 3", 1))
-        content = json.loads((path / MANIFEST_FILE).read_text())["content"]
-        content["notes"]["metrics_bytes"] = content["notes"].pop("files")["metrics.jsonl"][0]
-        sealed_again = sealed({**content, "format": 2, "files": {MODEL_FILE: digest(model.read_bytes())}})
-        (path / MANIFEST_FILE).write_bytes(sealed_again)
+        content, earlier = saving.read(path), path.with_suffix("")
+        notes = content.pop("notes")
+        notes["metrics_bytes"] = notes.pop("files")["metrics.jsonl"][0]
+        raw = saving.sealed(dumped(content), 3)
+        path.unlink()
+        earlier.mkdir()
+        (earlier / "model.pt").write_bytes(raw)
+        manifest = {"format": 2, "files": {"model.pt": digest(raw)}, "notes": notes}
+        (earlier / "manifest.json").write_bytes(sealed(manifest))
     for path in folder.glob("events.*.pgts"):
         path.rename(path.with_suffix(".0"))
 
@@ -156,8 +159,7 @@ def test_a_run_of_an_earlier_version_is_known_by_what_it_has_left(left, here, mo
     put(folder, notes_md="mine")
     before = tree(folder)
     if left == "checkpoints":
-        with pytest.warns(UserWarning, match="was saved by version 0.1"):
-            assert main(["train", *SHORT, *arguments, "--run.dir=run"]) == 2
+        assert main(["train", *SHORT, *arguments, "--run.dir=run"]) == 2
         mistake = "error: run/checkpoints/000000000005 was written by version 0.1, which trains otherwise: go on with"
         assert mistake in capsys.readouterr().err
         assert {name: content for name, content in tree(folder).items() if name != ".lock"} == {
@@ -268,7 +270,7 @@ def test_nothing_is_written_into_a_folder_that_took_the_place_of_the_runs(here, 
     assert "error: run.dir run was moved or replaced while this run had it" in capsys.readouterr().err
     files = {name: content for name, content in tree(here / "run").items() if content is not None}
     assert files == {"thesis.tex": b"mine", "checkpoints/000000000001/model.pt": b"mine"}
-    assert [path.name for path in checkpoint.listed(here / "moved")] == ["000000000005"]
+    assert [path.name for path in checkpoint.listed(here / "moved")] == ["000000000005.pt"]
 
 
 @pytest.mark.fault("edited configuration of a run")

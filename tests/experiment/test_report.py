@@ -243,10 +243,10 @@ def test_a_run_without_metrics_and_checkpoints_has_a_page_that_says_so(run, empt
 
 
 def test_a_damaged_checkpoint_is_named_and_the_one_before_it_is_shown(run):
-    newest = run / "checkpoints" / "000000000300"
-    (newest / "model.pt").write_bytes(b"damaged")
+    newest = run / "checkpoints" / "000000000300.pt"
+    newest.write_bytes(newest.read_bytes()[:-1])
     page, answer = report(run)
-    assert [f"the checkpoint {newest} is damaged: the checksum of model.pt does not fit."] == answer["notes"]
+    assert [f"{newest} is damaged: its checksum does not fit its content."] == answer["notes"]
     assert "after 240 environment steps" in page.text
 
 

@@ -21,7 +21,6 @@ from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import last_checkpoint
 from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.locking import RunLock
-from pgts_torch.experiment.ownership import digest, sealed
 from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
 from tests.support import same_values
@@ -174,7 +173,7 @@ def test_an_environment_of_another_size_is_refused_tensor_by_tensor_and_nothing_
     with monkeypatch.context() as patch:
         patch.setattr(run, "build", build_larger)
         assert main(arguments()) == 2
-    where = "in cut/checkpoints/000000000120 it is"
+    where = "in cut/checkpoints/000000000120.pt it is"
     assert capsys.readouterr().err.splitlines()[1:] == [
         f"error: policy.logits_SA has the shape (7, 2); {where} (5, 2)",
         f"error: critic.value_C has the shape (7,); {where} (5,)",
@@ -218,7 +217,7 @@ def test_what_ended_a_training_is_said_also_where_its_process_was_killed_before_
 
 def test_what_no_bit_of_training_depends_on_may_differ(cut, tmp_path, capsys):
     assert main(arguments("--name", "x", "--log.keep", "1", "--log.every", "2", "--eval.every", "60")) == 0
-    assert "going on from cut/checkpoints/000000000120" in capsys.readouterr().err
+    assert "going on from cut/checkpoints/000000000120.pt" in capsys.readouterr().err
     run.train(configured(tmp_path / "whole", *QUIET))
     assert same_values(*(PGTS.load(last_checkpoint(tmp_path / name)).state_dict() for name in ("cut", "whole")))
     assert len(checkpoint.listed(cut)) == 1
@@ -230,7 +229,7 @@ def test_a_run_goes_on_by_its_folder_alone_and_then_is_finished(cut, capsys):
     moved = cut.rename("moved")
     assert main(["train", "--resume", "moved", "--json"]) == 0
     out, err = capsys.readouterr()
-    assert "going on from moved/checkpoints/000000000120" in err
+    assert "going on from moved/checkpoints/000000000120.pt" in err
     assert json.loads(out)["env_steps"] == 300
     before = content(moved)
     for again in (["--resume", "moved"], [*arguments()[1:], "--run.dir", "moved"]):
@@ -259,15 +258,23 @@ def test_overwriting_starts_anew(flag, cut):
 @pytest.mark.fault("damaged last checkpoint")
 def test_after_a_damaged_checkpoint_the_one_before_leads_to_the_same_values(cut, tmp_path, capsys):
     newest = checkpoint.listed(cut)[-1]
-    (newest / checkpoint.MODEL_FILE).write_bytes(b"")
+    newest.write_bytes(newest.read_bytes()[:-1])
     before = content(cut)
     assert main(arguments("--strict-resume")) == 2
-    damaged = f"the checkpoint {newest} is damaged: the checksum of model.pt does not fit"
+    damaged = f"{newest} is damaged: its checksum does not fit its content"
     assert f"error: {damaged}\n" in capsys.readouterr().err
     assert content(cut) == before
     assert main(arguments()) == 0
     err = capsys.readouterr().err
-    assert f"warning: {damaged}\ngoing on from cut/checkpoints/000000000060" in err
+    assert f"warning: {damaged}\ngoing on from cut/checkpoints/000000000060.pt" in err
+    run.train(configured(tmp_path / "whole", *QUIET))
+    assert same_values(left(cut), left(tmp_path / "whole"))
+
+
+@pytest.mark.fault("last checkpoint missing")
+def test_without_the_last_checkpoint_the_one_before_leads_to_the_same_values(cut, tmp_path):
+    checkpoint.listed(cut)[-1].unlink()
+    assert main(arguments("--strict-resume")) == 0
     run.train(configured(tmp_path / "whole", *QUIET))
     assert same_values(left(cut), left(tmp_path / "whole"))
 
@@ -277,7 +284,7 @@ def test_after_a_damaged_checkpoint_the_one_before_leads_to_the_same_values(cut,
     ("damage", "said"),
     [
         (lambda raw: raw[:100], "has 100 bytes; it had "),
-        (lambda raw: raw.replace(b"0.5", b"0.6", 1), "was changed since cut/checkpoints/000000000120 was written"),
+        (lambda raw: raw.replace(b"0.5", b"0.6", 1), "was changed since cut/checkpoints/000000000120.pt was written"),
         (lambda raw: raw[:40] + bytes([raw[40] ^ 1]) + raw[41:], "was changed since"),
         (None, "is missing"),
     ],
@@ -381,13 +388,10 @@ def test_lost_events_are_made_anew_from_the_metrics(damage, tmp_path, monkeypatc
 
 
 def resealed(path: Path, change: Callable[[dict[str, Any], dict[str, Any]], object]) -> None:
-    """Change what a checkpoint says, its notes and its model, with all checksums right."""
-    manifest = json.loads((path / "manifest.json").read_text())["content"]
-    saved = saving.read(path / "model.pt")
-    change(manifest["notes"], saved["state"])
-    saving.write(path / "model.pt", saved)
-    manifest["files"] = {"model.pt": digest((path / "model.pt").read_bytes())}
-    (path / "manifest.json").write_bytes(sealed(manifest))
+    """Change what a checkpoint says, its notes and its model, with a checksum that is right."""
+    saved = saving.read(path)
+    change(saved["notes"], saved["state"])
+    saving.write(path, saved)
 
 
 @pytest.mark.fault("checkpoint that says what cannot be")
@@ -424,7 +428,7 @@ def test_a_checkpoint_that_says_what_cannot_be_is_refused_by_name(change, part, 
 def test_other_versions_are_a_warning_or_refused(cut, monkeypatch, capsys):
     now = tracking.versions()
     monkeypatch.setattr(resume, "versions", lambda: now | {"torch": "0.1"})
-    line = f"torch is 0.1; cut/checkpoints/000000000120 was written with {now['torch']}"
+    line = f"torch is 0.1; cut/checkpoints/000000000120.pt was written with {now['torch']}"
     assert main(arguments("--strict-resume")) == 2
     assert f"error: {line}: the last bits may differ\n" in capsys.readouterr().err
     assert main(arguments()) == 0

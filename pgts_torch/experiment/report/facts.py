@@ -49,7 +49,7 @@ def gather(run: Path, *, trust_imports: bool = False) -> tuple[dict[str, Any], P
     algorithm = None
     try:
         if last is not None:
-            algorithm = PGTS.load(path / checkpoint.MODEL_FILE, device="cpu", trust_imports=trust_imports)
+            algorithm = PGTS.load(path, device="cpu", trust_imports=trust_imports)
     except PgtsError as error:
         notes.append(f"The trained policy cannot be loaded, so there are no pictures of it: {error}.")
     facts = {
@@ -120,6 +120,8 @@ def _last_checkpoint(run: Path, notes: list[str]) -> tuple[Path, checkpoint.Note
             return path, checkpoint.read(path)[0]
         except PgtsError as error:
             notes.append(f"{error}.")
+    if ownership.earlier_checkpoints(run):
+        notes.append("The checkpoints are of version 0.1, which `pgts evaluate` reads and this page does not.")
     notes.append("There is no intact checkpoint, so nothing can be said about the trained policy itself.")
     return run, None
 
@@ -165,10 +167,9 @@ def _applies(when: str, values: Values) -> bool:
 
 
 def _files(run: Path) -> Iterator[tuple[str, int]]:
-    """Yield name and size in bytes of each file of a run, and of each checkpoint as a whole."""
+    """Yield name and size in bytes of each file of a run."""
     hidden = (ownership.CHECKPOINTS, ownership.LOCK_FILE, ownership.MARK_FILE, ownership.REPORT_FILE)
     for path in sorted([*run.iterdir(), *checkpoint.listed(run)]):
         if path.name not in hidden and not path.name.endswith(PARTIAL):
-            parts = path.glob("*") if path.parent != run else [path]
             with suppress(FileNotFoundError):  # a run that is still training removes old checkpoints
-                yield str(path.relative_to(run)), sum(part.stat().st_size for part in parts)
+                yield str(path.relative_to(run)), path.stat().st_size
