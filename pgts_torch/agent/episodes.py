@@ -7,6 +7,7 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.snapshots import each_of
 from pgts_torch.models.steps import (
     check_discounts,
     check_rewards,
@@ -37,7 +38,7 @@ class Episodes:
     def __init__(self, env: VectorEnv, *, gamma: float, seeds: list[int]) -> None:
         self._env, self._gamma, self._seeds = env, gamma, seeds
         self._one_by_one = isinstance(env, SyncVectorEnv) and type(env).step is SyncVectorEnv.step
-        self._names_discounts = [names_discounts(e) for e in (env.envs if isinstance(env, SyncVectorEnv) else [env])]
+        self._names_discounts = [names_discounts(one) for one in each_of(env)]
         self._over_B = np.zeros(env.num_envs, dtype=bool)
         self._reward_B = np.zeros(env.num_envs)
         self._stepping: int | None = None  # the index of the environment whose step is running

@@ -32,7 +32,7 @@ from pgts_torch.models.environments import EnvSource, kinds_of
 from pgts_torch.models.fidelity import why_not
 from pgts_torch.models.published import publishes_table, table_of
 from pgts_torch.models.simulator import SimulatorModel
-from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.trial import dynamics_contradiction
 from pgts_torch.models.walks import Setup
 from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_of, wrappers_of
@@ -263,9 +263,8 @@ def _simulator(request: _Request) -> SimulatedWorld:
 
 def _normalizing_wrapper(env: VectorEnv) -> str:
     """The name of a wrapper that normalises by running statistics; empty where there is none."""
-    around = wrappers_of(env.envs[0]) if isinstance(env, SyncVectorEnv) else []
     kinds = NormalizeObservation, NormalizeReward
-    return next((type(wrapper).__name__ for wrapper in around if isinstance(wrapper, kinds)), "")
+    return next((type(wrapper).__name__ for wrapper in wrappers_of(each_of(env)[0]) if isinstance(wrapper, kinds)), "")
 
 
 def _own(request: _Request, names: Iterable[str]) -> str:

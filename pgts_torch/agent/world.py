@@ -21,6 +21,7 @@ from pgts_torch.models.classic import ClassicModel
 from pgts_torch.models.environments import draws_its_own
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.simulator import SimulatorModel
+from pgts_torch.models.snapshots import each_of
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.tabular.mdp import TabularMDP
 
@@ -98,8 +99,7 @@ class World:
     @cached_property
     def draws_its_own(self) -> bool:
         """Whether the environments are known to use random generators of their own only."""
-        each = self.env.envs if isinstance(self.env, SyncVectorEnv) else [self.env]
-        return all(map(draws_its_own, each))
+        return all(map(draws_its_own, each_of(self.env)))
 
 
 class ModelWorld(World, ABC):

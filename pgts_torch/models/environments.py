@@ -18,7 +18,7 @@ from gymnasium.wrappers import TimeLimit
 from pgts_torch.errors import PgtsError, check_count, failure
 from pgts_torch.models.actions import Numbered, is_numbered, numbered
 from pgts_torch.models.attributes import Unlike, own_to_each, unlike
-from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.wrappers import wrappers_of
 from pgts_torch.seeding import numpy_stream
 
@@ -144,8 +144,8 @@ class EnvSource:
             makers = [lambda k=k: self.like(k) for k in range(num_envs)]
             made = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
         check_vector_env(made)
-        if isinstance(self.given, SyncVectorEnv):
-            self._check_like(self.given.envs, made.envs)
+        if self.given is not None:
+            self._check_like(each_of(self.given), made.envs)
         return made
 
     def like(self, k: int = 0) -> gymnasium.Env:
@@ -159,15 +159,15 @@ class EnvSource:
     def own_actions(self, envs: VectorEnv) -> np.ndarray | None:
         """What the numbers of the actions stand for in environments that `make` gave, a row each; None: the numbers
         themselves."""
-        outermost = envs.envs[0] if isinstance(envs, SyncVectorEnv) and envs is not self.given else None
-        return np.stack(outermost.actions) if isinstance(outermost, Numbered) else None
+        outermost = each_of(envs)[0]
+        return np.stack(outermost.actions) if isinstance(outermost, Numbered) and envs is not self.given else None
 
     @cached_property
     def time_limit(self) -> int | None:
         """The most steps of an episode, as registered or by a TimeLimit around the environment; None: no limit."""
         spec, limits = self._spec, list[int]()
         if spec is None and self._makers:
-            env = self.given.envs[0] if isinstance(self.given, SyncVectorEnv) else self.make_one()
+            env = self.make_one() if self.given is None else each_of(self.given)[0]
             spec = env.spec
             limits = [each._max_episode_steps for each in wrappers_of(env) if isinstance(each, TimeLimit)]
         limit = min(limits, default=None) if spec is None else spec.max_episode_steps
@@ -221,7 +221,7 @@ def check_vector_env(env: VectorEnv) -> None:
 
 def close_environments(env: VectorEnv) -> None:
     """Close them all; what one of them raises is a warning, for all that was wanted of it is done."""
-    for one in env.envs if isinstance(env, SyncVectorEnv) else [env]:
+    for one in each_of(env):
         try:
             one.close()
         except BaseException as error:

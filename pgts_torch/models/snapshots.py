@@ -18,7 +18,7 @@ merge surest.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,9 +127,13 @@ def _avalanche(x: int) -> int:
     return x ^ (x >> 31)
 
 
+def each_of(env: gymnasium.Env | VectorEnv) -> Sequence[Any]:
+    """The environments that step together, where one can look at each; else the environment itself, alone."""
+    return env.envs if isinstance(env, SyncVectorEnv) else [env]
+
+
 def env_name(env: gymnasium.Env | VectorEnv) -> str:
     """The id of an environment, or the name of its class where it has none; of several that step together, that of the
     first."""
-    if env.spec is None and isinstance(env, SyncVectorEnv):
-        env = env.envs[0]
+    env = each_of(env)[0] if env.spec is None else env
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__

@@ -20,6 +20,7 @@ from pgts_torch.models.base import (
     Transitions,
     step_text,
 )
+from pgts_torch.models.snapshots import each_of
 from pgts_torch.seeding import uniform
 from pgts_torch.tabular.mdp import TabularMDP
 from pgts_torch.tabular.stationary import highest_value, lowest_value
@@ -157,7 +158,7 @@ def tabular_truth(env: gymnasium.Env | gymnasium.vector.VectorEnv, *, gamma: flo
         MissingModel: the environment has neither.
     """
     base: Any = env.unwrapped
-    single: Any = base.envs[0] if isinstance(base, gymnasium.vector.SyncVectorEnv) else base
+    single = each_of(base)[0]
     mdp = getattr(single.unwrapped, "mdp", None)
     if not isinstance(mdp, TabularMDP):
         return TabularMDP.from_gymnasium(single, gamma)
