@@ -1,4 +1,4 @@
-"""Advantages of the actions that were taken, in the form in which updates take those of all actions."""
+"""Advantages of the actions taken, in the form of advantages of all actions, which updates expect."""
 
 import torch
 from jaxtyping import Float, Int
@@ -11,11 +11,11 @@ from pgts_torch.agent.rollout import Rollout
 def gae(
     rollout: Rollout, v_TB: Float[Tensor, "T B"], next_v_TB: Float[Tensor, "T B"], lambda_: float
 ) -> Float[Tensor, "T B"]:
-    """Generalised advantage estimates (Schulman et al. 2016), as what the lambda-return is above v:
+    """Generalised advantage estimates (Schulman et al. 2016): the lambda-return minus v.
 
         A_t = G_t^lambda - v(s_t) = delta_t + gamma_t lambda A_{t+1},    delta_t = r_t + gamma_t v(s_{t+1}) - v(s_t)
 
-    Where an episode was cut, v(s_{t+1}) stands for the rest; where it terminated, nothing does.
+    Where an episode was cut off it is bootstrapped with v(s_{t+1}), but not where it terminated.
 
     Args:
         v_TB, next_v_TB: v(s_t) and v(s_{t+1}) of one critic.
@@ -27,7 +27,7 @@ def gae(
 def score_function(
     action_N: Int[Tensor, "N"], advantage_N: Float[Tensor, "N"], pi_NA: Float[Tensor, "N A"]
 ) -> Float[Tensor, "N A"]:
-    """The unbiased estimate of the advantages of all actions from one that was taken: A / pi(a|s) there, 0 elsewhere.
+    """The unbiased estimate of the advantages of all actions from the action taken: A / pi(a|s) for it, 0 for others.
 
         sum_a rho_a pi(a|s) adv(s, a) = rho_{a_t} A_t   for any numbers rho
 

@@ -1,4 +1,4 @@
-"""Parts of the algorithm from their options, and what the environment chooses where they are auto."""
+"""Make the parts of the algorithm from their options; where these are auto, the environment decides."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -33,7 +33,7 @@ from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
 
 Description = str | Mapping[str, Any] | Part
-"""Options; or their name, "ppo", or a mapping of plain values, {"type": "ppo", "clip_range": 0.1}."""
+"""Options; or their name, as "ppo"; or a mapping of plain values, as {"type": "ppo", "clip_range": 0.1}."""
 
 _Choices = Mapping[type[Part], Callable[..., Any]]
 
@@ -50,7 +50,7 @@ _UPDATES: _Choices = {
 
 
 def make_device(device: torch.device | str) -> torch.device:
-    """A device; PgtsError unless torch can compute there."""
+    """Return the torch device; PgtsError unless torch can compute there."""
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
@@ -60,7 +60,7 @@ def make_device(device: torch.device | str) -> torch.device:
 
 
 def chosen(options: Training, world: World) -> Training:
-    """The options, with what is auto chosen by the environment: tables where its states are numbered, else networks.
+    """Return the options with auto replaced: by tables where observations are numbered states, else by networks.
 
     Raises:
         PgtsError: options that do not go together.
@@ -78,14 +78,14 @@ def chosen(options: Training, world: World) -> Training:
 
 
 def make_search(options: Kind, world: World) -> Search:
-    """A search of the world's model; MissingModel where there is none."""
+    """Make a search in the world's model; MissingModel where there is none."""
     if world.model is None:
-        raise MissingModel("the environment has no model that a lookahead could ask")
+        raise MissingModel("the environment has no model that a lookahead could query")
     return _made(_SEARCHES, options)(world.model, options)
 
 
 def make_policy(options: Part, world: World, *, seed: int) -> Policy:
-    """A table, or a network."""
+    """Make a policy, a table or a network."""
     if isinstance(options, Network):
         return NetworkPolicy(world.observation_space, world.num_actions, options, seed=seed, device=world.device)
     S, A = _tabular(world, f"the policy {_type(options)!r}").mdp_shape
@@ -93,7 +93,7 @@ def make_policy(options: Part, world: World, *, seed: int) -> Policy:
 
 
 def make_update(options: Part, policy: Policy) -> Update:
-    """An update of such a policy."""
+    """Make an update for this policy."""
     if isinstance(options, Mirror) and isinstance(policy, NetworkPolicy):
         return NetworkMirrorUpdate(options)
     return _made(_UPDATES, options)(options)
@@ -107,7 +107,7 @@ def make_critic(
     *,
     seed: int,
 ) -> Critic:
-    """A critic."""
+    """Make a critic for this policy."""
     if isinstance(options, NetworkValues):
         trunk = None
         if isinstance(options.network, SharedNetwork):
@@ -133,7 +133,7 @@ def make_critic(
 
 
 def check_parts(arguments: Mapping[str, Any], world: World, policy: Policy, update: Update) -> None:
-    """PgtsError where parts do not fit each other, or where one of the arguments of `PGTS` would have no effect."""
+    """PgtsError where parts do not fit each other, or the gamma given to `PGTS` would have no effect."""
     update.check(policy)
     if isinstance(policy, TabularPolicy):
         shape, found = _tabular(world, "the policy").mdp_shape, (policy.num_states, policy.num_actions)
@@ -144,7 +144,7 @@ def check_parts(arguments: Mapping[str, Any], world: World, policy: Policy, upda
 
 
 def plain(arguments: Mapping[str, Any], options: Training) -> dict[str, Any]:
-    """The arguments of `PGTS` as plain values; PgtsError where a part was given as an object."""
+    """Return the arguments of `PGTS` as plain values; PgtsError where a part was given as an object."""
     for name in ("policy", "critic", "update"):
         if not isinstance(arguments[name], str | Mapping | Part | None):
             raise PgtsError(f"{name} was given as {arguments[name]!r}; only models made from descriptions can be saved")

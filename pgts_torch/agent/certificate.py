@@ -140,7 +140,7 @@ class Certificates:
             v_of_starts = v_N[torch.searchsorted(state_N, starts)]
             return _Starts(starts, count_N.double() / num_episodes, v_of_starts.double(), num_episodes)
         starts = torch.nonzero(start_S).flatten()
-        if not self._critic.draws_when_asked:
+        if not self._critic.samples_when_queried:
             v_of_starts = self._critic.v(self._world.observe(starts))
         elif bool(torch.isin(starts, state_N).all()):
             v_of_starts = v_N[torch.searchsorted(state_N, starts)]

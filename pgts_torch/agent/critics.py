@@ -1,4 +1,4 @@
-"""Estimates of Q^pi or v^pi, each from what it is allowed to see."""
+"""Critics: estimates of v^pi or Q^pi; here the exact one, tables, and rollouts in the model."""
 
 import math
 from abc import ABC, abstractmethod
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.policies import Policy, fitting, listed
+from pgts_torch.agent.policies import Policy, exact_probs, fitting
 from pgts_torch.agent.rollout import Rollout, simulated_returns
 from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import NotFinite, PgtsError
@@ -27,24 +27,24 @@ Learned = TypeVar("Learned")
 class Critic(ABC):
     """An estimate of the values of the policy it was last fitted to.
 
-    options: what it was made from; None for a critic of the caller's own kind.
-    target: whether a lookahead stands on its v (one more level) or its Q.
-    draws_when_asked: whether it draws when it is asked for values, not when it is fitted.
-    is_exact: whether its values are those of the policy, but for `error`.
-    error: by how much the mean of its v over the start distribution may miss J^pi; infinite where it is an estimate.
-    dtype: that its values are rounded to.
+    options: what it was made from; None for a critic of the caller's own class.
+    target: whether the leaves of a lookahead take its v (with one more level) or its Q.
+    samples_when_queried: whether it uses random numbers when values are queried, and not when it is fitted.
+    is_exact: whether its values are those of the policy, up to rounding (`error`).
+    error: an upper bound on |mu^T v - J^pi|; infinite unless the critic is exact.
+    dtype: of its values.
     """
 
     options: Any = None
     target: Target
-    draws_when_asked: bool = False
+    samples_when_queried: bool = False
     is_exact: bool = False
     error: float = math.inf
     dtype: torch.dtype = torch.float64
 
     @abstractmethod
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
-        """Estimate the values of `policy`, which made `rollout`; the losses, by name."""
+        """Fit the estimate to `policy`, which collected `rollout`. Return the losses, by name."""
 
     @abstractmethod
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -52,7 +52,7 @@ class Critic(ABC):
 
     @abstractmethod
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
-        """Estimates of Q^pi(s, .). Only where target is "q" does a lookahead ask for them."""
+        """Estimates of Q^pi(s, .). A lookahead queries them only where target is "q"."""
 
     def values(self, rollout: Rollout) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
         """v(s_t) and v(s_{t+1}), as `Rollout.values`."""
@@ -60,29 +60,29 @@ class Critic(ABC):
 
     @property
     def model_calls(self) -> int:
-        """How many (state, action) this critic has asked of a model so far."""
+        """The number of (state, action) that this critic has queried a model for so far."""
         return 0
 
     def state_dict(self) -> dict[str, Any]:
-        """What has been learned, as tensors on the CPU and plain values."""
+        """Return what was learned, as tensors on the CPU and plain values."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave."""
+        """Load what `state_dict` returned."""
         if state:
-            raise PgtsError(f"{type(self).__name__} learns nothing; it cannot take over {sorted(state)}")
+            raise PgtsError(f"{type(self).__name__} learns nothing; it cannot load {sorted(state)}")
 
 
 @final
 class ExactCritic(Critic):
-    """v^pi and Q^pi of the true MDP. For validation: what is trained with it has learned from the truth.
+    """The exact v^pi and Q^pi, from the tables of the environment. For validation, and for planning in a known MDP.
 
-    `error` is what rounding may have done to the solution v of its Bellman equation:
+    `error` bounds the rounding of the solution v of the Bellman equation:
 
         |mu^T v - J^pi| = |sum_s d^pi(s) (T^pi v - v)(s)| <= 2 sum_s d(s) ( |T^pi v - v|(s) + (A + K + 4) eps size )
 
-    T^pi v is computed, so eps size stands for each of its operations, size = max |r| + max |v|; the factor 2 is for the
-    rounding of d itself, which is far less.
+    with size = max |r| + max |v|. The term with eps is for the rounding of T^pi v, an eps size for each operation; the
+    factor 2 is for the much smaller rounding of d.
     """
 
     is_exact = True
@@ -93,12 +93,12 @@ class ExactCritic(Critic):
         self._evaluation: exact.Evaluation | None = None
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
-        """Solve the Bellman equation of the policy, which sees the states themselves; the rollout is not looked at."""
-        self.solve(listed(policy, torch.arange(self.mdp.num_states, device=rollout.alive_TB.device)))
+        """Solve the Bellman equation of the policy, whose observations are states; the episodes are not used."""
+        self.solve(exact_probs(policy, torch.arange(self.mdp.num_states, device=rollout.alive_TB.device)))
         return {}
 
     def solve(self, pi_SA: Float[Tensor, "S A"]) -> None:
-        """The values of this policy, from now on."""
+        """Solve the Bellman equation of a policy; `v` and `q` are its values from then on."""
         pi_SA = exact.check_policy(self.mdp, pi_SA)
         self._evaluation = evaluation = exact.evaluate(self.mdp, pi_SA)
         rewards_SA, allowed_SA = self.mdp.outcomes.reward_NA, pi_SA > 0
@@ -116,19 +116,19 @@ class ExactCritic(Critic):
 
 @final
 class TabularCritic(Critic):
-    """One number for each state, or each (state, action), moved toward targets from rollouts.
+    """A table with a value for each state, or each (state, action), moved toward targets from rollouts.
 
         V(s) <- V(s) + alpha (mean of the targets at s - V(s))
 
-    What was never visited is worth what all visits of the iteration are on average, or a given number.
+    Cells that were never visited have the mean value of the iteration's visits, or a given one.
 
     Args:
         num_states, num_actions: the shape of the table.
-        options: with `step_size` "mean" alpha is the share of the new visits among all so far, which makes the estimate
-            the mean of all targets, and suits a policy that stands still. With `initial` "mean" cells that were never
-            visited are worth the w that makes the mean of an iteration's targets w, where w stands for the rest of
-            episodes that were cut in such a cell. A constant added to all rewards of a continuing task adds constant /
-            (1 - gamma) to it, as to all values; a factor multiplies it.
+        options: with `step_size` "mean" alpha is the number of new visits divided by that of all visits so far, so that
+            the estimate is the mean of all targets; this suits a policy that is not updated. With `initial` "mean"
+            cells that were never visited have the value w for which the mean of the iteration's targets is w, where
+            episodes that were cut off in such a cell are bootstrapped with w. A constant c added to all rewards of a
+            continuing task adds c / (1 - gamma) to w, as to all values; a factor multiplies it.
     """
 
     options: TabularValues
@@ -150,7 +150,7 @@ class TabularCritic(Critic):
         self._count_C = torch.zeros(cells, dtype=torch.float64, device=device)
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
-        """Move every visited cell toward the mean of its targets; returns the mean squared error before."""
+        """Move every visited cell toward the mean of its targets. Return the mean squared error before the step."""
         self._policy = policy
         value_C = self._value_C
         if self.options.initial == "mean":
@@ -173,7 +173,7 @@ class TabularCritic(Critic):
         return {"value": loss}
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
-        """The table, or sum_a pi(a|s) Q(s, a) of it."""
+        """The values in the table; for a table of Q, sum_a pi(a|s) Q(s, a)."""
         return self._read(self._value_C, state_N)
 
     def _read(self, value_C: Float[Tensor, "C"], state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -203,32 +203,33 @@ class TabularCritic(Critic):
         return lambda_returns(rollout, bootstrap_TB, rollout.survival_TB, 1.0)
 
     def _mean_target(self, rollout: Rollout) -> Float[Tensor, ""]:
-        """The w of which the targets have the mean, if it is what cells that were never visited are worth.
+        """The w that is the mean of the targets if it is the value of all cells that were never visited.
 
-        Targets are a + b w: w = mean a / (1 - mean b). Two passes with w = 0 and, without rewards and with all other
-        values 0, w = 1. Where no target ends anywhere else (mean b = 1) nothing is known of w, and it is 0.
+        Targets are linear in w, a + b w, so w = mean a / (1 - mean b). a: the targets for w = 0. b: the targets for w =
+        1 without rewards and with all other values 0. If every target is bootstrapped in such cells alone (mean b = 1),
+        w is undetermined and set to 0.
         """
         value_C, seen_C = self._value_C, self._count_C > 0
         unseen_C = (~seen_C).to(value_C)
-        silent = replace(rollout, reward_TB=torch.zeros_like(rollout.reward_TB))
+        unrewarded = replace(rollout, reward_TB=torch.zeros_like(rollout.reward_TB))
         a = self._targets(rollout, partial(self._read, value_C * seen_C))[rollout.alive_TB].mean()
-        b = self._targets(silent, partial(self._read, unseen_C))[rollout.alive_TB].mean()
+        b = self._targets(unrewarded, partial(self._read, unseen_C))[rollout.alive_TB].mean()
         return torch.where(b < 1, a / (1 - b), 0.0)
 
 
 @final
 class RolloutCritic(Critic):
-    """Monte-Carlo through the model from the very states that are asked for.
+    """Mean returns of episodes in the model from the queried states.
 
     So states that the policy never visits get values as good as the others; with the geometric horizon, unbiased ones.
-    Nothing is remembered between fits; each question is answered by fresh episodes.
+    Nothing is learned: each query samples new episodes.
 
     Args:
         model: samples outcomes.
-        options: both v and Q can be asked for, whatever the target. A fixed horizon leaves out what comes after it.
+        options: both v and Q can be queried, whatever the target. With a fixed horizon returns end at the horizon.
     """
 
-    draws_when_asked = True
+    samples_when_queried = True
     options: RolloutValues
 
     def __init__(self, model: SamplingModel, options: RolloutValues = RolloutValues()) -> None:  # noqa: B008 - frozen
@@ -241,7 +242,7 @@ class RolloutCritic(Critic):
         return self._model_calls
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
-        """Take the policy to be followed; the rollout is not looked at."""
+        """Set the policy that episodes in the model follow; the rollout is not used."""
         self._following = policy, generator
         return {}
 
@@ -273,7 +274,7 @@ def lambda_returns(
     discount_TB: Float[Tensor, "T B"],
     lambda_: float,
 ) -> Float[Tensor, "T B"]:
-    """G_t = r_t + gamma_t ((1 - lambda) V(s_{t+1}) + lambda G_{t+1}); V(s_{t+1}) alone where the episode's data end.
+    """G_t = r_t + gamma_t ((1 - lambda) V(s_{t+1}) + lambda G_{t+1}), with G_{t+1} = V(s_{t+1}) at the last step.
 
     Args:
         rollout: B episodes.
@@ -283,7 +284,7 @@ def lambda_returns(
     """
     lambda_TB = lambda_ * rollout.follows_TB.float()
     returns_TB = rollout.reward_TB + discount_TB * (1 - lambda_TB) * bootstrap_TB
-    # Row by row on the CPU, where a few numbers cost least.
+    # in numpy, where operations on a few numbers cost least
     row_TB, later_TB = returns_TB.cpu().numpy(), (discount_TB * lambda_TB).cpu().numpy()
     for t in reversed(range(len(row_TB) - 1)):
         row_TB[t] += later_TB[t] * row_TB[t + 1]
@@ -291,12 +292,12 @@ def lambda_returns(
 
 
 def check_targets(target_V: Float[Tensor, "V"]) -> None:
-    """NotFinite unless a critic can learn from these."""
+    """NotFinite unless the sum of the targets is finite."""
     if not math.isfinite(target_V.sum()):
         raise NotFinite("a target of the critic is not finite; it has learned nothing from this rollout", what="value")
 
 
 def _fitted(learned: Learned | None) -> Learned:
     if learned is None:
-        raise PgtsError("the critic knows no policy yet; fit it, or iterate, before asking for values")
+        raise PgtsError("the critic has no values yet; call fit or iterate before querying it")
     return learned

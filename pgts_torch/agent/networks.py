@@ -1,9 +1,9 @@
-"""Networks from plain descriptions. Their weights are drawn from a named stream, never from torch's global generator.
+"""Networks from their options, with weights from a given generator, never from torch's global one.
 
     output(o) = head(trunk(encode(o)))
 
-`encode` makes float32 inputs of what is observed: one-hot rows of states, vectors as they are, images scaled. It holds
-no weights, so a training loop encodes its batch once.
+`encode` makes float32 inputs of observations: one-hot rows of states, vectors as they are, images scaled. It has no
+weights, so a training loop encodes its batch once.
 """
 
 import math
@@ -29,10 +29,11 @@ _CLIP = 10.0
 
 @final
 class RunningNorm(nn.Module):
-    """(x - mean) / standard deviation of all rows absorbed so far, clipped to [-10, 10]; the identity before the first.
+    """(x - mean) / standard deviation, clipped to [-10, 10], with the statistics of all rows absorbed so far; the
+    identity before the first.
 
-    Each entry of the last axis has statistics of its own, in float64: mean and sum of squared deviations are merged
-    batch by batch (Chan, Golub and LeVeque 1983). They change in `absorb` only.
+    Each entry of the last axis has its own statistics, in float64: mean and sum of squared deviations are merged batch
+    by batch (Chan, Golub and LeVeque 1983). They change in `absorb` only.
     """
 
     count: Tensor
@@ -49,13 +50,13 @@ class RunningNorm(nn.Module):
         if not bool(self.count):
             return x
         std_D = (self.square_D / self.count).sqrt()
-        # A feature that never moved says nothing: it stays near 0 instead of being blown up.
+        # a constant feature is not divided by its (rounding) deviation, so that it stays near 0
         std_D = torch.where(std_D > 1e-6 * (1 + self.mean_D.abs()), std_D, 1.0)
         return ((x - self.mean_D) / std_D).clamp(-_CLIP, _CLIP)
 
     @torch.no_grad()
     def absorb(self, x: Tensor) -> None:
-        """Count the rows of x among those seen; PgtsError, and nothing counted, unless they are finite."""
+        """Add the rows of x to the statistics; NotFinite, and nothing is added, unless they are finite."""
         x_ND = x.reshape(-1, x.shape[-1]).double()
         mean_D, total = x_ND.mean(0), self.count + len(x_ND)
         if not bool(mean_D.isfinite().all()):
@@ -69,7 +70,7 @@ class RunningNorm(nn.Module):
 
 @final
 class Encoder(nn.Module):
-    """Observations of a space as float32 inputs.
+    """Makes float32 inputs of the observations of a space.
 
     Discrete(n): one-hot rows [N, n].   Box (D,): [N, D].   Box (H, W, C): divided by `scale`, as [N, C, H, W].
 
@@ -88,7 +89,7 @@ class Encoder(nn.Module):
         elif isinstance(observation_space, spaces.Box) and len(observation_space.shape) in (1, 3):
             self.shape = observation_space.shape
         else:
-            raise PgtsError(f"observations are {observation_space}; a network sees Discrete(n), vectors or images")
+            raise PgtsError(f"observations are {observation_space}; a network takes Discrete(n), vectors or images")
         self.scale = scale if scale is not None else 255.0 if observation_space.dtype == "uint8" else 1.0
         self.norm = RunningNorm(self.shape[-1]) if normalize else None
 
@@ -111,19 +112,19 @@ class Encoder(nn.Module):
         return (observation_N if observation_N.is_floating_point() else observation_N.float()) / self.scale
 
     def absorb(self, observation_N: Tensor) -> None:
-        """Let the running statistics see these observations, where there are any."""
+        """Add these observations to the running statistics, where there are any."""
         if self.norm is not None:
             self.norm.absorb(self._scaled(observation_N))
 
     @property
     def fresh(self) -> bool:
-        """Whether there are running statistics that have seen nothing yet."""
+        """Whether there are running statistics without any observation yet."""
         return self.norm is not None and not bool(self.norm.count)
 
 
 @final
 class Trunk(nn.Module):
-    """All of a network but its last layer. A policy and a critic that are given the same one share its weights."""
+    """All layers of a network but the last. A policy and a critic that have the same trunk share its weights."""
 
     def __init__(self, encoder: Encoder, layers: nn.Sequential, num_features: int) -> None:
         super().__init__()
@@ -131,30 +132,30 @@ class Trunk(nn.Module):
 
 
 def make_trunk(network: MLP | CNN, observation_space: Space[Any], *, generator: torch.Generator) -> Trunk:
-    """A trunk on the CPU: orthogonal weights of gain sqrt(2) (Saxe et al. 2014), biases 0.
+    """Make a trunk on the CPU, with orthogonal weights of gain sqrt(2) (Saxe et al. 2014) and biases 0.
 
-    MLP: without hidden layers, one number for each (state, output). CNN: convolutions without padding over
+    MLP: without hidden layers, and with one-hot states, the network is a table. CNN: convolutions without padding over
     channels-last images; the default is the usual one for the 7x7x3 views of MiniGrid (Chevalier-Boisvert et al. 2023).
 
     Raises:
-        PgtsError: the network cannot see such observations.
+        PgtsError: the network does not take such observations.
     """
     if isinstance(network, MLP):
         encoder = Encoder(observation_space, normalize=network.normalize)
         if len(encoder.shape) != 1:
-            raise PgtsError(f"an mlp sees states or vectors, not images of shape {encoder.shape}; use a cnn")
+            raise PgtsError(f"an mlp takes states or vectors, not images of shape {encoder.shape}; use a cnn")
         flat, layers = encoder.num_inputs, list[nn.Module]()
     else:
         encoder = Encoder(observation_space, normalize=network.normalize, scale=network.scale)
         if len(encoder.shape) != 3:
-            raise PgtsError(f"a cnn sees images (H, W, C), not {observation_space}; use an mlp")
+            raise PgtsError(f"a cnn takes images (H, W, C), not {observation_space}; use an mlp")
         flat, layers = _convolutions(network, encoder, generator)
     layers += _dense(flat, network.hidden, network.activation, generator)
     return Trunk(encoder, nn.Sequential(*layers), (flat, *network.hidden)[-1])
 
 
 def _convolutions(network: CNN, encoder: Encoder, generator: torch.Generator) -> tuple[int, list[nn.Module]]:
-    """How many numbers the convolutions end in, and their layers."""
+    """Return the number of outputs of the convolutions, and their layers."""
     height, width, inputs = encoder.shape
     layers: list[nn.Module] = []
     for outputs in network.channels:
@@ -169,10 +170,10 @@ def _convolutions(network: CNN, encoder: Encoder, generator: torch.Generator) ->
 
 @final
 class Network(nn.Module):
-    """A trunk and a linear head. Not to be moved to another device once it was used.
+    """A trunk and a linear head. It must not be moved to another device after its first use.
 
     Args:
-        trunk: may be another network's, too.
+        trunk: may be shared with another network.
         num_outputs: of the head.
         gain: of the head's orthogonal weights; its biases are 0.
     """
@@ -191,7 +192,7 @@ class Network(nn.Module):
 
     @cached_property
     def _functions(self) -> list[Callable[[Tensor], Tensor]]:
-        """The layers without their modules, whose calls and attributes cost as much as a small layer."""
+        """The layers as plain functions, because calling a module costs as much as a small layer."""
         return [
             partial(nn.functional.linear, weight=layer.weight, bias=layer.bias)
             if isinstance(layer, nn.Linear)
@@ -201,11 +202,11 @@ class Network(nn.Module):
 
     @cached_property
     def _named(self) -> dict[str, Tensor]:
-        """Weights and running statistics themselves."""
+        """Weights and running statistics, by name, without copies."""
         return self.state_dict(keep_vars=True)
 
     def encode(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
-        """The inputs that `forward` takes; they carry no gradient."""
+        """Return the inputs that `forward` takes, without gradient."""
         return self.trunk.encoder(observation_N)
 
     def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
@@ -214,20 +215,20 @@ class Network(nn.Module):
         return input_N
 
     @torch.no_grad()
-    def evaluate(self, observation_N: Tensor) -> Float[Tensor, "N D"]:
-        """Outputs without gradient, in pieces of bounded memory."""
+    def outputs(self, observation_N: Tensor) -> Float[Tensor, "N D"]:
+        """Return the outputs without gradient, computed in pieces so that memory is bounded."""
         if len(observation_N) <= self._most_rows:
             return self.forward(self.encode(observation_N))
         return torch.cat([self.forward(self.encode(piece)) for piece in observation_N.split(self._most_rows)])
 
     @torch.no_grad()
     def plain_state(self) -> dict[str, Tensor]:
-        """Weights and running statistics, copied to the CPU."""
+        """Return weights and running statistics, copied to the CPU."""
         return {name: value.to("cpu", copy=True) for name, value in self._named.items()}
 
     @torch.no_grad()
-    def take_over(self, state: Mapping[str, Any]) -> None:
-        """What `plain_state` gave; PgtsError, and nothing changed, unless all of it fits."""
+    def load_plain_state(self, state: Mapping[str, Any]) -> None:
+        """Load what `plain_state` returned; PgtsError, and nothing is changed, unless all of it fits."""
         own = self._named
         if unknown := sorted(set(state) - set(own)):
             raise PgtsError(f"{unknown[0]} belongs to another network; this one has {sorted(own)}")

@@ -1,4 +1,4 @@
-"""Policies and critics whose answers come from networks."""
+"""Policies and critics that are networks."""
 
 import copy
 import math
@@ -27,16 +27,16 @@ _SLOWEST_RATE = 0.1
 
 @final
 class NetworkPolicy(Policy):
-    """pi(a|o) ~ exp(logit_a(o)), float32; nearly uniform at first, for the last layer starts with gain 0.01.
+    """pi(a|o) ~ exp(logit_a(o)) in float32; nearly uniform at first, because the head has gain 0.01.
 
     Args:
         observation_space: Discrete(n), vectors or channels-last images.
-        num_actions: of the discrete action set.
-        options: its trunk.
-        seed: the weights are drawn from the stream (seed, "policy"), alike on every device.
+        num_actions: A.
+        options: of the trunk.
+        seed: the initial weights are from the stream (seed, "policy"), the same on every device.
 
     Raises:
-        PgtsError: a network that cannot see such observations.
+        PgtsError: the network does not take such observations.
     """
 
     def __init__(
@@ -56,13 +56,13 @@ class NetworkPolicy(Policy):
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         """softmax of the logits."""
-        return self.network.evaluate(observation_N).softmax(-1)
+        return self.network.outputs(observation_N).softmax(-1)
 
     def state_dict(self) -> dict[str, Any]:
         return self.network.plain_state()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.network.take_over(state)
+        self.network.load_plain_state(state)
 
 
 @final
@@ -71,16 +71,17 @@ class NetworkCritic(Critic):
 
         minimise  mean over visits of ((y_t - mean) / scale - net(o_t))^2,    v(o) = mean + scale * net(o)
 
-    y_t are lambda-returns or Monte-Carlo returns: where an episode was cut, v of the target network stands for the
-    rest; where it terminated, nothing does. mean and scale follow the targets (1/k of fit k, never less than 1/10);
-    when they change, the last layer is changed so that v stays as it is (PopArt; van Hasselt et al. 2016). In the
-    first fit v counts as 0, unless it was asked for before. So rewards times 2^k give values times 2^k, bit for bit.
+    y_t are lambda-returns or Monte-Carlo returns, bootstrapped with the target network where an episode was cut off and
+    not where it terminated. mean and scale are running statistics of the targets, with the rate 1/k in fit k, at least
+    1/10; when they change, the head is rescaled so that v stays the same (PopArt; van Hasselt et al. 2016). In the
+    first fit targets are bootstrapped with 0, unless v was queried before. So rewards times 2^k give values times 2^k,
+    bit for bit.
 
     Args:
-        observation_space, num_actions: what is seen and done.
-        trunk: that of a policy, which is shared instead of `options.network`. It is moved by both, and its running
-            statistics of observations by the policy's update.
-        seed: the weights are drawn from the stream (seed, "critic").
+        observation_space, num_actions: of the environment.
+        trunk: the trunk of a policy, which is then shared, in place of `options.network`. Both train it; its running
+            statistics of observations are changed by the policy's update alone.
+        seed: the initial weights are from the stream (seed, "critic").
     """
 
     dtype = torch.float32
@@ -109,21 +110,21 @@ class NetworkCritic(Critic):
         self._target_network = copy.deepcopy(self.network) if self._lags else self.network
         self._optimiser = Optimiser(learning_rate=filled.learning_rate, max_grad_norm=limit(options.max_grad_norm))
         self._policy: Policy | None = None
-        self._asked: tuple[Rollout, tuple[Tensor, Tensor]] | None = None
+        self._queried: tuple[Rollout, tuple[Tensor, Tensor]] | None = None
         self._mean, self._scale, self._num_fits = 0.0, 1.0, 0
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
-        """Move the network toward the targets of all visits.
+        """Fit the network to the targets of all visits.
 
         Returns:
-            value: the mean squared error in squared reward units, and explained_variance: 1 less its share of the
-            variance of the targets; both before anything moves. value_grad_norm: mean over the gradient steps.
+            value: the mean squared error in squared reward units. explained_variance: 1 - Var(error) / Var(targets).
+            Both are of the values before the fit. value_grad_norm: mean over the gradient steps.
 
         Raises:
             PgtsError: a target, a loss or a gradient is not finite.
         """
         if self.target == "q" and policy is not self._policy:
-            self._asked = None  # they were sums over the actions of another policy
+            self._queried = None  # they were means over the actions of another policy
         self._policy = policy
         alive_TB = rollout.alive_TB
         observation_V, action_V = rollout.observation_V, rollout.action_TB[alive_TB]
@@ -135,7 +136,7 @@ class NetworkCritic(Critic):
             error_V = target_V - v_TB[alive_TB]
 
         encoder = self.network.trunk.encoder
-        if encoder.fresh or not _share(policy, self.network):
+        if encoder.fresh or not _shares_trunk(policy, self.network):
             encoder.absorb(observation_V)
         input_V = self.network.encode(observation_V)
         fits, passes = (self.options.num_epochs, 1) if self.options.fresh_targets else (1, self.options.num_epochs)
@@ -157,7 +158,7 @@ class NetworkCritic(Critic):
         num_passes: int,
         generator: torch.Generator,
     ) -> list[float]:
-        """Move the network toward given targets; the norms of its gradients."""
+        """Fit the network to given targets. Return the norms of the gradients."""
         check_targets(target_V)
         if self.options.normalize_returns:
             self._rescale(target_V)
@@ -172,13 +173,13 @@ class NetworkCritic(Critic):
         return norms
 
     def v(self, observation_N: Tensor) -> Float[Tensor, "N"]:
-        """The network's value, or sum_a pi(a|o) Q(o, a) of it."""
+        """The network's value; for a network of Q, sum_a pi(a|o) Q(o, a)."""
         return self._v(self.network, observation_N)
 
     def values(self, rollout: Rollout) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
-        """v(s_t) and v(s_{t+1}). If a fit to the same rollout comes next, it takes them as they are."""
-        self._asked = rollout, rollout.values(self.v)
-        return self._asked[1]
+        """v(s_t) and v(s_{t+1}). They are kept for the next fit if it is to the same rollout."""
+        self._queried = rollout, rollout.values(self.v)
+        return self._queried[1]
 
     def q(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         if self.target != "q":
@@ -204,23 +205,23 @@ class NetworkCritic(Critic):
         if not (isinstance(state["scale"], float) and state["scale"] >= 0):
             raise PgtsError(f"scale is {state['scale']!r}; it must be at least 0")
         check_count("num_fits", state["num_fits"], least=0)
-        self.network.take_over(state["network"])
+        self.network.load_plain_state(state["network"])
         if self._lags:
-            self._target_network.take_over(state["target_network"])
+            self._target_network.load_plain_state(state["target_network"])
         self._optimiser.load_state_dict(state["optimiser"])
         self._optimiser.check_fits(self.network.weights)
-        self._asked = None
+        self._queried = None
         self._mean, self._scale, self._num_fits = state["mean"], state["scale"], state["num_fits"]
 
     def _values(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N D"]:
         """The network's outputs in reward units."""
-        return self._mean + self._scale * network.evaluate(observation_N)
+        return self._mean + self._scale * network.outputs(observation_N)
 
     def _v(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N"]:
         if self.target == "v":
             return self._values(network, observation_N).squeeze(-1)
         if self._policy is None:
-            raise PgtsError("the critic knows no policy yet; fit it, or iterate, before asking for values")
+            raise PgtsError("the critic has no values yet; call fit or iterate before querying it")
         return policy_mean(self._policy.probs(observation_N), self._values(network, observation_N))
 
     def _taken(self, value_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -228,11 +229,11 @@ class NetworkCritic(Critic):
         return value_ND.squeeze(-1) if self.target == "v" else value_ND.gather(-1, action_N[:, None]).squeeze(-1)
 
     def _targets(self, rollout: Rollout) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
-        """v of the target network at the visits, and the targets, which stand on it."""
-        asked, self._asked = self._asked, None
-        if asked is not None and asked[0] is rollout and not self._lags:
-            v_TB, next_v_TB = asked[1]
-        elif asked is None and not self._num_fits and self.options.normalize_returns:
+        """Return v of the target network at the visits, and the targets that are bootstrapped with it."""
+        queried, self._queried = self._queried, None
+        if queried is not None and queried[0] is rollout and not self._lags:
+            v_TB, next_v_TB = queried[1]
+        elif queried is None and not self._num_fits and self.options.normalize_returns:
             v_TB = next_v_TB = torch.zeros_like(rollout.reward_TB)
         else:
             v_TB, next_v_TB = rollout.values(lambda observation_N: self._v(self._target_network, observation_N))
@@ -242,13 +243,13 @@ class NetworkCritic(Critic):
 
     @torch.no_grad()
     def _rescale(self, target_V: Float[Tensor, "V"]) -> None:
-        """Let mean and scale follow the targets; what was learned before keeps its values in reward units."""
+        """Update mean and scale by the targets, and rescale the heads so that values in reward units stay the same."""
         rate = max(1 / (self._num_fits + 1), _SLOWEST_RATE)
         old_mean, old_scale = self._mean, self._scale
         new_mean, new_var = float(target_V.mean()), float(target_V.var(correction=0))
         mean = old_mean + rate * (new_mean - old_mean)
         spread = (1 - rate) * (old_scale**2 + (old_mean - mean) ** 2) + rate * (new_var + (new_mean - mean) ** 2)
-        # What is less than the rounding of the targets is none of their spread. Where all are 0, so is the scale.
+        # A deviation below the rounding error of the targets is replaced by it. If all targets are 0, so is the scale.
         self._mean, self._scale = mean, max(math.sqrt(spread), _ROUNDING * float(target_V.abs().max()))
         if self._num_fits and self._scale:
             for network in {self.network, self._target_network}:
@@ -265,5 +266,5 @@ class NetworkCritic(Critic):
             statistic.copy_(present)
 
 
-def _share(policy: Policy, network: Network) -> bool:
+def _shares_trunk(policy: Policy, network: Network) -> bool:
     return isinstance(policy, NetworkPolicy) and policy.network.trunk is network.trunk

@@ -1,8 +1,8 @@
-"""How network policies move: by gradient steps on an objective over all actions of the visited observations.
+"""Updates of network policies: gradient steps on an objective over all actions at the visited observations.
 
 `advantage_NA` are either the advantages of all actions, q - <pi, q>, or the estimate of `advantages.score_function`
-from the action taken, A_t / pi(a_t|s_t) there and 0 elsewhere, one row a visit. With the latter, `GradientUpdate` is
-A2C and `PPOUpdate` is PPO:
+from the action taken, A_t / pi(a_t|s_t) for it and 0 for the others, a row for each visit. With the latter,
+`GradientUpdate` is A2C and `PPOUpdate` is PPO:
 
     sum_a pi(a|s) adv(s, a)                                     has the gradient of   log pi(a_t|s_t) A_t
     sum_a pi_old(a|s) min(rho_a adv, clip(rho_a) adv)           is                    min(rho A_t, clip(rho) A_t)
@@ -30,10 +30,10 @@ from pgts_torch.search.lookahead import check_finite
 
 
 class Batch(NamedTuple):
-    """What one update moves the policy by.
+    """The batch of one update.
 
     input_N: encoded observations.   weight_N: float32.   advantage_NA: in reward units, in the dtype of the lookahead.
-    noise: what advantages may be off by, in reward units (`Update.__call__`).
+    noise: the standard error of the advantages, in reward units (`Update.__call__`).
     """
 
     input_N: Float[Tensor, "N ..."]
@@ -43,9 +43,9 @@ class Batch(NamedTuple):
 
 
 class Move(NamedTuple):
-    """What the steps of an update did.
+    """The result of the steps of an update.
 
-    old_NA, new_NA: log pi before and after them, without gradient.   losses: and diagnostics, by name.
+    old_NA, new_NA: log pi before and after them, without gradient.   losses: losses and diagnostics, by name.
     """
 
     old_NA: Float[Tensor, "N A"]
@@ -56,8 +56,8 @@ class Move(NamedTuple):
 class NetworkUpdate(Update):
     """Gradient steps on the parameters of a network policy.
 
-    Running statistics of the observations see the batch after the steps, so that these start from the policy that made
-    it; only the first batch of all is seen before.
+    The batch is added to running statistics of observations after the steps, so that these start from the policy that
+    collected it; only the first batch of all is added before.
     """
 
     policies = (NetworkPolicy,)
@@ -80,36 +80,36 @@ class NetworkUpdate(Update):
         generator: torch.Generator,
         noise: float = 0.0,
     ) -> dict[str, float]:
-        """Move the network.
+        """Take the gradient steps.
 
         Returns:
-            The losses and diagnostics of the update; and, after it, entropy: the mean entropy of pi in nats, and kl:
-            the mean KL(pi_old || pi).
+            The losses and diagnostics of the update, with entropy: the mean entropy of the new pi in nats, and kl: the
+            mean KL(pi_old || pi).
 
         Raises:
-            NotFinite: an advantage, a weight, a loss, a gradient or what the policy would become is not finite. The
-                policy and what the optimiser remembers are as before.
-            PgtsError: no state counts.
+            NotFinite: an advantage, a weight, a loss, a gradient or the next policy is not finite. Policy and optimiser
+                are as before.
+            PgtsError: all weights are 0.
         """
         assert isinstance(policy, NetworkPolicy)
         _check_numbers(advantage_NA, weight_N)
-        with self._as_before_unless_finite(policy):
+        with self._restored_unless_finite(policy):
             network, encoder = policy.network, policy.network.trunk.encoder
             if fresh := encoder.fresh:
                 encoder.absorb(observation_N)
             batch = Batch(network.encode(observation_N), advantage_NA, weight_N.float(), noise)
             old_NA, new_NA, losses = self.move(network, batch, generator)
             check_finite("probability", "the next policy", new_NA, None)
-            share_N = batch.weight_N / batch.weight_N.sum()
-            losses["entropy"] = float(share_N @ entropy(new_NA))
-            losses["kl"] = float(share_N @ divergence(old_NA, new_NA))
+            weight_N = batch.weight_N / batch.weight_N.sum()
+            losses["entropy"] = float(weight_N @ entropy(new_NA))
+            losses["kl"] = float(weight_N @ divergence(old_NA, new_NA))
             if not fresh:
                 encoder.absorb(observation_N)
         return losses
 
     @contextmanager
-    def _as_before_unless_finite(self, policy: NetworkPolicy) -> Iterator[None]:
-        """Puts policy and optimiser back where a number was not finite."""
+    def _restored_unless_finite(self, policy: NetworkPolicy) -> Iterator[None]:
+        """A context that restores policy and optimiser where it is left by NotFinite."""
         before = policy.state_dict(), self.state_dict()
         try:
             yield
@@ -131,10 +131,10 @@ class NetworkUpdate(Update):
 
     @abstractmethod
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
-        """Take the steps."""
+        """Take the gradient steps of this kind of update."""
 
     def step(self, network: Network, loss: Tensor, *, through: tuple[Tensor, Tensor] | None = None) -> float:
-        """One step down the loss (see `Optimiser.step`); the norm of its gradient."""
+        """Take one step down the loss (see `Optimiser.step`). Return the norm of its gradient."""
         return self._optimiser.step(network.weights, loss, "policy", through=through)
 
 
@@ -153,7 +153,7 @@ class GradientUpdate(NetworkUpdate):
         super().__init__(options)
 
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
-        """policy: less the objective without entropy, before the step; grad_norm: before clipping."""
+        """Losses: policy, minus the objective without entropy, before the step; grad_norm, before clipping."""
         log_NA = network(batch.input_N).log_softmax(-1)
         policy_loss = -(batch.weight_N @ (log_NA.exp() * batch.advantage_NA.float()).sum(-1))
         coef = self.options.entropy_coef
@@ -165,14 +165,15 @@ class GradientUpdate(NetworkUpdate):
 
 @final
 class PPOUpdate(NetworkUpdate):
-    """Many small steps up an objective that is clipped where pi has moved far enough (Schulman et al. 2017).
+    """Many small steps up an objective that is clipped where pi has changed enough (Schulman et al. 2017).
 
         maximise  mean_s w(s) [ sum_a pi_old(a|s) min(rho_a adv, clip(rho_a, 1 - clip_range, 1 + clip_range) adv)
                                 + entropy_coef H(pi(.|s)) ],        rho_a = pi(a|s) / pi_old(a|s)
 
-    over minibatches, the weights scaled to a mean of 1. `normalize_advantage` divides by the root of
-    mean_s w(s) (sum_a pi_old(a|s) |adv(s, a)|)^2; for sampled advantages that is their root mean square. Nothing is
-    subtracted: their mean under pi is 0 already. `target_kl` is held against the mean KL(pi_old || pi) of a minibatch.
+    over minibatches, with weights scaled to a mean of 1. `normalize_advantage` divides by the square root of
+    mean_s w(s) (sum_a pi_old(a|s) |adv(s, a)|)^2; for sampled advantages that is their root mean square. No mean is
+    subtracted, because it is 0 under pi. The steps end once the mean KL(pi_old || pi) of a minibatch exceeds
+    `target_kl`.
     """
 
     options: PPO
@@ -181,8 +182,8 @@ class PPOUpdate(NetworkUpdate):
         super().__init__(options)
 
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
-        """policy: mean over the steps of less the objective without entropy; grad_norm: mean, before clipping;
-        clip_fraction: the share of actions, after the steps, whose rho is out of range; num_steps taken."""
+        """Losses: policy, minus the objective without entropy, mean over the steps; grad_norm, mean, before clipping;
+        clip_fraction, the probability of actions whose rho is out of range after the steps; num_steps."""
         input_N, advantage_NA, weight_N = batch.input_N, batch.advantage_NA.float(), batch.weight_N
         old_NA = log_probs(network, input_N)
         weight_N = weight_N / weight_N.mean()
@@ -215,11 +216,11 @@ class PPOUpdate(NetworkUpdate):
     def objective(
         self, log_NA: Float[Tensor, "N A"], old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"]
     ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
-        """min(rho adv, clip(rho) adv), and the gradient of the whole objective of a state in log pi(a|s):
+        """Return min(rho adv, clip(rho) adv), and the gradient of a state's whole objective in log pi(a|s):
 
             pi(a|s) ( adv(s, a) 1(not clipped) - entropy_coef (log pi(a|s) + 1) )
 
-        Autograd through these dozen operations would cost as much as the network itself.
+        It is written out because autograd through these operations would cost as much as the network itself.
         """
         ratio_NA = (log_NA - old_NA).exp()
         clipped_NA = ratio_NA.clamp(1 - self.options.clip_range, 1 + self.options.clip_range)
@@ -250,7 +251,7 @@ def log_probs(network: Network, input_N: Float[Tensor, "N ..."]) -> Float[Tensor
 def passes(
     network: Network, columns: Sequence[Tensor], num_epochs: int, minibatch_size: int, generator: torch.Generator
 ) -> Iterator[tuple[Float[Tensor, "N A"], tuple[Tensor, ...]]]:
-    """log pi of the network as it is by then, and the columns, of which the first are its inputs, in minibatches."""
+    """Yield minibatches of the columns, the first of which are inputs, with log pi of the current network."""
     for _ in range(num_epochs):
         for part in minibatches(columns, minibatch_size, generator=generator):
             yield network(part[0]).log_softmax(-1), part
@@ -279,4 +280,4 @@ def _check_numbers(advantage_NA: Tensor, weight_N: Tensor) -> None:
                     f"{name}[{where}] is {float(value[place])}; it must be finite", what=name.partition("_")[0]
                 )
     if not float(weight_N.sum()) > 0 or float(weight_N.min()) < 0:
-        raise PgtsError(f"weight_N is {weight_N.tolist()[:8]}; weights are at least 0, and some state must count")
+        raise PgtsError(f"weight_N is {weight_N.tolist()[:8]}; weights are at least 0, and one must be positive")

@@ -1,4 +1,4 @@
-"""Gradient steps on networks that refuse to move by what is not finite."""
+"""Gradient steps on networks, which raise NotFinite before a parameter would change by infinity or NaN."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -21,7 +21,7 @@ class Optimiser:
         adam:   theta <- theta - learning_rate m / (sqrt(v) + 1e-8),   bias-corrected moments (Kingma and Ba 2015)
         sgd:    theta <- theta - learning_rate g
 
-    All gradients are handled as one vector: for a small network the calls cost more than the numbers.
+    All gradients are concatenated into one vector, because for a small network the calls cost more than the numbers.
 
     Args:
         learning_rate: above 0.
@@ -45,16 +45,16 @@ class Optimiser:
         *,
         through: tuple[Tensor, Tensor] | None = None,
     ) -> float:
-        """Move the parameters, the same ones in each call; returns the norm of the gradient before clipping.
+        """Take a step; the parameters must be the same in each call. Return the norm of the gradient before clipping.
 
         Args:
             loss: what is minimised.
-            name: what an error calls it.
-            through: an output of the network and the loss's gradient in it, where a formula gives it for less than
-                autograd does. The loss then needs no gradient of its own.
+            name: of the loss, in errors.
+            through: an output of the network and the loss's gradient with respect to it, where a formula is cheaper
+                than autograd. The loss then needs no gradient of its own.
 
         Raises:
-            NotFinite: the loss, its gradient or the step is not finite. No parameter has moved then.
+            NotFinite: the loss, its gradient or the step is not finite. No parameter has changed then.
             PgtsError: the moments are those of other parameters.
         """
         output, gradient = (loss, None) if through is None else through
@@ -78,7 +78,7 @@ class Optimiser:
             self._first_D, self._second_D = torch.zeros_like(gradient_D), torch.zeros_like(gradient_D)
         if len(self._first_D) != len(gradient_D):
             raise PgtsError(
-                f"the optimiser remembers {len(self._first_D)} parameters; the network has {len(gradient_D)}"
+                f"the optimiser has moments of {len(self._first_D)} parameters; the network has {len(gradient_D)}"
             )
         first_D, second_D = self._first_D, self._second_D = self._first_D.to(gradient_D), self._second_D.to(gradient_D)
         self._num_steps += 1
@@ -91,7 +91,7 @@ class Optimiser:
         return torch.div(first_D, scale_D).mul_(-self.learning_rate * root / mean_correction)
 
     def state_dict(self) -> dict[str, Any]:
-        """The moments and how many steps they stand for."""
+        """Return the moments and the number of steps; empty before the first step."""
         if self._first_D is None or self._second_D is None:
             return {}
         return {
@@ -101,20 +101,20 @@ class Optimiser:
         }
 
     def check_fits(self, parameters: Sequence[Tensor]) -> None:
-        """PgtsError unless the moments, if there are any, are those of these parameters."""
+        """PgtsError unless the moments, if there are any, have the size and dtype of these parameters."""
         size, dtype = sum(each.numel() for each in parameters), parameters[0].dtype
         if self._first_D is not None and (self._first_D.shape != (size,) or self._first_D.dtype != dtype):
             found = f"{self._first_D.dtype} of shape {tuple(self._first_D.shape)}"
             raise PgtsError(f"the moments of the optimiser are {found}; the network has {size} parameters in {dtype}")
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave; PgtsError if it is something else."""
+        """Load what `state_dict` returned; PgtsError if it is something else."""
         if not state:
             self._num_steps, self._first_D, self._second_D = 0, None, None
             return
         num_steps, first_D = state.get("num_steps"), state.get("first_D")
         if type(num_steps) is not int or num_steps < 1 or not isinstance(first_D, Tensor) or self.method == "sgd":
-            raise PgtsError(f"{self.method} cannot take over {sorted(state)} with num_steps = {num_steps}")
+            raise PgtsError(f"{self.method} cannot load {sorted(state)} with num_steps = {num_steps}")
         second_D = fitting(state, "second_D", first_D)
         if not bool((second_D >= 0).all()):
             raise PgtsError("second_D has negative squares")
@@ -123,12 +123,12 @@ class Optimiser:
 
 def _check_finite(what: str, name: str, value: float) -> None:
     if not math.isfinite(value):
-        raise NotFinite(f"{name} is {value}; nothing has been moved by it", what=what)
+        raise NotFinite(f"{name} is {value}; no parameter was changed", what=what)
 
 
 def minibatches(columns: Sequence[Tensor], size: int, *, generator: torch.Generator) -> Iterator[tuple[Tensor, ...]]:
-    """Rows of all columns in one common random order, `size` at a time, the last ones fewer; each row once. Not more
-    than `size` rows stay as they are."""
+    """Yield the rows of all columns in one common random order, `size` at a time (the last batch may be smaller). If
+    there are at most `size` rows they are one batch, in their own order."""
     if len(columns[0]) <= size:
         return iter([tuple(columns)])
     order_N = torch.randperm(len(columns[0]), generator=generator, device=generator.device)

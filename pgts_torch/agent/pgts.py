@@ -18,7 +18,7 @@ from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.model_check import Mode
 from pgts_torch.agent.parts import make_parts
-from pgts_torch.agent.policies import Policy, listed
+from pgts_torch.agent.policies import Policy, exact_probs
 from pgts_torch.agent.ranks import present_ranks
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
@@ -124,7 +124,7 @@ class PGTS:
         batch = self.estimator(experience, draws) if self.estimator.comes_first else None
 
         # Evaluate pi_k: estimate Q^{pi_k} (line 2).
-        fitting = draws.own if self.critic.draws_when_asked else draws.common
+        fitting = draws.own if self.critic.samples_when_queried else draws.common
         losses = self.critic.fit(self.policy, experience, generator=fitting)
 
         # Look m steps ahead from the states with d(s) > 0.
@@ -153,7 +153,7 @@ class PGTS:
 
     def policy_table(self) -> Float[Tensor, "S A"]:
         """pi(.|s) for all states, on the CPU in float64; PgtsError where they cannot be listed."""
-        return listed(self.policy, torch.arange(self.mdp.num_states, device=self.device))
+        return exact_probs(self.policy, torch.arange(self.mdp.num_states, device=self.device))
 
     def lookahead(self, state_N: Int[Tensor, "N"], *, depth: int | None = None) -> Lookahead:
         """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves. m is by default

@@ -1,4 +1,4 @@
-"""Policies: a distribution over actions for each observation. Tabular ones, whose observations are states."""
+"""Policies: a distribution over actions for each observation; here tables, whose observations are states."""
 
 import math
 from abc import ABC, abstractmethod
@@ -14,7 +14,7 @@ from pgts_torch.seeding import stream
 
 
 def initial(init: Init, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
-    """The policy before the first update.
+    """Return the probabilities of the initial policy.
 
     `Biased(action=0, probability=1)` on the Ladder is the paper's "always left".
     """
@@ -33,9 +33,9 @@ def initial(init: Init, num_states: int, num_actions: int, generator: torch.Gene
 
 
 class Policy(ABC):
-    """pi(a|o) over observations: states of a tabular world, vectors or images of another.
+    """pi(a|o) for observations o: states of a tabular world, else vectors or images.
 
-    options: what it was made from; None for a policy of the caller's own kind.
+    options: what it was made from; None for a policy of the caller's own class.
     """
 
     num_actions: int
@@ -43,21 +43,21 @@ class Policy(ABC):
 
     @abstractmethod
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
-        """pi(.|o) for each observation; it carries no gradient."""
+        """pi(.|o) for each observation, without gradient."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """The parameters, as tensors on the CPU and plain values."""
+        """Return the parameters, as tensors on the CPU and plain values."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over parameters of the same shape; PgtsError if they do not fit."""
+        """Load parameters of the same shape; PgtsError if they do not fit."""
 
     def sample(self, observation_N: Tensor, *, generator: torch.Generator) -> Int[Tensor, "N"]:
-        """One action for each observation, drawn with the caller's generator.
+        """Sample one action for each observation.
 
-        The largest of pi(a|o) / E_a, where the E_a are exponentially distributed: what `torch.multinomial` draws, which
-        takes five times as long to check its probabilities.
+        It is the action with the largest pi(a|o) / E_a for exponentially distributed E_a, as in `torch.multinomial`,
+        which takes five times as long because it checks its probabilities.
 
         Raises:
             NotFinite: a probability is not finite.
@@ -67,7 +67,7 @@ class Policy(ABC):
         if not math.isfinite(score_N.sum()):
             off_N = score_N.isnan() | ~pi_NA.isfinite().all(-1)
             if bool(off_N.any()):
-                raise NotFinite(f"the policy has no probabilities, but {pi_NA[off_N][0].tolist()}", what="probability")
+                raise NotFinite(f"the policy's probabilities are {pi_NA[off_N][0].tolist()}", what="probability")
         return action_N
 
 
@@ -112,7 +112,7 @@ class SoftmaxPolicy(TabularPolicy):
 
 @final
 class SimplexPolicy(TabularPolicy):
-    """The paper's direct parameters: pi(a|s) is the parameter itself, and may be 0 or 1.        [PGTS Sec. 2]"""
+    """The paper's direct parametrisation: pi(a|s) is the parameter itself, and may be 0 or 1.        [PGTS Sec. 2]"""
 
     def __init__(
         self,
@@ -128,7 +128,7 @@ class SimplexPolicy(TabularPolicy):
         self.probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy")).to(device)
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
-        """The rows of the parameter."""
+        """The rows of the table."""
         return self.probs_SA[observation_N]
 
     def state_dict(self) -> dict[str, Any]:
@@ -141,16 +141,16 @@ class SimplexPolicy(TabularPolicy):
         self.probs_SA = probs_SA
 
 
-def listed(policy: Policy, observation_S: Tensor) -> Float[Tensor, "S A"]:
-    """pi(.|o) as the exact world reads it: on the CPU, in float64, and what float32 left of 1 made up for."""
+def exact_probs(policy: Policy, observation_S: Tensor) -> Float[Tensor, "S A"]:
+    """pi(.|o) on the CPU in float64; probabilities of float32 are divided by their sum."""
     pi_SA = policy.probs(observation_S).cpu()
     return pi_SA if pi_SA.dtype == torch.float64 else pi_SA.double() / pi_SA.double().sum(-1, keepdim=True)
 
 
 def fitting(state: dict[str, Any], name: str, like: Tensor) -> Tensor:
-    """A copy of state[name] on the device of `like`; PgtsError unless it is a tensor of the same shape and dtype."""
+    """Return a copy of state[name] on the device of `like`; PgtsError unless it is a tensor of its shape and dtype."""
     value = state.get(name)
     if not isinstance(value, Tensor) or value.shape != like.shape or value.dtype != like.dtype:
         found = f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else value
         raise PgtsError(f"{name} is {found}; a tensor of {like.dtype} of shape {tuple(like.shape)} is needed")
-    return value.to(like, copy=True)  # updates write in place, and the caller's tensor is not theirs
+    return value.to(like, copy=True)  # because updates write in place

@@ -1,4 +1,4 @@
-"""How network policies move toward a target policy that the advantages of all actions name."""
+"""Updates of network policies toward a target policy that is computed from the advantages of all actions."""
 
 from abc import abstractmethod
 from typing import Any, final
@@ -13,24 +13,25 @@ from pgts_torch.options.updates import CMPO, Mirror
 
 
 class TargetUpdate(NetworkUpdate):
-    """A step of the policy's probabilities, projected onto the network by KL.
+    """A fit of the network to a target policy.
 
         minimise  mean_s w(s) KL(target(.|s) || pi(.|s)),    target(a|s) = pi_old(a|s) exp(step(s, a)) / Z
 
-    over minibatches, the weights scaled to a mean of 1. The advantages must be of all actions: in the exponent, an
-    estimate from one action is not unbiased.
+    over minibatches, with weights scaled to a mean of 1. It needs the advantages of all actions, because an estimate
+    from one action is biased in the exponent.
     """
 
     options: Any
 
     @abstractmethod
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
-        """step(s, a)."""
+        """Return step(s, a)."""
 
     def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
-        """policy: mean_s w(s) KL(target || pi) after the steps; grad_norm: mean over the steps, before clipping.
+        """Losses: policy, mean_s w(s) KL(target || pi) after the steps; grad_norm, mean over the steps, unclipped.
 
-        No step is taken where all actions are alike in all states: Adam would make one of the rounding."""
+        Where step(s, a) is 0 everywhere no gradient step is taken, because Adam would turn rounding errors into one.
+        """
         old_NA, exponent_NA = log_probs(network, batch.input_N), self.exponent(batch)
         if not bool(exponent_NA.any()):
             return Move(old_NA, old_NA, {"policy": 0.0, "grad_norm": 0.0})
@@ -49,8 +50,8 @@ class TargetUpdate(NetworkUpdate):
 class NetworkMirrorUpdate(TargetUpdate):
     """The mirror step, step(s, a) = adv(s, a) / temperature (Tomar et al. 2022; Protopapas and Barakat 2024).
 
-    A network that can be any policy ends where `MirrorUpdate` in reward units (normalize "none", floor None) with
-    step_size * w(s) = 1 / temperature does.
+    For a network that can represent any policy, the minimum is the step of `MirrorUpdate` in reward units (normalize
+    "none", floor "never") with step_size * w(s) = 1 / temperature.
 
     Args:
         options: those of networks.
@@ -69,9 +70,9 @@ class CMPOUpdate(TargetUpdate):
 
         scale = mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|, and at least the noise
 
-    The default for lookaheads: how far an action moves depends on how much better it is than usual, never on the scale
-    of rewards, of which a factor of 2^k leaves every bit as it is. The scale is a mean and no root of a mean square:
-    few states in which all depends on the action do not silence the many in which it matters a little.
+    The default with a lookahead. The step does not depend on the scale of rewards; a factor of 2^k changes no bit of
+    the policy. The scale is a mean of absolute values, not a root mean square, so that a few states with very large
+    advantages do not make the steps of all others negligible.
     """
 
     def __init__(self, options: CMPO = CMPO()) -> None:  # noqa: B008 - frozen
@@ -79,7 +80,7 @@ class CMPOUpdate(TargetUpdate):
 
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
         scale = max(advantage_scale(batch.advantage_NA, batch.weight_N), batch.noise)
-        if scale == 0:  # all actions are alike
+        if scale == 0:  # all actions have the same advantage
             return torch.zeros_like(batch.advantage_NA, dtype=torch.float32)
         return (
             (batch.advantage_NA / scale / self.options.temperature).clamp(-self.options.clip, self.options.clip).float()
@@ -87,7 +88,6 @@ class CMPOUpdate(TargetUpdate):
 
 
 def advantage_scale(advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]) -> float:
-    """mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|: how far apart the actions of a state are, in reward units."""
-    apart_N = (advantage_NA - advantage_NA.mean(-1, keepdim=True)).abs().mean(-1).double()
-    share_N = weight_N.double() / weight_N.double().sum()
-    return float(share_N @ apart_N)
+    """mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|: the mean size of advantages, in reward units."""
+    size_N = (advantage_NA - advantage_NA.mean(-1, keepdim=True)).abs().mean(-1).double()
+    return float((weight_N.double() / weight_N.double().sum()) @ size_N)

@@ -1,4 +1,4 @@
-"""How a policy moves, given lookahead values at the states it visited."""
+"""Updates of a policy from advantages at the states it visited; here those of tables."""
 
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, final
@@ -16,12 +16,12 @@ from pgts_torch.tabular.ascent import centred, floored, normalised, projected_st
 
 
 class Update(ABC):
-    """How a policy is moved at visited states.
+    """A rule that changes a policy at visited states.
 
-    state_weight: w(s) of a visited state. `occupancy`: the estimate of d^pi(s), as in the paper. `visits`: its share of
-        all visits, without discounts (sums to 1). `uniform`: 1, as in h-PMD.
-    policies: the kinds of policy that it moves.
-    options: what it was made from; None for an update of the caller's own kind.
+    state_weight: the weight w(s) of a visited state. `occupancy`: the estimate of d^pi(s), as in the paper. `visits`:
+        the fraction of all visits that are to s, without discounts. `uniform`: 1, as in h-PMD.
+    policies: the classes of policy that it can change.
+    options: what it was made from; None for an update of the caller's own class.
     """
 
     options: Any = None
@@ -39,36 +39,36 @@ class Update(ABC):
         generator: torch.Generator,
         noise: float = 0.0,
     ) -> dict[str, float]:
-        """Move pi(.|o) along the advantages of all actions, in place; losses and the like, by name.
+        """Change pi(.|o) along the advantages of all actions, in place. Return losses and diagnostics, by name.
 
         Args:
-            observation_N: what the policy sees of N visited states.
-            advantage_NA: (T^m Q)(s, a) - <pi, T^m Q> (`advantages.centred`), or sampled ones.
+            observation_N: the observations in N visited states.
+            advantage_NA: (T^m Q)(s, a) - <pi, T^m Q>(s) (`ascent.centred`), or sampled ones.
             weight_N: w(s).
-            noise: the standard error of the advantages, in reward units: the least that normalised steps divide by.
+            noise: the standard error of the advantages, in reward units; normalised steps divide by at least this.
         """
 
     def state_dict(self) -> dict[str, Any]:
-        """What an optimiser remembers, as tensors on the CPU and plain values."""
+        """Return the state of the optimiser, as tensors on the CPU and plain values; empty where there is none."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave."""
+        """Load what `state_dict` returned."""
         if state:
-            raise PgtsError(f"{type(self).__name__} remembers nothing; it cannot take over {sorted(state)}")
+            raise PgtsError(f"{type(self).__name__} has no state; it cannot load {sorted(state)}")
 
     def check(self, policy: Policy) -> None:
-        """PgtsError unless this update, and what it remembers, can move such a policy."""
+        """PgtsError unless this update, with the state of its optimiser, can change such a policy."""
         if not isinstance(policy, self.policies):
             names = " or ".join(kind.__name__ for kind in self.policies)
             raise PgtsError(
-                f"{type(self).__name__} moves a {names}, not a {type(policy).__name__}; take such a policy or another "
-                "update"
+                f"{type(self).__name__} updates a {names}, not a {type(policy).__name__}; take such a policy or "
+                "another update"
             )
 
 
 class TabularUpdate(Update):
-    """One step at the rows of a table; all other states stay as they are.
+    """One step in the rows of visited states; all other rows stay as they are.
 
     step_size: eta > 0.
     """
@@ -85,11 +85,10 @@ class TabularUpdate(Update):
         generator: torch.Generator,
         noise: float = 0.0,
     ) -> dict[str, float]:
-        """Nothing is drawn, and there is no loss.
+        """Take the step. It uses no random numbers and has no losses.
 
         Raises:
-            NotFinite: step_size w(s) adv(s, a) is not finite for the best action of a state, or what the policy would
-                become is not.
+            NotFinite: step_size w(s) adv(s, a) is not finite for the best action of a state, or the next policy is not.
         """
         step_NA = self.step_size * weight_N[:, None] * advantage_NA
         check_finite("advantage", "the step along the advantages", step_NA, observation_N)
@@ -105,7 +104,7 @@ class TabularUpdate(Update):
         weight_N: Float[Tensor, "N"],
         noise: float = 0.0,
     ) -> None:
-        """Move pi(.|s) at N distinct states along q(s, .), or along q(s, .) less anything that all actions share."""
+        """Change pi(.|s) in N distinct states along q(s, .), which may have any constant added in each state."""
 
 
 @final
@@ -139,17 +138,17 @@ class SoftmaxUpdate(TabularUpdate):
 
 @final
 class MirrorUpdate(TabularUpdate):
-    """A KL step at visited states, in units of what the advantages amount to (Protopapas and Barakat 2024).
+    """A mirror ascent step at visited states, with normalised advantages (Protopapas and Barakat 2024).
 
-        pi(a|s) <- pi(a|s) exp(eta w(s) A(s, a) / s) / Z,        s = sqrt(mean over visited states of sum_a pi A^2)
+        pi(a|s) <- pi(a|s) exp(eta w(s) A(s, a) / c) / Z,        c = sqrt(mean over visited states of sum_a pi A^2)
 
-    So neither a constant added to all rewards of a continuing task nor their scale matters; a factor of 2^k leaves
-    every bit as it is. Where all advantages are 0 nothing moves.
+    So neither a constant added to all rewards of a continuing task nor their scale matters; a factor of 2^k changes no
+    bit of the policy. A row in which all advantages are 0 stays as it is.
 
     Args:
-        options: those of tables. With `normalize` "rms" s is at least the standard error of a sampled lookahead; with
-            "none" it is 1, the paper's step in reward units. `floor` is the least that log pi(a|s) may be below its
-            largest in a row that moves, so that a policy which was sure too early can come back.
+        options: those of tables. With `normalize` "rms" c is at least the standard error of a sampled lookahead; with
+            "none" it is 1, the paper's step in reward units. After a step, log pi(a|s) is at most `floor` below the
+            largest of its row, so that a policy that became deterministic too early can recover.
     """
 
     policies = (SoftmaxPolicy, SimplexPolicy)
@@ -175,6 +174,6 @@ class MirrorUpdate(TabularUpdate):
 
 
 def _replace(table_SA: Float[Tensor, "S A"], state_N: Int[Tensor, "N"], row_NA: Float[Tensor, "N A"]) -> None:
-    """Write the rows; NotFinite, and nothing written, if they are no logits or probabilities."""
+    """Write rows into a table; NotFinite, and nothing is written, unless they are finite logits or probabilities."""
     check_finite("probability", "the next policy", row_NA, state_N)
     table_SA[state_N] = row_NA

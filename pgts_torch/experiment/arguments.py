@@ -1,4 +1,4 @@
-"""What the command line is made of: its parser, the types of its arguments, and its answers."""
+"""The command line's parser, the types of its arguments, its help and its output."""
 
 import argparse
 import json
@@ -18,7 +18,7 @@ WIDTH = 79
 
 
 class Parser(argparse.ArgumentParser):
-    """An argparse parser that reports a mistake in one line and takes no abbreviations."""
+    """An argparse parser that raises PgtsError in one line and takes no abbreviations."""
 
     def __init__(self, name: str, function: Callable[..., Any], **settings: Any) -> None:
         settings.setdefault("prog", f"pgts {name}".strip())
@@ -30,7 +30,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def print_help(self, file: Any = None) -> None:
-        """As argparse does, but without hiding that nobody reads."""
+        """As argparse, but a broken pipe raises an error."""
         (file or sys.stdout).write(self.format_help())
 
     def error(self, message: str) -> NoReturn:
@@ -43,11 +43,11 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 
 
 def describe_options(options: Sequence[Option]) -> Iterator[str]:
-    """The keys of a configuration for --help, by section."""
+    """Yield the lines of --help about the keys of a configuration, by section."""
     yield "keys, each --KEY VALUE or --KEY=VALUE, with the value in YAML:"
     yield from textwrap.wrap(
-        "A mapping replaces its whole section, as in --critic '{type: exact}'; a single key changes nothing but "
-        "itself. true may be left out.",
+        "A mapping replaces its whole section, as in --critic '{type: exact}'; a single key changes only itself. "
+        "true may be left out.",
         WIDTH,
         initial_indent="  ",
         subsequent_indent="  ",
@@ -76,7 +76,7 @@ def _describe_option(option: Option, indent: str) -> Iterator[str]:
 
 
 def _value(value: Any) -> str:
-    """A default as it would be written on the command line."""
+    """Return a default as it is written on the command line."""
     if isinstance(value, str):
         return value
     return f"{value:_}" if type(value) is int else json.dumps(value)
@@ -114,7 +114,7 @@ def json_object(text: str) -> dict[str, Any]:
     return value
 
 
-def share(text: str) -> float:
+def unit_interval(text: str) -> float:
     """An argparse type: a number in [0, 1]."""
     try:
         value = float(text)
@@ -136,26 +136,26 @@ def start(text: str) -> int | str:
 
 
 def path_kind(text: str) -> str | None:
-    """What is at a path that the system can tell of."""
+    """Return what is at a path (`files.kind`); ArgumentTypeError where it cannot be looked up."""
     try:
         text.encode()
         return files.kind(text, follow=True)
     except UnicodeEncodeError:
-        reason = "its name has letters that this locale lacks; set PYTHONUTF8=1, or LC_ALL to a locale of UTF-8"
+        reason = "its name has characters that this locale lacks; set PYTHONUTF8=1, or LC_ALL to a UTF-8 locale"
         raise argparse.ArgumentTypeError(f"{text!a}: {reason}") from None
     except PgtsError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def output_folder(text: str) -> Path:
-    """An argparse type: a folder, or where one can be made."""
+    """An argparse type: a folder, which need not exist yet."""
     if path_kind(text) not in (None, "folder"):
         raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
     return Path(text)
 
 
 def html_file(text: str) -> Path:
-    """An argparse type: a file that ends in .html, in a folder that exists."""
+    """An argparse type: a path that ends in .html, in an existing folder."""
     path = Path(text)
     if path.suffix != ".html" or path_kind(text) == "folder":
         raise argparse.ArgumentTypeError(f"{text!r} is not a file that ends in .html")
@@ -165,7 +165,7 @@ def html_file(text: str) -> Path:
 
 
 def run_folder(text: str) -> Path:
-    """An argparse type: a folder with the configuration of a run in it."""
+    """An argparse type: a folder that has the config.yaml of a run."""
     path = Path(text)
     if path_kind(text) != "folder":
         raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
@@ -175,7 +175,7 @@ def run_folder(text: str) -> Path:
 
 
 def print_values(answer: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print named values, for a program or for a person."""
+    """Print named values, as one JSON object or as a table."""
     if as_json:
         print(json.dumps(answer))
         return
@@ -186,7 +186,7 @@ def print_values(answer: Mapping[str, Any], *, as_json: bool) -> None:
 
 
 def _rows(answer: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted name, value) of nested values."""
+    """Yield (dotted name, value) for nested values."""
     for name, value in answer.items():
         if isinstance(value, Mapping):
             yield from _rows(value, f"{prefix}{name}.")

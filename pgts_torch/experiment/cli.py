@@ -1,6 +1,6 @@
 """The command `pgts`: one function for each subcommand.
 
-Torch is imported only after the arguments have proved themselves, so that mistakes and help appear at once.
+Torch is imported only after the arguments have been checked, so that errors and help appear at once.
 """
 
 import argparse
@@ -22,8 +22,8 @@ from pgts_torch.experiment.arguments import (
     path_kind,
     print_values,
     run_folder,
-    share,
     start,
+    unit_interval,
     whole,
     whole_list,
 )
@@ -52,9 +52,9 @@ def main(arguments: Arguments | None = None) -> int:
     """Run `pgts` with these arguments (default: those of the process).
 
     Returns:
-        The exit code: 0; 1 if `check-model` found something missing, a run of a sweep failed or a number in training
-        was not finite; 2 after a mistake of the caller, which stands on stderr, a line each; 130 after Ctrl-C, 143
-        after SIGTERM, 129 after SIGHUP.
+        The exit code: 0; 1 if `check-model` says no, a run of a sweep failed or a number in training was not finite; 2
+        after a mistake of the caller, reported on stderr, a line each; 130 after Ctrl-C, 143 after SIGTERM, 129 after
+        SIGHUP.
     """
     return exit_code(_run_command, sys.argv[1:] if arguments is None else arguments)
 
@@ -68,11 +68,11 @@ def exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> in
 def _exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> int:
     try:
         code = _dispatch(function, arguments)
-        sys.stdout.flush()  # meets a broken pipe here, not while the interpreter shuts down
+        sys.stdout.flush()  # so that a broken pipe is noticed here, not while the interpreter shuts down
         return code
     except PgtsError as error:
         rank = _rank()
-        if rank == (error.rank or 0):  # one that all processes meet is said by the first
+        if rank == (error.rank or 0):  # an error that all processes raise is printed by the first
             for line in str(error).splitlines():
                 print(f"error: {f'[rank {rank}] ' if rank else ''}{line}", file=sys.stderr)
         return TRAINING_FAILED if isinstance(error, NotFinite | RankLost) else USAGE_ERROR
@@ -94,7 +94,7 @@ def train(arguments: Arguments) -> None:
     parser = Parser("train", train, usage=usage)
     parser.add_argument("--config", metavar="FILE", help="YAML file with any of the keys below; none: the defaults")
     parser.add_argument("--resume", metavar="RUN_DIR", type=run_folder, help="go on with an unfinished run")
-    parser.add_argument("--overwrite", action="store_true", help="start anew, as --run.overwrite")
+    parser.add_argument("--overwrite", action="store_true", help="start from the beginning, as --run.overwrite")
     parser.add_argument(
         "--strict-resume", action="store_true", help="refuse a last checkpoint that is damaged or of other versions"
     )
@@ -137,7 +137,7 @@ def train(arguments: Arguments) -> None:
 def sweep(arguments: Arguments) -> None:
     """Train with several seeds at several depths, and compare."""
     parser = Parser("sweep", sweep, usage="%(prog)s --out DIR [--config FILE] [--KEY VALUE ...]")
-    parser.add_argument("--out", metavar="DIR", type=output_folder, help="gets DIR/depth-D/seed-S, a table, a picture")
+    parser.add_argument("--out", metavar="DIR", type=output_folder, help="for DIR/depth-D/seed-S, a table, a picture")
     parser.add_argument("--config", metavar="FILE", help="as for pgts train; none: the defaults")
     parser.add_argument("--seeds", metavar="N", type=whole(1), default=5, help="0 to N - 1 (default: %(default)s)")
     parser.add_argument("--depths", metavar="LIST", type=depth_list, default=(), help="as in 0,2,4 (default: its own)")
@@ -168,7 +168,7 @@ code is 1. SIGTERM or Ctrl-C lets the runs finish their iterations and save."""
 
 @command
 def evaluate(arguments: Arguments) -> None:
-    """Measure the policy that a run has left, in fresh episodes."""
+    """Evaluate the last checkpoint of a run, in new episodes."""
     parser = Parser("evaluate", evaluate)
     parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run")
     parser.add_argument("--episodes", metavar="N", type=whole(1), default=100, help="how many (default: %(default)s)")
@@ -206,7 +206,7 @@ STATIONARY_OPTIONS = {
     "deep_sea": ("n", "gamma", "start"),
     "file.npz": ("start",),
 }
-"""The MDPs of `pgts stationary`, each with the options that change it."""
+"""The MDPs of `pgts stationary`, each with its options."""
 
 
 @command
@@ -221,8 +221,8 @@ def stationary(arguments: Arguments) -> None:
         ("branching", whole(1), "successors of each state and action of random (default: all states)"),
         ("mdp-seed", whole(0), "of random (default 0)"),
         ("traps", whole_list, "states of the grid that cost 10, as in 1,5 (default: none)"),
-        ("gamma", share, "discount (default 0.9; deep_sea 0.99; a file has its own)"),
-        ("start", start, "a state, or uniform for all alike (default: state 0; a file has its own)"),
+        ("gamma", unit_interval, "discount (default 0.9; deep_sea 0.99; a file has its own)"),
+        ("start", start, "a state, or uniform over all states (default: state 0; a file has its own)"),
     ]:
         parser.add_argument(f"--{name}", metavar="N", type=kind, help=meaning)
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
@@ -246,7 +246,7 @@ A file of your own, written by numpy.savez("mdp.npz", P=P, R=R, gamma=0.9):
   R      [S, A]     expected rewards
   gamma  a number   discount in [0, 1]
   start  optional   a state, or a distribution [S]; uniform where it is missing
-An end is a state that leads to itself and earns 0."""
+A terminal state is one that leads to itself and earns 0."""
 
 
 @command
@@ -288,7 +288,7 @@ def _add_trust(parser: Parser, when: str = "") -> None:
 
 
 def _dispatch(function: Callable[[Arguments], None], arguments: Arguments) -> int:
-    """Run a command and return its exit code; argparse leaves by SystemExit after --help."""
+    """Run a command and return its exit code; argparse raises SystemExit after --help."""
     try:
         function(arguments)
     except SystemExit as leave:
@@ -297,7 +297,7 @@ def _dispatch(function: Callable[[Arguments], None], arguments: Arguments) -> in
 
 
 def _run_command(arguments: Arguments) -> None:
-    """Hand the arguments after the subcommand to its function."""
+    """Call the function of a subcommand with the arguments after it."""
     summaries = [f"  {name:<12}{(function.__doc__ or '').partition(chr(10))[0]}" for name, function in COMMANDS.items()]
     parser = Parser("", main, usage="pgts [-h] [--version] COMMAND ...")
     parser.description = "Policy gradient with tree search."
@@ -321,7 +321,7 @@ def _run_command(arguments: Arguments) -> None:
 
 
 def _rank() -> int:
-    """The number of this process among those that torchrun has started, of which the first one speaks."""
+    """The rank of this process under torchrun, else 0; rank 0 prints."""
     return int(os.environ["RANK"]) if "TORCHELASTIC_RUN_ID" in os.environ else 0
 
 

@@ -324,5 +324,5 @@ def test_a_critic_that_knows_no_policy_yet_says_so():
         RolloutCritic(TabularModel(ladder())),
         TabularCritic(5, 2, TabularValues(target="q")),
     ):
-        with pytest.raises(PgtsError, match="no policy yet"):
+        with pytest.raises(PgtsError, match="has no values yet"):
             critic.v(states)

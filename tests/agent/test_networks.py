@@ -37,7 +37,7 @@ def test_an_mlp_is_the_formula_of_its_weights(hidden, activation, function):
     h = x_ND
     for weight, bias in zip(weights[:-2:2], weights[1:-2:2], strict=True):
         h = function(h @ weight.T + bias)
-    torch.testing.assert_close(net.evaluate(x_ND).double(), h @ weights[-2].T + weights[-1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(net.outputs(x_ND).double(), h @ weights[-2].T + weights[-1], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("hidden", [(), (5,), (5, 9), (9, 5)])
@@ -51,7 +51,7 @@ def test_a_cnn_is_the_formula_of_its_weights(hidden):
     h = h.flatten(1)
     for weight, bias in zip(weights[4:-2:2], weights[5:-2:2], strict=True):
         h = (h @ weight.T + bias).relu()
-    torch.testing.assert_close(net.evaluate(views(4)).double(), h @ weights[-2].T + weights[-1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(net.outputs(views(4)).double(), h @ weights[-2].T + weights[-1], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("description", "space"), [(MLP(), VECTORS), (MLP(hidden=(8,)), STATES), (CNN(), VIEWS)])
@@ -76,7 +76,7 @@ def test_weights_are_drawn_from_the_given_stream_and_torch_s_own_generator_is_le
 
 def test_states_are_seen_as_one_hot_rows():
     net = network(MLP(hidden=()), STATES)
-    output_ND = net.evaluate(torch.tensor([4, 0, 4]))
+    output_ND = net.outputs(torch.tensor([4, 0, 4]))
     expected_ND = net.head.weight.T[[4, 0, 4]] + net.head.bias
     torch.testing.assert_close(output_ND, expected_ND.detach())
     assert torch.equal(net.encode(torch.tensor([2])), torch.tensor([[0.0, 0, 1, 0, 0]]))
@@ -95,7 +95,7 @@ def test_images_are_scaled_and_their_channels_come_first():
 def test_the_default_convolutions_of_a_minigrid_view_leave_4_by_4_by_64():
     net = network(CNN(), VIEWS)
     assert net.trunk.layers[:7](net.encode(views(3))).shape == (3, 64 * 4 * 4)
-    assert net.evaluate(views(3)).shape == (3, 2)
+    assert net.outputs(views(3)).shape == (3, 2)
     wide = network(
         CNN(channels=(8, 8), kernel_size=4, stride=2, hidden=(5,)), spaces.Box(0, 255, (40, 30, 1), np.uint8)
     )
@@ -104,9 +104,9 @@ def test_the_default_convolutions_of_a_minigrid_view_leave_4_by_4_by_64():
 
 def test_what_a_network_says_of_a_row_does_not_depend_on_how_many_are_asked_at_once(monkeypatch):
     net, x_ND = network(MLP(), VECTORS), torch.randn(10, 3, generator=stream(0, "x"))
-    whole_ND = net.evaluate(x_ND)
+    whole_ND = net.outputs(x_ND)
     monkeypatch.setattr(networks, "_MOST_INPUTS", 3 * 64)
-    torch.testing.assert_close(net.evaluate(x_ND), whole_ND)
+    torch.testing.assert_close(net.outputs(x_ND), whole_ND)
 
 
 def test_running_statistics_are_those_of_all_rows_absorbed():
@@ -150,7 +150,7 @@ def test_asking_a_network_changes_no_statistics():
     net = network(MLP(normalize=True), VECTORS)
     x_ND = torch.randn(10, 3, generator=stream(0, "x"))
     before = net.plain_state()
-    net.evaluate(x_ND)
+    net.outputs(x_ND)
     assert all(torch.equal(value, before[name]) for name, value in net.plain_state().items())
     net.trunk.encoder.absorb(x_ND)
     assert not torch.equal(net.plain_state()["trunk.encoder.norm.mean_D"], before["trunk.encoder.norm.mean_D"])
@@ -171,10 +171,10 @@ def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_cha
         with pytest.raises(
             PgtsError, match=r"is None|head.bias is torch.float(32 of shape \(3,\)|64)|more belongs to another network"
         ):
-            second.take_over(wrong)
+            second.load_plain_state(wrong)
     assert all(torch.equal(value, before[name]) for name, value in second.plain_state().items())
-    second.take_over(state)
-    assert torch.equal(first.evaluate(x_ND), second.evaluate(x_ND))
+    second.load_plain_state(state)
+    assert torch.equal(first.outputs(x_ND), second.outputs(x_ND))
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_cha
         (lambda: network(MLP(normalize=True), STATES), "states are numbers without a scale"),
         (lambda: network(MLP(), spaces.MultiDiscrete([2, 3])), "observations are MultiDiscrete"),
         (lambda: network(MLP(), spaces.Discrete(3, start=1)), "observations are Discrete"),
-        (lambda: network(MLP(), VECTORS).evaluate(torch.zeros(2, 4)), r"shape \(4,\); it must be \(3,\)"),
+        (lambda: network(MLP(), VECTORS).outputs(torch.zeros(2, 4)), r"shape \(4,\); it must be \(3,\)"),
     ],
 )
 def test_what_no_network_can_be_made_of_or_see_is_refused(make, message):

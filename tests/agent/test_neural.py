@@ -46,7 +46,7 @@ def tabular_critic(value_S: list[float] | Tensor, **options) -> NetworkCritic:
     value_SD = torch.as_tensor(value_S, dtype=torch.float32)
     critic = NetworkCritic(spaces.Discrete(len(value_SD)), 2, NetworkValues(network=MLP(hidden=()), **options))
     weight_DS = value_SD.reshape(len(value_SD), -1).T
-    critic.network.take_over({"head.weight": weight_DS, "head.bias": torch.zeros(len(weight_DS))})
+    critic.network.load_plain_state({"head.weight": weight_DS, "head.bias": torch.zeros(len(weight_DS))})
     return critic
 
 
@@ -230,7 +230,7 @@ def test_a_new_scale_of_the_targets_leaves_learned_values_where_they_were():
 def test_a_target_network_lags_behind(polyak, target_period):
     options = {"polyak": polyak, "target_period": target_period, "normalize_returns": False}
     critic = tabular_critic([0.0] * 4, learning_rate=0.1, **options)
-    critic._target_network.take_over(critic.network.plain_state())
+    critic._target_network.load_plain_state(critic.network.plain_state())
     lagging_S, states = critic.v(torch.arange(4)), torch.arange(4)
     for k in range(1, 7):
         critic.fit(following(torch.ones(4, 2) / 2), by_hand(), generator=stream(k, "critic"))
@@ -244,8 +244,8 @@ def test_a_target_network_lags_behind(polyak, target_period):
 def test_values_that_were_asked_for_before_a_fit_are_not_asked_for_again(polyak, asks, monkeypatch):
     values, options = [0.5, -1.0, 2.0, 0.0], {"learning_rate": 0.1, "polyak": polyak}
     asking, silent = (fitted(tabular_critic(values, **options)) for _ in range(2))
-    counted, evaluate = [], asking.network.evaluate
-    monkeypatch.setattr(asking.network, "evaluate", lambda seen_N: counted.append(seen_N) or evaluate(seen_N))
+    counted, outputs = [], asking.network.outputs
+    monkeypatch.setattr(asking.network, "outputs", lambda seen_N: counted.append(seen_N) or outputs(seen_N))
     made = by_hand()
     for k in range(3):
         counted.clear()
@@ -348,6 +348,6 @@ def test_options_that_make_no_sense_are_refused(options, message):
 def test_a_critic_that_lacks_what_it_is_asked_for_says_so():
     with pytest.raises(PgtsError, match="learns v"):
         NetworkCritic(VECTORS, 2).q(POINTS_SD)
-    with pytest.raises(PgtsError, match="no policy yet"):
+    with pytest.raises(PgtsError, match="has no values yet"):
         NetworkCritic(VECTORS, 2, NetworkValues(target="q")).v(POINTS_SD)
     assert isinstance(following(torch.ones(2, 2) / 2), SimplexPolicy)

@@ -243,8 +243,8 @@ def test_with_sampled_advantages_a_critic_values_each_visit_and_each_end_once_an
     estimator = {"type": "sampled", "lambda": 0.9}
     model = make("CartPole-v1", depth=0, estimator=estimator, policy="mlp", critic={"type": "network", "num_epochs": 1})
     network, rows = model.critic.network, []
-    evaluate = network.evaluate
-    monkeypatch.setattr(network, "evaluate", lambda seen_N: rows.append(len(seen_N)) or evaluate(seen_N))
+    outputs = network.outputs
+    monkeypatch.setattr(network, "outputs", lambda seen_N: rows.append(len(seen_N)) or outputs(seen_N))
     experience = model.iterate().experience
     assert rows == [experience.num_steps + experience.num_episodes]
 

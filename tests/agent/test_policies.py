@@ -126,5 +126,5 @@ def test_a_policy_without_probabilities_draws_no_action():
     policy = SoftmaxPolicy(3, 2)
     policy.logits_SA[1, 0] = torch.nan
     assert len(policy.sample(torch.tensor([0, 2]), generator=stream(0, "actions"))) == 2
-    with pytest.raises(PgtsError, match=r"the policy has no probabilities, but \[nan, nan\]"):
+    with pytest.raises(PgtsError, match=r"the policy's probabilities are \[nan, nan\]"):
         policy.sample(torch.arange(3), generator=stream(0, "actions"))

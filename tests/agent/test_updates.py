@@ -124,7 +124,7 @@ def test_the_softmax_update_is_the_gradient_of_the_weighted_mean_value():
     ],
 )
 def test_a_policy_that_an_update_cannot_move_is_refused(update, kind, fits):
-    with pytest.raises(PgtsError, match=f"{update.__name__} moves a {fits}, not a {kind.__name__}"):
+    with pytest.raises(PgtsError, match=f"{update.__name__} updates a {fits}, not a {kind.__name__}"):
         update().check(kind(3, 2))
 
 
