@@ -555,6 +555,18 @@ def test_what_only_an_adaptive_depth_heeds_is_refused_beside_a_number(key: str) 
         load(None, ["--search.depth", "4", f"--search.{key}", "1"])
 
 
+@pytest.mark.parametrize("kind", ["auto", "expectimax", "sampled", "mcts"])
+def test_a_file_of_version_0_1_with_null_for_what_another_kind_of_search_has_means_what_it_did(
+    kind: str, tmp_path: Path
+) -> None:
+    nulls = {"max_width": None, "samples": None, "share": None, "simulations": None, "merge": None}
+    text = strict_yaml.dump({"search": {"depth": 2, "kind": kind} | nulls})
+    (tmp_path / "c.yaml").write_text(text)
+    assert load(tmp_path / "c.yaml") == load(None, ["--search.depth", "2", "--search.kind", kind])
+    with pytest.raises(ConfigError, match=r"--search.best is unknown"):
+        load(tmp_path / "c.yaml", ["--search.best", "null"])
+
+
 @pytest.mark.parametrize(("key", "value"), [("stop_at_return", 0.5), ("stop_at_return", 0.0), ("keep_best", True)])
 def test_what_only_evaluations_during_training_heed_is_refused_without_them(key: str, value: Any) -> None:
     word = str(value).lower()
