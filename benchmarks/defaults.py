@@ -1,6 +1,6 @@
 """What a stranger gets who gives no options: the defaults on problems that they have not been chosen on.
 
-    python benchmarks/defaults.py tables|networks [--seeds 100 101 ...] [--only NAME ...] [--short]
+    python benchmarks/defaults.py tables|networks [--seeds 1000 1001 ...] [--only NAME ...] [--short]
 
 Prints the table of docs/benchmarks.md, section Defaults. `--short` (also `--quick`) takes less than a minute.
 """
@@ -17,7 +17,7 @@ TABLES = {"tables": defaults_tables.table, "networks": defaults_networks.table}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("part", choices=list(TABLES))
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(100, 110)))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(1000, 1010)))
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="the rows whose first column begins so")
     parser.add_argument("--short", "--quick", action="store_true", help="less than a minute, for tests")
     given = parser.parse_args()

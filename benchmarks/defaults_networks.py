@@ -29,8 +29,14 @@ class Task:
 
 TASKS = (Task("CartPole-v1", 475, 10), Task("Acrobot-v1", -100, 10), Task(key_and_door.ID, 0.95, 8))
 
-FORMS: dict[str, dict[str, Any]] = {"after": {}, "before": {"update": "ppo"}}
-"""Options of `PGTS`. Before this version the default update was PPO."""
+BEFORE: dict[str, Any] = {
+    "update": "ppo",
+    "critic": {"type": "network", "fresh_targets": False},
+    "num_envs": 32,
+    "horizon": {"type": "fixed", "length": 100},
+}
+FORMS: dict[str, dict[str, Any]] = {"after": {}, "before": BEFORE}
+"""Options of `PGTS`: the defaults, and PPO on the same lookahead as it was before them."""
 
 
 BEFORE_SEEDS = 3

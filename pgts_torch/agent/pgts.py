@@ -87,7 +87,7 @@ class PGTS:
         critic: Description | Critic | None = None,
         update: Description | Update | None = None,
         horizon: Description = "fixed",
-        num_envs: int = 32,
+        num_envs: int = 16,
         actions_per_dimension: int | None = None,
         action_repeat: int = 1,
         model_check: Mode = "error",

@@ -13,7 +13,7 @@ class FixedHorizon(Part):
 
     type: Literal["fixed"] = "fixed"
 
-    length: Count = 100
+    length: Count = 200
     """Steps of a rollout."""
 
     @property
@@ -42,7 +42,7 @@ Horizon = FixedHorizon | GeometricHorizon
 class Rollouts(Part):
     """The rollouts of one iteration."""
 
-    num_envs: Count = 32
+    num_envs: Count = 16
     """Rollouts of one iteration, each in an environment of its own."""
 
     horizon: Horizon = Field(default=FixedHorizon(), discriminator="type")
