@@ -119,7 +119,7 @@ def test_a_network_learns_to_balance_a_pole_by_dynamics_in_torch_and_by_a_simula
     )
     assert isinstance(model.world, kind)
     assert shown(model) < 40
-    assert shown(model.learn(2_000)) > 80
+    assert shown(model.learn(4_000)) > 80
 
 
 def test_a_cnn_learns_to_walk_to_the_goal_that_it_sees():
