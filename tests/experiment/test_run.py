@@ -165,7 +165,7 @@ def test_training_ends_at_the_stated_return_of_greedy_episodes_and_the_best_mode
     greedy = [line["eval/deterministic_return"] for line in lines if "eval/deterministic_return" in line]
     assert greedy[-1] == 96.0 == PGTS.load(tmp_path / "run" / "best.pt").predict(0) * 96
     assert all(score < 96 for score in greedy[:-1])
-    assert last_checkpoint(tmp_path / "run").parent.name == f"{summary.env_steps:012d}"
+    assert last_checkpoint(tmp_path / "run").stem == f"{summary.env_steps:012d}"
     summary = run.train(few_iterations(tmp_path, *fast, "--run.overwrite", "--total_steps", "600"))
     assert summary.env_steps >= 600
     assert summary.ended_by == "total_steps"
