@@ -1,4 +1,4 @@
-"""A policy as it acts outside of training: from what an environment shows to what it takes."""
+"""Acting with a trained policy: from observations to actions in the environment's own form."""
 
 from typing import final
 
@@ -12,12 +12,12 @@ from pgts_torch.agent.world import World
 
 @final
 class Actor:
-    """Acts by a policy, without search.
+    """Selects actions by a policy, without search.
 
     Args:
-        world: says what the policy sees.
-        actions: what the environment takes for each action of the policy; None: its number.
-        generator: draws actions where no other one is given.
+        world: makes tensors of observations.
+        actions: the environment's action for each action of the policy; None: the number of the action itself.
+        generator: for sampled actions, unless another one is given.
     """
 
     def __init__(self, world: World, policy: Policy, actions: np.ndarray | None, generator: torch.Generator) -> None:

@@ -61,17 +61,17 @@ class ModelCheck:
     Args:
         world: the environments and their model.
         mode: "error", "warn" or "off".
-        is_asked: whether a lookahead queries the model; else nothing is checked.
+        is_queried: whether a lookahead queries the model; else nothing is checked.
         seed: for the sample of steps.
         ranks: the processes that train together; a contradiction stops all of them.
     """
 
-    def __init__(self, world: World, *, mode: Mode, is_asked: bool, seed: int, ranks: Ranks) -> None:
+    def __init__(self, world: World, *, mode: Mode, is_queried: bool, seed: int, ranks: Ranks) -> None:
         if mode not in get_args(Mode):
             raise PgtsError(f"model_check is {mode!r}; it must be one of {', '.join(map(repr, get_args(Mode)))}")
         self.mode, self.contradictions, self.model_calls = mode, 0, 0
         self._world, self._seed, self._ranks = world, seed, ranks
-        model = world.model if is_asked and mode != "off" else None
+        model = world.model if is_queried and mode != "off" else None
         self._model = model if isinstance(model, ExactModel) else None
         self._said: list[str] = []
         self._frequencies: dict[str, Frequencies] = {}

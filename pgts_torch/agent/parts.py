@@ -1,4 +1,4 @@
-"""What a training is made of, by the arguments of `PGTS`."""
+"""Make the parts of a training from the arguments of `PGTS`."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from pgts_torch.seeding import SharedGenerators
 
 
 class Parts(NamedTuple):
-    """The parts of a training; search, certificates and depth choice are None where advantages are sampled."""
+    """The parts of a training; search, certificates and depth choice are None with sampled advantages."""
 
     options: Training
     source: EnvSource
@@ -42,11 +42,11 @@ class Parts(NamedTuple):
 
 
 def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
-    """The parts, from the environment to the check of its model; those that are given as objects are taken as they are.
+    """Make all parts, from the environments to the model check; parts that are given as objects are used as they are.
 
     Args:
-        arguments: all of `PGTS`.
-        ranks: that train together.
+        arguments: all arguments of `PGTS`.
+        ranks: the processes that train together.
 
     Raises:
         PgtsError, MissingModel, ModelMismatch: as `PGTS`.
@@ -78,7 +78,7 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
         depth_choice = DepthChoice(look, certificates, depths=depths, tolerance=tolerance, stop_at=stop_at)
         estimator = LookaheadEstimator(look, depth_choice, update.state_weight)
     model_check = ModelCheck(
-        world, mode=options.search.model_check, is_asked=search is not None, seed=seed, ranks=ranks
+        world, mode=options.search.model_check, is_queried=search is not None, seed=seed, ranks=ranks
     )
     check_parts(arguments, world, policy, update)
     return Parts(
@@ -87,7 +87,7 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
 
 
 def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks) -> tuple[EnvSource, World]:
-    """Where environments come from, and the world of this rank's part of them."""
+    """Return the source of environments, and the world of this rank's part of them."""
     num_envs, given = options.rollout.num_envs, ("gamma", "actions_per_dimension")
     with SharedGenerators(arguments["seed"], "construction"):
         source = EnvSource.of(

@@ -29,45 +29,45 @@ from pgts_torch.seeding import stream
 from pgts_torch.tabular.mdp import TabularMDP
 
 Callback = Callable[["PGTS", Iteration], bool | None]
-"""Called after each iteration; returning False ends the training. `agent.callbacks` has some."""
+"""A function that is called after each iteration; if it returns False, training ends. See also `agent.callbacks`."""
 
 
 @final
 class PGTS:
-    """A policy that is pushed toward what a depth-m lookahead sees at the states it visits.
+    """Trains a policy with the values of a depth-m lookahead at the states that it visits.
 
         pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d^pi(s) (T^m Q^pi)(s, .) ]        [PGTS Eq. (3)]
 
-    The tree is used in training only; acting is one look into the policy. Everything random in iteration k is drawn
-    from streams named by (seed, k), so a loaded model goes on exactly as the saved one would have.
+    The lookahead is used in training only; `predict` evaluates the policy alone. All random numbers of iteration k are
+    from streams named by (seed, k), so that a loaded model continues exactly as the saved one would have.
 
     Where torch.distributed has a default process group, its processes train one policy together (`agent.ranks`): each
-    makes its part of the episodes and of the lookahead. They must make the same calls, with the same arguments.
+    computes its part of the episodes and of the lookahead. They must make the same calls, with the same arguments.
 
     Args:
-        env: a Gymnasium id; a spec; an instance, of whose spec others are made, which have to be like it; a function
-            that makes one; or several as a VectorEnv that resets by mask (`EnvSource`). What a lookahead queries is
-            the environment's table (pgts/*, or a P table), else its dynamics in torch (CartPole, Acrobot, MountainCar,
-            Pendulum), else a simulator that is restored from snapshots.
+        env: a Gymnasium id; a spec; an instance, from whose spec equal ones can be made; a function that makes one; or
+            a VectorEnv that can reset by mask (`EnvSource`). The model of the lookahead is the environment's table
+            (pgts/*, or a P table), else its dynamics in torch (CartPole, Acrobot, MountainCar, Pendulum), else a
+            simulator that is restored from snapshots.
         depth, max_depth, tolerance, stop_at: m, or how it is chosen, and when training ends (`options.search.Depth`).
-        search: how the lookahead is made: "auto", MCTS(simulations=32), {"type": "sampled", "samples": 8}, ...
-        estimator: "lookahead", or SampledAdvantages(), of the actions taken: it needs depth 0, a network and no model.
+        search: the search for the lookahead: "auto", MCTS(simulations=32), {"type": "sampled", "samples": 8}, ...
+        estimator: "lookahead", or SampledAdvantages() of actions taken, which needs depth 0, a network and no model.
         policy, critic, update, horizon: options of these parts (`pgts_torch.options`), their names, or the parts
-            themselves. Default: tables where the states of the environment are numbered, else networks.
+            themselves. Default: tables where observations are numbered states, else networks.
         num_envs: episodes in each iteration, of all processes together; a VectorEnv keeps its own number, for each.
-        actions_per_dimension: into how many evenly spaced values, from the lowest to the highest, each dimension of
-            continuous actions is divided; None: actions are discrete, of MultiDiscrete each combination of them.
+        actions_per_dimension: the number of evenly spaced values, from the lowest to the highest, for each dimension of
+            continuous actions; None: actions are discrete, or MultiDiscrete, whose combinations are numbered.
         action_repeat, model_check: of the model (`options.search.Depth`, `TensorModel`, `ModelCheck`).
-        observation_key: which part of dictionary observations policy and critic see.
-        reward_range: the lowest and the highest reward of a single step, to which environment and model are held.
-            `stop_at` and an adaptive depth need it where the model knows no largest reward (simulators).
-        gamma: discount. Default: the environment's own (pgts/*), else 0.99. A VectorEnv of pgts/* brings its own.
-        seed, device: of everything random, and where policy, critic and model live.
+        observation_key: the entry of dictionary observations that policy and critic use.
+        reward_range: the lowest and the highest reward of a single step; a reward outside of it is an error. `stop_at`
+            and an adaptive depth need it where the model has no largest reward (simulators).
+        gamma: discount. Default: the environment's own (pgts/*), else 0.99. A VectorEnv of pgts/* has its own.
+        seed: of all random numbers.   device: of policy, critic and model.
         env_kwargs: for gymnasium.make, if the environment is given by its id.
 
     Raises:
         PgtsError: parts that do not fit each other, or options out of range.
-        MissingModel: nothing that a lookahead could query.
+        MissingModel: the environment has no model that a lookahead could query.
         ModelMismatch: rewards of a table are outside `reward_range`.
     """
 
@@ -113,14 +113,14 @@ class PGTS:
     @torch.inference_mode(False)
     @torch.enable_grad()
     def iterate(self) -> Iteration:
-        """One pass through the loop: visit states, estimate Q^pi, look m steps ahead, move pi.        [PGTS Alg. 1]"""
+        """Run one iteration: visit states, estimate Q^pi, look m steps ahead, update pi.        [PGTS Alg. 1]"""
         draws = self.ranks.draws(self.seed, self.num_iterations, self.device)
         calls_before = self.estimator.model_calls
 
         # Visit states with pi_k.
         experience = visit(self.world, self.policy, self.horizon, draws, self.ranks)
 
-        # The advantages of actions taken, if these are wanted, stand on the critic before it learns from them.
+        # Sampled advantages use the critic before it is fitted to the same episodes.
         batch = self.estimator(experience, draws) if self.estimator.comes_first else None
 
         # Evaluate pi_k: estimate Q^{pi_k} (line 2).
@@ -130,13 +130,13 @@ class PGTS:
         # Look m steps ahead from the states with d(s) > 0.
         batch = batch or self.estimator(experience, draws)
 
-        # Hold what happened to what the model says, before pi learns from either.
+        # Check the episodes against the model, before pi is updated.
         self.model_check(experience, self.num_iterations)
 
         # Update: pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is good enough.
         if not batch.is_enough:
-            seen = batch.observation_N, batch.advantage_NA, batch.weight_N
-            losses |= self.update(self.policy, *seen, generator=draws.common, noise=batch.noise)
+            columns = batch.observation_N, batch.advantage_NA, batch.weight_N
+            losses |= self.update(self.policy, *columns, generator=draws.common, noise=batch.noise)
 
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
@@ -146,18 +146,18 @@ class PGTS:
 
     @property
     def mdp(self) -> TabularMDP:
-        """The exact truth behind the environment; PgtsError where there is none."""
+        """The exact MDP of the environment; PgtsError where it is not known."""
         if self.world.mdp is None:
             raise PgtsError(f"nothing exact is known of {self.source.name}")
         return self.world.mdp
 
     def policy_table(self) -> Float[Tensor, "S A"]:
-        """pi(.|s) for all states, on the CPU in float64; PgtsError where they cannot be listed."""
+        """pi(.|s) for all states, on the CPU in float64; PgtsError where states are not numbered."""
         return exact_probs(self.policy, torch.arange(self.mdp.num_states, device=self.device))
 
     def lookahead(self, state_N: Int[Tensor, "N"], *, depth: int | None = None) -> Lookahead:
-        """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves. m is by default
-        that of the training, or the largest of an adaptive depth."""
+        """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves. The default of m
+        is the depth of the training, or the largest of an adaptive depth."""
         if self.depth_choice is None:
             raise PgtsError("with sampled advantages there is no lookahead")
         depth = self.depth_choice.depths[-1] if depth is None else depth
@@ -165,11 +165,11 @@ class PGTS:
         return self.depth_choice.look(state_N, depth, generator)
 
     def learn(self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool = False) -> Self:
-        """Iterate until `total_steps` environment steps have been made in all, counting those before this call.
+        """Iterate until there are `total_steps` environment steps, including those before this call.
 
         Args:
-            callback: one or more, each called with (self, iteration) after each iteration; if one returns False, the
-                training ends, in all processes.
+            callback: one or more, each called with (self, iteration) after each iteration; if one returns False,
+                training ends in all processes.
             progress: show a progress bar.
 
         Raises:
@@ -192,28 +192,28 @@ class PGTS:
     def predict(
         self, observation: ArrayLike, *, deterministic: bool = True, generator: torch.Generator | None = None
     ) -> np.ndarray | np.generic:
-        """Actions for observations, as the environment takes them; no search.
+        """Return actions for observations, in the form of the environment; without search.
 
         Args:
-            observation: what the environment shows, or an array of it.
-            deterministic: the most probable action, else one drawn from pi.
-            generator: for drawing; default one from this model's seed, which goes on from call to call.
+            observation: an observation of the environment, or an array of them.
+            deterministic: take the most probable action; else sample from pi.
+            generator: for sampling; default: one with this model's seed, which continues from call to call.
         """
         return self._act(observation, deterministic=deterministic, generator=generator)
 
     def save(self, path: str | Path) -> None:
-        """Write everything that training or acting goes on from into one file with a checksum, but for an environment
-        that was given as an object. Of several processes all must call it, and the first one writes.
+        """Write arguments and state into one file with a checksum, without an environment that was given as an object.
+        If several processes train together all must call it, and the first one writes.
 
         Raises:
-            PgtsError: a part was given as an object, so that no file can describe it, or an argument is no plain value;
-                or there is a file that is no saved model: that stays.
+            PgtsError: a part was given as an object, which cannot be saved, or an argument is no plain value; or there
+                is another file at `path`, which is not replaced.
         """
         content = self.content()
         self.ranks.first("a saved model", lambda: saving.write(saving.target(path), content))
 
     def content(self) -> dict[str, Any]:
-        """What `save` writes: the arguments and the state. Of several processes all must ask for it."""
+        """Return the content of `save`: arguments and state. If several processes train together all must call it."""
         return {"arguments": plain(self._arguments, self.options), "state": self.state_dict()}
 
     @classmethod
@@ -225,25 +225,25 @@ class PGTS:
         device: torch.device | str | None = None,
         trust_imports: bool = False,
     ) -> Self:
-        """The model that `save` wrote; it trains on exactly as the saved one would have. Outcomes that its lookahead
-        remembers are queried again, which `num_model_calls` does not count.
+        """Return the model that `save` wrote; it trains exactly as the saved one would have. The outcomes known to its
+        lookahead are queried again, which `num_model_calls` does not count.
 
         Args:
-            env: the environment, where it was given to the saved model as an object; default its id.
-            device: where to load it; default the device it was saved from.
-            trust_imports: import the module that the id of its environment may name, as in "module:Id-v0". Nothing
-                else in a file is executed.
+            env: the environment, if it was given to the saved model as an object; default: the saved id.
+            device: where to load it; default: the device it was saved from.
+            trust_imports: whether the module that the id of its environment may name, as in "module:Id-v0", is
+                imported. Nothing else in a file is executed.
 
         Raises:
-            PgtsError: no such file, damaged, or not ours; it names a module that is not trusted; env is missing, or
-                given in vain.
+            PgtsError: no such file, damaged, or no saved model; it names a module that is not trusted; env is missing,
+                or not needed.
         """
         return saved.load_training(path, cls, env=env, device=device, trust_imports=trust_imports)
 
     def state_dict(self) -> dict[str, Any]:
-        """What training goes on from (`saved.state_of`). Of several processes all must ask for it."""
+        """Return the state of the training (`saved.state_of`). If several processes train together all must call it."""
         return saved.state_of(self)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave; or nothing of it and PgtsError, where it is no state of such a model."""
+        """Load what `state_dict` returned; PgtsError, and nothing is loaded, if it is no state of such a model."""
         saved.restore(self, state)

@@ -1,6 +1,6 @@
-"""What a run can be configured to do.
+"""The configuration of a run.
 
-This module and everything it imports are free of torch, so that mistakes and help appear at once.
+This module and all it imports do not import torch, so that errors and help appear at once.
 """
 
 from collections.abc import Sequence
@@ -19,26 +19,26 @@ from pgts_torch.options.training import Training
 
 
 class General(Part):
-    """What is of the whole run."""
+    """Options of the whole run."""
 
     name: Name = "run"
-    """Begins the name of the run's folder."""
+    """The beginning of the name of the run's folder."""
 
     seed: Natural = 0
-    """Everything random follows from it."""
+    """The seed of all random numbers."""
 
     total_steps: Count = 50_000
     """Environment steps to train for."""
 
     device: Device = "cpu"
-    """Where tensors live."""
+    """The device of policy, critic and model."""
 
     threads: Annotated[int, Field(ge=1, le=1024)] = 1
-    """Threads of torch."""
+    """The number of threads of torch."""
 
 
 class Config(Training, General):
-    """A whole run."""
+    """The configuration of a run."""
 
     log: LogConfig = LogConfig()
     eval: EvalConfig = EvalConfig()
@@ -50,7 +50,7 @@ class Config(Training, General):
         return with_types(data) if isinstance(data, dict) else data
 
     def arguments(self) -> dict[str, Any]:
-        """The arguments of `PGTS`."""
+        """Return the arguments of `PGTS`."""
         env, critic = dict(self.env), self.critic
         if (
             isinstance(critic, NetworkValues)
@@ -66,15 +66,17 @@ class Config(Training, General):
 
 
 NULL_ONCE = ("max_width", "samples", "share", "simulations", "merge")
-"""Options of a kind of search that version 0.1 wrote down as null for the other kinds, and for their default."""
+"""Options of a kind of search that version 0.1 wrote as null for the other kinds, and for their default."""
 
 MIRROR_OF_NETWORKS = Mirror.model_fields.keys() - {"type", *Mirror.standing("tables")}
 """Options of the mirror update that only networks have."""
 
 
 def with_types(data: dict[str, Any]) -> dict[str, Any]:
-    """The values, with the type of policy, critic and update where they name other keys but not their type: the first
-    of those that suit the rest of the values and know these keys, else the first that suits."""
+    """Return the values with a type for policy, critic and update where these have other keys but no type.
+
+    It is the first type that goes with the other values and has all these keys; if none has, the first that goes.
+    """
     if isinstance(search := data.get("search"), dict):
         kept = {name: value for name, value in search.items() if value is not None or name not in NULL_ONCE}
         data = data | {"search": {"kind": "auto"} | kept}
@@ -107,7 +109,7 @@ def _type(data: dict[str, Any], name: str) -> Any:
 
 
 def dump(config: Config) -> str:
-    """Every key of the configuration as YAML; `loading.load` reads the same configuration back."""
+    """Return all keys of the configuration as YAML, from which `loading.load` reads the same configuration."""
     return strict_yaml.dump(_tag_first(config.model_dump(by_alias=True)))
 
 

@@ -1,4 +1,4 @@
-"""From a file and command-line overrides to a `Config`, with every mistake reported at once."""
+"""Load a `Config` from a file and command-line overrides, and report all mistakes at once."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -19,11 +19,11 @@ MAX_BYTES = 2**15
 """A larger configuration file is refused."""
 
 MAX_MISTAKES = 50
-"""So many are listed; the rest is counted."""
+"""Messages list at most so many mistakes, and the number of the others."""
 
 
 class ConfigError(PgtsError):
-    """What is wrong with a configuration: one line for each mistake."""
+    """The mistakes in a configuration, a line for each."""
 
     def __init__(self, mistakes: Sequence[str]) -> None:
         self.mistakes = tuple(mistakes)
@@ -31,12 +31,12 @@ class ConfigError(PgtsError):
 
 
 def load(path: str | Path | None = None, arguments: Sequence[str] = ()) -> Config:
-    """The defaults, changed by a file, changed by command-line arguments.
+    """Return the configuration: defaults, replaced by a file, replaced by command-line arguments.
 
     Args:
         path: a YAML file with some of the keys; None: none.
-        arguments: overrides as on the command line, `--KEY VALUE` or `--KEY=VALUE`; a later one wins. A mapping as the
-            value replaces the whole section; a single key changes nothing but itself.
+        arguments: overrides as on the command line, `--KEY VALUE` or `--KEY=VALUE`; later ones win. A mapping as the
+            value replaces the whole section; a single key changes only itself.
 
     Raises:
         ConfigError: with every mistake in the file and in the arguments.
@@ -46,7 +46,7 @@ def load(path: str | Path | None = None, arguments: Sequence[str] = ()) -> Confi
 
 @dataclass(frozen=True)
 class _Origin:
-    """Where a value was given, the line if it was in a file, and a scalar's text as it was written."""
+    """The place where a value was given, its line if that is a file, and the text of a scalar as it was written."""
 
     where: str
     line: int = 0

@@ -1,4 +1,4 @@
-"""Whether a run folder holds a training that goes on, and from where."""
+"""Decide whether a training resumes from a run folder, and from which checkpoint."""
 
 import json
 import shlex
@@ -33,18 +33,18 @@ from pgts_torch.experiment.tracking import GrowingDigest, versions
 
 FREE_SECTIONS = ("run", "log")
 FREE_KEYS = ("name", "eval.every", "eval.episodes", "eval.keep_best")
-"""What may differ when a run goes on: no bit of its training depends on it."""
+"""Keys that may differ when a run resumes, because no bit of its training depends on them."""
 
 _ADVICE = "choose another folder, or set run.overwrite"
 
 
 @dataclass(frozen=True)
 class Start:
-    """A checkpoint that a training goes on from.
+    """A checkpoint that a training resumes from.
 
     state: for `PGTS.load_state_dict`.
-    has_events: whether the TensorBoard events are as they were then.
-    lost_best: what is wrong with the best model, or nothing.
+    has_events: whether the TensorBoard events are unchanged since the checkpoint.
+    lost_best: what is wrong with the best model; empty if nothing is.
     """
 
     path: Path
@@ -54,8 +54,8 @@ class Start:
     lost_best: str = ""
 
     def check(self, algorithm: PGTS) -> None:
-        """PgtsError, naming each tensor, where the algorithm has others: its environment is no longer what it was."""
-        own = {  # by part: what a search remembers grows, and all ranks must ask for the whole together
+        """PgtsError, naming each tensor, if shapes differ from the algorithm's: its environment has changed."""
+        own = {  # without the search, whose state grows and can only be read by all ranks together
             "policy": algorithm.policy.state_dict(),
             "critic": algorithm.critic.state_dict(),
             "update": algorithm.update.state_dict(),
@@ -70,7 +70,7 @@ class Start:
             raise PgtsError("\n".join([*lines, f"the environment has changed since; {_ADVICE}"]))
 
     def load(self, algorithm: PGTS) -> None:
-        """Have the algorithm go on from here; PgtsError, naming the part, where the state is none of such a model."""
+        """Load the state into the algorithm; PgtsError, naming the part, if it is no state of such a model."""
         try:
             algorithm.load_state_dict(dict(self.state))
             if algorithm.num_env_steps != self.notes.env_steps:
@@ -82,16 +82,16 @@ class Start:
 def find(
     config: Config, run: Path, *, strict: bool = False, world_size: int = 1, any_world_size: bool = False
 ) -> Start | None:
-    """Where the training of a configuration begins in its run folder; None: at the beginning.
+    """Return the checkpoint from which a configuration resumes in its run folder; None: it starts from the beginning.
 
     Args:
         strict: refuse a last checkpoint that is damaged or of other versions, and lost events or a lost best model.
-        world_size: how many processes are to go on.
-        any_world_size: whether it may have been another number before.
+        world_size: the number of processes.
+        any_world_size: whether the run may have had another number of processes before.
 
     Raises:
-        PgtsError: the folder holds a finished run, or one of another configuration, naming what differs, or of another
-            number of processes; or no checkpoint in it is intact, or not the one that is asked for.
+        PgtsError: the folder has a finished run, or one of another configuration (the message names the differences),
+            or of another number of processes; or no checkpoint is intact, or with `strict` not the last one.
     """
     mark = read_mark(run)
     if files.kind(run / SUMMARY_FILE) is not None and mark is not None:
@@ -133,10 +133,10 @@ def find(
 
 
 def is_kept(config: Config, run: Path, mark: Mark) -> bool:
-    """Whether config.yaml in a run folder stays as it is, because somebody has edited it and it means the same.
+    """Whether config.yaml in a run folder is kept, because a user has edited it without changing its meaning.
 
     Raises:
-        PgtsError: it was edited, and to write the configuration of this run would undo that.
+        PgtsError: it was edited and has another meaning, so that this run would overwrite the user's changes.
     """
     path = run / CONFIG_FILE
     if files.kind(path) is None or digest(files.read(path)) in mark.configs:
@@ -151,14 +151,14 @@ def is_kept(config: Config, run: Path, mark: Mark) -> bool:
 
 
 def resuming(run: str | Path, world_size: int, env_id: str) -> str:
-    """The command by which as many processes go on with a run in this environment."""
+    """The command that resumes a run in this environment with the same number of processes."""
     trust = " --trust-imports" if ":" in env_id else ""
     command = "pgts train" if world_size == 1 else f"torchrun --nproc-per-node={world_size} train.py"
     return f"{command} --resume {shlex.quote(str(run))}{trust}"
 
 
 def flat(config: Config) -> dict[str, Any]:
-    """Every key of a configuration, dotted, with its value as JSON has it."""
+    """Return all keys of a configuration, dotted, with their values in JSON types."""
     return dict(_flat("", json.loads(json.dumps(config.model_dump(by_alias=True)))))
 
 
@@ -171,7 +171,7 @@ def _flat(prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _check_config(config: Config, earlier: Mapping[str, Any], run: Path) -> None:
-    """PgtsError, key by key, where a run had another configuration."""
+    """PgtsError, with a line for each key, if the earlier run had another configuration."""
     if differing := list(_differing(flat(config), _read_again(earlier))):
         lines = (f"{key} is {_shown(now)}; in run.dir {run} it is {_shown(before)}" for key, now, before in differing)
         raise PgtsError("\n".join([*lines, f"run.dir {run} holds an earlier run of another configuration; {_ADVICE}"]))
@@ -193,7 +193,7 @@ def _read_again(earlier: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _differing(now: Mapping[str, Any], before: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """(key, value now, value before) where it matters; a key that is missing on one side has None there."""
+    """Yield (key, value now, value before) for each difference that matters; a missing key has the value None."""
     for key in dict.fromkeys((*now, *before)):
         free = key in FREE_KEYS or key.partition(".")[0] in FREE_SECTIONS
         if not free and now.get(key) != before.get(key):
@@ -205,7 +205,7 @@ def _shown(value: Any) -> str:
 
 
 def _changed(path: Path, size: int, sha256: str) -> str:
-    """What has happened to a file since it had this length and SHA-256, beside that it has grown; or nothing."""
+    """Return how a file has changed since it had this length and SHA-256, apart from growing; empty if it has not."""
     if files.kind(path) != "file":
         return f"{path} is missing"
     if (now := path.stat().st_size) < size:
@@ -227,8 +227,8 @@ def _lost_events(run: Path, notes: checkpoint.Notes) -> str:
 
 
 def _lost_best(run: Path, notes: checkpoint.Notes) -> str:
-    """What is wrong with the best model, if there should be one. A later one than the checkpoint is right: it will come
-    again."""
+    """Return what is wrong with the best model, if there should be one; empty if nothing is. A model that is later than
+    the checkpoint is right, because training will save it again."""
     path, told = run / BEST_FILE, notes.files.get(BEST_FILE)
     evaluations = notes.progress.get("evaluations")
     greedy = evaluations.get("deterministic") if isinstance(evaluations, Mapping) else None
@@ -256,7 +256,7 @@ def _other_versions(before: Mapping[str, str], path: Path) -> list[str]:
 
 
 def _complain(lines: list[str], *, strict: bool) -> None:
-    """Warn of these, or refuse them."""
+    """Print these lines as warnings; with `strict` raise them as an error."""
     if lines and strict:
         raise PgtsError("\n".join(lines))
     for line in lines:

@@ -1,4 +1,4 @@
-"""The sections of a configuration that are of the run, not of the training."""
+"""The sections of a configuration about logging, evaluation and the run folder."""
 
 import json
 from typing import Any
@@ -10,7 +10,7 @@ from pgts_torch.options.part import Part
 
 
 class LogConfig(Part):
-    """What is written down, and when."""
+    """Metrics and checkpoints."""
 
     every: Count = 1
     """Iterations from one line of metrics to the next."""
@@ -20,11 +20,11 @@ class LogConfig(Part):
     where a signal ends the training."""
 
     keep: Count = 3
-    """Checkpoints that are kept, the newest; the best model is a matter of eval.keep_best."""
+    """The number of checkpoints that are kept, the newest ones; for the best model see eval.keep_best."""
 
 
 class EvalConfig(Part):
-    """Episodes of the current policy that nothing is learned from: of the most probable actions, and of drawn ones."""
+    """Evaluations of the current policy in separate episodes, with greedy and with sampled actions."""
 
     every: Count | None = None
     """Environment steps from one evaluation to the next; null: only after the last iteration."""
@@ -36,7 +36,8 @@ class EvalConfig(Part):
     """Training ends once greedy episodes have this mean return; null: it does not. Only with eval.every."""
 
     keep_best: bool = False
-    """Save the model as best.pt whenever greedy episodes have a higher mean return than ever. Only with eval.every."""
+    """Save the model as best.pt whenever the mean return of greedy episodes is the highest so far. Only with
+    eval.every."""
 
     @field_validator("stop_at_return", "keep_best")
     @classmethod
@@ -54,14 +55,14 @@ class EvalConfig(Part):
 
 
 class RunConfig(Part):
-    """The folder that the run leaves."""
+    """The run folder."""
 
     dir: Folder | None = None
     """Its path; null: a new one in runs/, named after the run, its seed and the time."""
 
     overwrite: bool = False
-    """Replace an earlier run in run.dir. Otherwise one of the same configuration goes on where it was cut off, and
-    any other is refused."""
+    """Replace an earlier run in run.dir. Otherwise a run of the same configuration resumes from its last checkpoint,
+    and any other is an error."""
 
     tensorboard: bool = True
     """Write TensorBoard events beside metrics.jsonl."""

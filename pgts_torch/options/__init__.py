@@ -1,4 +1,4 @@
-"""The options of a training: each class is an argument of `PGTS`, a section of a configuration and what is saved.
+"""The options of a training. Each class is an argument of `PGTS`, a section of a configuration and a saved value.
 
     PGTS("CartPole-v1", policy=MLP(hidden=[32]), update=PPO(clip_range=0.1), estimator=SampledAdvantages(), depth=0)
 

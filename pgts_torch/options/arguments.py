@@ -1,4 +1,4 @@
-"""The arguments of `PGTS` as options, and back."""
+"""Convert the arguments of `PGTS` to options, and back."""
 
 import re
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from pgts_torch.options.search import Depth
 from pgts_torch.options.training import Training
 
 _FLAT = {"env": ("observation_key",), "rollout": tuple(Rollouts.model_fields), "search": tuple(Depth.model_fields)}
-"""The sections whose options `PGTS` takes one by one."""
+"""The sections whose options are arguments of `PGTS` of their own."""
 
 _PARTS = ("policy", "critic", "estimator", "update")
 
@@ -22,8 +22,10 @@ _PREFIX = re.compile(rf"\b(?:env|rollout|search)\.({'|'.join(name for names in _
 
 
 def read(arguments: Mapping[str, Any]) -> Training:
-    """The options among the arguments of `PGTS`: parts as options, words, plain mappings or objects that were made from
-    options; None, and an object of the caller's own kind, is auto.
+    """Return the options in the arguments of `PGTS`.
+
+    Parts may be given as options, names, plain mappings or objects that were made from options. None, and objects of
+    the caller's own classes, count as auto.
 
     Raises:
         PgtsError: one line for each mistake.
@@ -40,7 +42,7 @@ def read(arguments: Mapping[str, Any]) -> Training:
 
 
 def checked(options: Mapping[str, Any]) -> Training:
-    """A training of these options; PgtsError, in which they are called as `PGTS` calls them."""
+    """Return a training with these options; PgtsError, which names them as arguments of `PGTS`, if they are invalid."""
     try:
         return Training.model_validate(dict(options))
     except ValidationError as error:
@@ -49,7 +51,7 @@ def checked(options: Mapping[str, Any]) -> Training:
 
 
 def described(options: Training) -> dict[str, Any]:
-    """What `read` reads the same options from, as plain values."""
+    """Return plain arguments from which `read` returns the same options."""
     plain = options.plain()
     kind = {name: value for name, value in plain["search"].items() if name not in Depth.model_fields}
     flat = {name: getattr(getattr(options, section), name) for section, names in _FLAT.items() for name in names}

@@ -1,4 +1,4 @@
-"""Where the values at the leaves of the lookahead come from."""
+"""Options of the critic, which gives the values at the leaves of the lookahead."""
 
 from typing import Annotated, Any, Literal
 
@@ -33,7 +33,7 @@ class NetworkTDLambda(TDLambda):
 
 
 def _of_networks(method: Any) -> Any:
-    """`TDLambda` is as good here, with the default of networks."""
+    """Accept a `TDLambda` for a network, with the default lambda of networks."""
     return (
         method.model_dump(by_alias=True, exclude_unset=True) | {"type": "td_lambda"}
         if type(method) is TDLambda
@@ -42,7 +42,8 @@ def _of_networks(method: Any) -> Any:
 
 
 class AutoCritic(Part):
-    """By the environment: a table where its states are numbered, else a network; with a network policy a network."""
+    """By the environment: a table where observations are numbered states, else a network; with a network policy
+    a network."""
 
     type: Literal["auto"] = "auto"
 
@@ -55,7 +56,7 @@ class Values(Part):
 
 
 class ExactValues(Values):
-    """The true values, from the tables of the environment; for validation."""
+    """The exact values, from the tables of the environment; for validation."""
 
     type: Literal["exact"] = "exact"
 
@@ -66,17 +67,17 @@ class TabularValues(Values):
     type: Literal["tabular"] = "tabular"
 
     method: MonteCarlo | TDLambda = Field(default=TDLambda(), discriminator="type")
-    """What a value is moved toward."""
+    """The targets of values."""
 
     step_size: Share | Literal["mean"] = 0.5
-    """How far it is moved; mean: so that it is the mean of all targets so far."""
+    """The step of a value toward its targets; mean: the value is the mean of all targets so far."""
 
     initial: float | Literal["mean"] = "mean"
-    """The value of what was never visited, in reward units; mean: that of all visits of the iteration."""
+    """The value of states that were never visited, in reward units; mean: the mean of all visits of the iteration."""
 
 
 class RolloutValues(Values):
-    """The mean return of fresh rollouts from each state that is asked for; nothing is learned."""
+    """The mean return of new rollouts in the model from each queried state; nothing is learned."""
 
     type: Literal["rollout"] = "rollout"
 
@@ -88,13 +89,13 @@ class RolloutValues(Values):
 
 
 class OwnNetwork(Part):
-    """A network of its own like the policy's; an mlp beside a table."""
+    """A network of its own with the options of the policy's; an mlp where the policy is a table."""
 
     type: Literal["own"] = "own"
 
 
 class SharedNetwork(Part):
-    """The policy's, up to its last layer."""
+    """The policy's network, with a last layer of its own."""
 
     type: Literal["shared"] = "shared"
 
@@ -105,18 +106,18 @@ class NetworkValues(Values):
     type: Literal["network"] = "network"
 
     network: OwnNetwork | SharedNetwork | MLP | CNN = Field(default=OwnNetwork(), discriminator="type")
-    """Which network."""
+    """The network."""
 
     method: Annotated[MonteCarlo | NetworkTDLambda, Field(discriminator="type"), BeforeValidator(_of_networks)] = (
         NetworkTDLambda()
     )
-    """What a value is moved toward."""
+    """The targets of values."""
 
     learning_rate: Positive | None = null(lookahead=1e-3, sampled=3e-4)
     """Step size of Adam."""
 
     max_grad_norm: Clip = 0.5
-    """Longer gradients are shortened to it."""
+    """The norm to which longer gradients are clipped."""
 
     num_epochs: Count = 10
     """Passes over the rollouts in each iteration."""
@@ -125,26 +126,25 @@ class NetworkValues(Values):
     """Visits in each step."""
 
     normalize_returns: bool = True
-    """Fit what the targets are above their running mean, in units of their running deviation."""
+    """Subtract the running mean of the targets and divide by their running deviation before the fit."""
 
     polyak: Share = 1.0
-    """How far the network that targets are made with moves toward the one that is fitted; 1: it is the same."""
+    """The step of the target network's weights toward those of the fitted network; 1: they are equal."""
 
     target_period: Count = 1
-    """Iterations from one such move to the next."""
+    """Iterations from one step of the target network to the next."""
 
     fresh_targets: bool | None = null(lookahead=True, sampled=False)
-    """Make new targets for each pass, of the critic as it is by then. One fit to the same targets leaves
-    gamma (1 - lambda) / (1 - gamma lambda) of what is missing to v^pi, often 0.83. Not where the network that targets
-    are made with lags."""
+    """Compute new targets with the current critic for each pass. A fit to the same targets in all passes leaves a
+    fraction gamma (1 - lambda) / (1 - gamma lambda) of the error to v^pi, often 0.83. Not with a target network."""
 
     @property
     def lags(self) -> bool:
-        """Whether targets are made with a network of their own."""
+        """Whether there is a target network, which lags behind the fitted one."""
         return self.polyak < 1 or self.target_period > 1
 
     def filled(self, case: str) -> Any:
-        """These options, with what null stands for in such a case."""
+        """Return the options with null replaced by its value in a case."""
         filled = super().filled(case)
         return filled if self.fresh_targets or not self.lags else filled.model_copy(update={"fresh_targets": False})
 
@@ -154,7 +154,7 @@ class NetworkValues(Values):
         polyak, period = info.data.get("polyak", 1.0), info.data.get("target_period", 1)
         if value and (polyak < 1 or period > 1):
             raise conflict(
-                "critic.fresh_targets is true, but the network that makes targets lags behind: critic.polyak is "
+                "critic.fresh_targets is true, but there is a target network, which lags behind: critic.polyak is "
                 "{polyak} and critic.target_period {period}; take the one or the other",
                 "critic.fresh_targets",
                 "critic.polyak",

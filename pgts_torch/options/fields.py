@@ -19,7 +19,7 @@ Clip = Positive | Literal["never"]
 
 
 def limit(clip: float | str) -> float | None:
-    """The number; None: there is none."""
+    """Return the number; None for "never"."""
     return None if isinstance(clip, str) else clip
 
 
@@ -31,7 +31,7 @@ Sizes = Annotated[list[Annotated[int, Field(ge=1, le=2**16)]], Field(max_length=
 
 
 def _text(pattern: str, requirement: str, max_length: int) -> Any:
-    """A string field; `requirement` says in words what the pattern asks for."""
+    """A string field; `requirement` describes the pattern in words."""
     return Field(pattern=pattern, max_length=max_length, json_schema_extra={"requirement": requirement})
 
 
@@ -50,7 +50,7 @@ RESERVED_KWARGS = {
     "autoreset_mode": "the rollout sets it",
     "vector_kwargs": "the rollout sets it",
 }
-"""Arguments of gymnasium.make_vec that are not the environment's own, and why each is refused."""
+"""Arguments of gymnasium.make_vec that env.kwargs must not have, with the option to use in their place."""
 
 
 def _check_kwargs(kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def _plain_values(value: Any) -> Iterator[Any]:
 
 
 def conflict(reason: str, *keys: str, **values: str) -> PydanticCustomError:
-    """An error that is a whole sentence; `keys` are the dotted keys of which any could be changed."""
+    """An error whose message is a whole sentence; `keys` are the dotted keys that can be changed to solve it."""
     return PydanticCustomError("conflict", "{reason}", {"reason": reason.format(**values), "keys": keys})
 
 
@@ -119,4 +119,4 @@ Samples = Annotated[
     AfterValidator(_check_samples),
     Field(json_schema_extra={"requirement": "a whole number >= 1, or a list of such and null, one for each level"}),
 ]
-"""None in a list: all outcomes of that level."""
+"""None in a list: all outcomes are enumerated at that level."""

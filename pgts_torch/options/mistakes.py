@@ -1,4 +1,4 @@
-"""What is wrong with options, in words."""
+"""Messages about invalid options."""
 
 import functools
 import json
@@ -15,13 +15,13 @@ from pgts_torch.options.schema import KeyPath, Node, Place, Schema, is_text, req
 
 @dataclass(frozen=True)
 class Mistake:
-    """One mistake.
+    """An invalid option, or options that do not go together.
 
     Args:
         message: a whole sentence.
-        kind: pydantic's word for it; "conflict" where options do not go together.
-        keys: the options of which any could be changed, the likeliest first.
-        is_value: whether the message begins with the key, of which a value was refused.
+        kind: pydantic's error type; "conflict" where options do not go together.
+        keys: the options that can be changed to solve it, the likeliest first.
+        is_value: whether a value was refused; the message then begins with its key.
     """
 
     message: str
@@ -40,10 +40,10 @@ def explain(
     error: ValidationError,
     written: Callable[[KeyPath], str | None] = lambda key: None,
 ) -> Iterator[Mistake]:
-    """Each mistake in our words.
+    """Yield a `Mistake` for each error of pydantic.
 
     Args:
-        written: a scalar as it was written, where it was read from a text.
+        written: returns the text of a scalar as it was written, where it was read from text.
     """
     for each in error.errors(include_url=False):
         yield _Sentence(schema_of(model), written).of(each)
@@ -81,14 +81,14 @@ class _Sentence:
 
 
 def what(node: Node) -> str:
-    """What a value, or a section, must be."""
+    """Return what a value, or a section, must be, in words."""
     if "oneOf" in node:
         return f"a mapping with the key {node['discriminator']['propertyName']} ({requirement(node)})"
     return requirement(node)
 
 
 def _advice(node: Node, value: Any) -> str:
-    """How to write what was probably meant."""
+    """Return how to write the value that was probably meant; empty where that is unknown."""
     if isinstance(value, bool):
         return ""
     if isinstance(value, int) and value > INT64_MAX:
@@ -101,7 +101,7 @@ def _advice(node: Node, value: Any) -> str:
 
 
 def show(value: Any, text: str | None = None) -> str:
-    """A value in one short line; a number as it was written, text in quotes."""
+    """Return a value as one short line; numbers as they were written, text in quotes."""
     if isinstance(value, dict | list):
         return "a mapping" if isinstance(value, dict) else "a list"
     if text == "":
@@ -118,6 +118,6 @@ def quote(text: str) -> str:
 
 
 def escape(text: str, length: int = 60) -> str:
-    """Printable ASCII and letters as they are, everything else escaped; cut where it is long."""
+    """Escape all characters that cannot be printed, and shorten long text."""
     shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: length + 1])
     return shown if len(shown) <= length else f"{shown[:length]}..."

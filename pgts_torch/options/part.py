@@ -1,4 +1,4 @@
-"""What all options have in common: a frozen class that is an argument, a section of a file and a saved description."""
+"""The base class of all options."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,8 +9,9 @@ from pgts_torch.options.mistakes import explain
 
 
 class Part(BaseModel):
-    """Options that belong together. The docstring under a field is its meaning in `pgts train --help`, the annotation
-    its range there and in messages.
+    """Options that belong together, as a frozen pydantic model.
+
+    The docstring under a field is its meaning in `pgts train --help`, its annotation the range there and in messages.
 
     Raises:
         PgtsError: one line for each option that is unknown or out of range.
@@ -28,7 +29,7 @@ class Part(BaseModel):
     if not TYPE_CHECKING:  # type checkers see the fields
 
         def __init__(self, **options: Any) -> None:
-            if "lambda_" in options:  # lambda is a word of Python
+            if "lambda_" in options:  # because lambda is a keyword of Python
                 options["lambda"] = options.pop("lambda_")
             try:
                 super().__init__(**options)
@@ -36,16 +37,16 @@ class Part(BaseModel):
                 lines = dict.fromkeys(f"{type(self).__name__}: {each.message}" for each in explain(type(self), error))
                 raise PgtsError("\n".join(lines)) from None
 
-        # Nested options are then validated in one go, with the path of each mistake.
+        # Makes pydantic validate nested options at once, with the path of each mistake.
         __init__.__pydantic_base_init__ = True
 
     def plain(self) -> dict[str, Any]:
-        """As plain values, without those that are null."""
+        """Return the options as plain values, without those that are null."""
         return self.model_dump(by_alias=True, exclude_none=True)
 
     @classmethod
     def standing(cls, case: str) -> dict[str, Any]:
-        """What null stands for in such a case, by option (`null`)."""
+        """Return the values that null stands for in a case, by option (`null`)."""
         extras = {name: field.json_schema_extra for name, field in cls.model_fields.items()}
         nulls: dict[str, Any] = {
             name: extra.get("null", {}) for name, extra in extras.items() if isinstance(extra, dict)
@@ -53,12 +54,12 @@ class Part(BaseModel):
         return {name: cases[case] for name, cases in nulls.items() if case in cases}
 
     def filled(self, case: str) -> Any:
-        """These options, with what null stands for in such a case."""
+        """Return the options with null replaced by its value in a case."""
         standing = {name: value for name, value in self.standing(case).items() if getattr(self, name) is None}
         return self.model_copy(update=standing)
 
 
 def null(**standing: Any) -> Any:
-    """The default of an option that is null, which stands for a value that depends on the case, as in
-    `null(tables="uniform", networks="visits")`. In other cases the option has no effect."""
+    """A default of null that stands for a value in each case, as in `null(tables="uniform", networks="visits")`. In
+    other cases the option has no effect."""
     return Field(default=None, json_schema_extra={"null": standing})

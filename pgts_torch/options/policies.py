@@ -1,4 +1,4 @@
-"""What policies are made of: tables, and networks."""
+"""Options of policies: tables and networks."""
 
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ class Uniform(Part):
 
 
 class Random(Part):
-    """Action probabilities drawn from the uniform distribution over the simplex."""
+    """Action probabilities sampled from the uniform distribution over the simplex."""
 
     type: Literal["random"] = "random"
 
@@ -36,7 +36,7 @@ Init = Uniform | Random | Biased
 
 
 class AutoPolicy(Part):
-    """By the environment: a softmax table where its states are numbered, else a network, cnn for images and mlp."""
+    """By the environment: softmax where observations are numbered states, cnn for images, else mlp."""
 
     type: Literal["auto"] = "auto"
 
@@ -63,7 +63,7 @@ class Softmax(Part):
 
 
 class Simplex(Part):
-    """A table of the probabilities themselves, likewise."""
+    """A table of probabilities, for environments whose observations are numbered states."""
 
     type: Literal["simplex"] = "simplex"
 
@@ -80,7 +80,7 @@ class MLP(Part):
     """Sizes of the hidden layers."""
 
     activation: Literal["tanh", "relu"] = "tanh"
-    """What follows each of them."""
+    """The activation function after each hidden layer."""
 
     normalize: bool = False
     """Subtract the running mean of the observations and divide by their running deviation; not for numbered states."""
@@ -95,26 +95,26 @@ class CNN(Part):
     """Channels of the convolutions, one after the other."""
 
     kernel_size: Count = 2
-    """Height and width of each of them."""
+    """Height and width of the kernels of all convolutions."""
 
     stride: Count = 1
-    """Steps of each of them."""
+    """Stride of all convolutions."""
 
     hidden: Sizes = Field(default=[128])
     """Sizes of the fully connected layers."""
 
     activation: Literal["tanh", "relu"] = "relu"
-    """What follows each layer."""
+    """The activation function after each layer."""
 
     normalize: bool = False
     """Subtract the running mean of each channel and divide by its running deviation."""
 
     scale: Positive | None = None
-    """What observations are divided by; null: 255 for bytes, else 1. MiniGrid's codes are at most 10."""
+    """By which observations are divided; null: 255 for bytes, else 1. MiniGrid's codes are at most 10."""
 
 
 Table = Softmax | Simplex
 Network = MLP | CNN
 
 TABLES, NETWORKS = ("softmax", "simplex"), ("mlp", "cnn")
-"""Their types; which of them auto is, the environment says."""
+"""The types of tables and of networks; auto, which the environment decides, is in neither."""

@@ -1,4 +1,4 @@
-"""How experience is made, and what advantages are estimated from."""
+"""Options of rollouts, and of the advantages that are estimated from them."""
 
 from typing import Literal
 
@@ -9,7 +9,7 @@ from pgts_torch.options.part import Part
 
 
 class FixedHorizon(Part):
-    """The same number of steps for every rollout, or until it terminates."""
+    """Every rollout runs for the same number of steps, or until it terminates."""
 
     type: Literal["fixed"] = "fixed"
 
@@ -18,21 +18,21 @@ class FixedHorizon(Part):
 
     @property
     def limit(self) -> int:
-        """The most steps of an episode."""
+        """The largest number of steps of an episode."""
         return self.length
 
 
 class GeometricHorizon(Part):
-    """After each step a rollout goes on with probability gamma: it visits states as often as the occupancy says."""
+    """After each step a rollout goes on with probability gamma, so that its visits are a sample of the occupancy."""
 
     type: Literal["geometric"] = "geometric"
 
     max_length: Count = 100_000
-    """A guard against processes that never end (gamma = 1); reaching it is an error."""
+    """Reaching this length is an error; it guards against rollouts that never end (gamma = 1)."""
 
     @property
     def limit(self) -> int:
-        """The most steps of an episode."""
+        """The largest number of steps of an episode."""
         return self.max_length
 
 
@@ -50,19 +50,19 @@ class Rollouts(Part):
 
 
 class LookaheadAdvantages(Part):
-    """Of all actions, by the lookahead from the visited states."""
+    """Advantages of all actions, by the lookahead from the visited states."""
 
     type: Literal["lookahead"] = "lookahead"
 
 
 class SampledAdvantages(Part):
-    """Of the actions taken, from what came of them, as in PPO and A2C: no lookahead, no model, for comparison. Needs a
-    network policy and search.depth 0."""
+    """Advantages of the actions taken, from the rewards after them, as in PPO and A2C: without lookahead or model, for
+    comparison. Needs a network policy and search.depth 0."""
 
     type: Literal["sampled"] = "sampled"
 
     lambda_: UnitInterval = Field(default=0.95, validation_alias="lambda", serialization_alias="lambda")
-    """0 looks one step at what came, 1 at all of it (Schulman et al. 2016)."""
+    """0 uses the reward of one step, 1 all rewards until the end (Schulman et al. 2016)."""
 
 
 Estimator = LookaheadAdvantages | SampledAdvantages

@@ -1,6 +1,6 @@
-"""Options as a person reads them: dotted keys, each with its requirement, default and meaning.
+"""The keys of options with their requirements, defaults and meanings, for help and messages.
 
-Everything is read from the JSON schema of the pydantic model, so help and messages cannot drift from what is accepted.
+All are read from the JSON schema of the pydantic model, so help and messages agree with what is accepted.
 """
 
 import difflib
@@ -25,10 +25,10 @@ class Option:
     Args:
         key: dotted, for instance "search.depth".
         requirement: what its value must be, in words.
-        default: its value where nothing is said.
+        default: its value where none is given.
         meaning: one sentence.
-        choices: (value, meaning) of each value, where they have one.
-        when: the choices that the key belongs to, for instance "critic.type tabular|rollout"; "" for the others.
+        choices: (value, meaning) for each value, where values have meanings.
+        when: the condition under which the key exists, for instance "critic.type tabular|rollout"; "" for always.
     """
 
     key: str
@@ -41,7 +41,7 @@ class Option:
 
 @dataclass(frozen=True)
 class Place:
-    """Where an error is: its key, the node of that key (None: there is no such key) and the section around it."""
+    """The place of an error: its key, the node of that key (None: there is no such key) and the section around it."""
 
     path: KeyPath
     node: Node | None
@@ -49,7 +49,7 @@ class Place:
 
 
 class Schema:
-    """The tree of keys below a model. A node is a JSON schema with its reference followed."""
+    """The tree of keys of a model. A node is a JSON schema with its reference resolved."""
 
     def __init__(self, model: type[BaseModel]) -> None:
         schema = model.model_json_schema(by_alias=True)
@@ -57,27 +57,27 @@ class Schema:
         self.root = self._follow(schema)
 
     def fields(self, node: Node) -> dict[str, Node]:
-        """The keys right below a section; {} for anything else."""
+        """Return the keys directly below a section; {} for other nodes."""
         return {name: self._follow(child) for name, child in node.get("properties", {}).items()}
 
     def variants(self, node: Node) -> dict[str, Node]:
-        """The sections that a tag (`type`, or `kind`) chooses from, in the order of the model; {} for anything else."""
+        """Return the sections between which a tag (`type` or `kind`) chooses, in order; {} for other nodes."""
         nodes = [self._follow(variant) for variant in node.get("oneOf", ())]
         return {variant["properties"][self.tag(node)]["const"]: variant for variant in nodes}
 
     def tag(self, node: Node) -> str:
-        """The key by which a node with variants chooses."""
+        """Return the key by which a node with variants chooses."""
         return node["discriminator"]["propertyName"]
 
     def tag_value(self, variant: Node) -> tuple[str, str]:
-        """That key of one variant, and its value."""
+        """Return the tag of a variant and its value."""
         return next((name, child["const"]) for name, child in variant["properties"].items() if "const" in child)
 
     def with_tags(self, node: Node, data: Any, *, words: bool = False) -> Any:
-        """The data of a section; where it leaves out by which tag it is one of several variants, the default's holds.
+        """Return the data of a section, with the default's tag wherever a tag is missing.
 
         Args:
-            words: also read what `PGTS` takes: a tag alone, "ppo"; `type` for any tag; None where a file says never.
+            words: also accept the shorthands of `PGTS`: a tag alone, as "ppo"; `type` for any tag; None for never.
         """
         variants = self.variants(node)
         if words and variants and isinstance(data, str):
@@ -102,7 +102,7 @@ class Schema:
         }
 
     def find(self, path: Sequence[str]) -> list[Node]:
-        """The nodes that a path may mean, one for each variant that has it. What is inside kwargs asks for nothing."""
+        """Return the nodes of a path, one for each variant that has it. Below kwargs any path is valid, as node {}."""
         nodes = [self.root]
         for part in path:
             if any(node.get("additionalProperties") is True for node in nodes):
@@ -112,7 +112,7 @@ class Schema:
         return nodes
 
     def locate(self, location: Sequence[str | int]) -> Place:
-        """The place that a pydantic error location means; its union tags and type names are no part of the key."""
+        """Return the place of a pydantic error location, without the union tags and type names in it."""
         path: KeyPath = ()
         node = parent = self.root
         for part in location:
@@ -129,23 +129,23 @@ class Schema:
         return Place(path, node, parent)
 
     def options(self) -> list[Option]:
-        """Every key with a value, in the order of the model."""
+        """Return all keys that have a value, in the order of the model."""
         return list(self._options(self.root, ()))
 
     def nearest(self, key: str) -> str | None:
-        """The key that was probably meant: one that ends the same, or one that is spelled nearly the same."""
+        """Return the key that was probably meant: one with the same last part, or with a similar spelling."""
         same_end = [known for known in self._keys if known.rpartition(".")[2] == key.rpartition(".")[2]]
         close = difflib.get_close_matches(key, same_end or self._keys, n=1, cutoff=0.0 if same_end else 0.7)
         return close[0] if close else None
 
     def hint(self, key: str, prefix: str = "") -> str:
-        """What to do about a key that is unknown."""
+        """Return the end of the message about an unknown key."""
         nearest = self.nearest(key)
         return f"; did you mean {prefix}{nearest}?" if nearest else "; `pgts train --help` lists all keys"
 
     @cached_property
     def _keys(self) -> list[str]:
-        """All dotted keys, sections too."""
+        """All dotted keys, also of sections."""
         parts = [option.key.split(".") for option in self.options()]
         return list(dict.fromkeys(".".join(part[:end]) for part in parts for end in range(1, len(part) + 1)))
 
@@ -163,7 +163,7 @@ class Schema:
                 yield Option(key, requirement(node), node["default"], _sentence(node))
 
     def _options_of_variants(self, key: str, variants: dict[str, Node], path: KeyPath) -> list[Option]:
-        """The options of all variants, equal ones once, those with the same condition together."""
+        """Return the options of all variants, without duplicates, grouped by condition."""
         distinct: dict[str, tuple[Option, list[str]]] = {}
         for tag, variant in variants.items():
             for option in self._options(variant, path):
@@ -183,7 +183,7 @@ class Schema:
         return Option(key, requirement(node), node["default"][self.tag(node)], _sentence(node), choices)
 
     def _follow(self, node: Node) -> Node:
-        """The node with what its reference points at; what stands beside the reference goes first."""
+        """Return the node with its reference resolved; keys beside the reference have precedence."""
         [inner] = node.get("allOf", [node])
         if "$ref" not in inner:
             return node
@@ -193,7 +193,7 @@ class Schema:
 
 
 def requirement(node: Node) -> str:
-    """What a value must be, in words: "a whole number >= 1"."""
+    """Return what a value must be, in words, as "a whole number >= 1"."""
     if "requirement" in node:
         return node["requirement"]
     if "anyOf" in node:
@@ -223,7 +223,7 @@ def requirement(node: Node) -> str:
 
 
 def is_text(node: Node) -> bool:
-    """Whether every value but null is text."""
+    """Whether all values but null are text."""
     kinds = {each.get("type") for each in node.get("anyOf", [node])}
     return "string" in kinds and kinds <= {"string", "null"}
 
@@ -233,7 +233,7 @@ def is_nullable(node: Node) -> bool:
 
 
 def _bounds(node: Node) -> str:
-    """An interval, or one comparison, or nothing."""
+    """Return the bounds of a number as an interval or a comparison; empty where there are none."""
     low, above = node.get("minimum"), node.get("exclusiveMinimum")
     high = node.get("maximum")
     if high is None and low is None and above is None:
@@ -249,7 +249,7 @@ def _either(values: list[str]) -> str:
 
 
 def _sentence(node: Node) -> str:
-    """The meaning; and what null stands for in which case."""
+    """Return the meaning of a node, with the values that null stands for."""
     meaning = " ".join(node.get("description", "").split())
     if "null" not in node:
         return meaning

@@ -1,4 +1,4 @@
-"""The lookahead T^m Q at the visited states: how far, and how it is made."""
+"""Options of the lookahead T^m Q: its depth, and the search that computes it."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -13,45 +13,47 @@ MAX_BYTES = 4 * 2**30
 
 
 class Budget(Part):
-    """What one search may take."""
+    """The limits of one search."""
 
     max_nodes: Count = MAX_NODES
-    """The most nodes of one search. One that needs more is narrowed by auto and refused by the others."""
+    """The largest number of nodes of one search. With auto a search that needs more is narrowed; otherwise it is an
+    error."""
 
     max_bytes: Count = MAX_BYTES
-    """The most memory that a search may take at its peak, with what is remembered for the next ones. One that needs
-    more is treated likewise, before it takes it."""
+    """The most memory of one search at its peak, with what is kept for the next ones. With auto a search that needs
+    more is narrowed; otherwise it is an error, before the memory is used."""
 
 
 class Auto(Budget):
-    """Picks by what the model can do and by the budget."""
+    """The search that suits the model and the budget."""
 
     kind: Literal["auto"] = "auto"
 
 
 class Expectimax(Budget):
-    """Looks at all outcomes of all actions."""
+    """Enumerates all outcomes of all actions."""
 
     kind: Literal["expectimax"] = "expectimax"
 
     max_width: Count | None = None
-    """The most states of a level that are expanded; null: all."""
+    """The largest number of states that are expanded at a level; null: all."""
 
 
 class Sampled(Budget):
-    """Looks at outcomes that are drawn."""
+    """Samples outcomes of all actions."""
 
     kind: Literal["sampled"] = "sampled"
 
     samples: Samples = 4
-    """Outcomes drawn of each state and action."""
+    """Sampled outcomes of each state and action."""
 
     share: Literal["none", "level", "search"] = "level"
-    """What shares them: nothing, paths that meet at one level, or all that meet."""
+    """Which paths use the same samples of a state. none: each path has its own; level: those that meet at one level;
+    search: all that meet."""
 
 
 class MCTS(Budget):
-    """Looks where it seems worth while."""
+    """A tree search that expands the most promising states (Monte-Carlo tree search)."""
 
     kind: Literal["mcts"] = "mcts"
 
@@ -59,8 +61,8 @@ class MCTS(Budget):
     """States expanded below each root."""
 
     root: Literal["gumbel", "rule"] = "gumbel"
-    """How a root shares out its simulations. gumbel: sequential halving of its actions (Danihelka et al. 2022); rule:
-    as below it."""
+    """How simulations are distributed over the actions of a root. gumbel: sequential halving (Danihelka et al. 2022);
+    rule: as below the root."""
 
     rule: Literal["gumbel", "puct", "uct"] = "gumbel"
     """How actions are selected below the root."""
@@ -69,21 +71,20 @@ class MCTS(Budget):
     """c of puct and uct; null: 1.25."""
 
     wave: Count | None = None
-    """The most simulations of one action of a root (with root rule: of the root) that are under way before values are
-    backed up; 1 is the ordinary search, null the fastest."""
+    """The largest number of simulations of one action of a root (with root rule: of the root) between two backups of
+    values; 1 is the ordinary search, null the fastest."""
 
     prior: Literal["uniform", "policy"] = "uniform"
-    """The probabilities that a search starts from: the same for all actions, or those of the current policy, as in
-    AlphaZero."""
+    """The prior probabilities of actions: uniform, or those of the current policy, as in AlphaZero."""
 
     backup: Literal["max", "mean"] = "max"
-    """What the value of a node is: the maximum over its actions, or, for comparison, the mean of the returns seen."""
+    """The value of a node: the maximum over its actions or, for comparison, the mean return of its simulations."""
 
     merge: bool | None = None
-    """Whether paths that meet are one node; null: with backup max."""
+    """Whether paths that meet in a state share one node; null: true with backup max."""
 
     samples: Count | None = None
-    """How many sampled outcomes of each action stand for all, fresh ones in each search; null: all are enumerated, or 4
+    """The number of sampled outcomes of each action, new ones in each search; null: all outcomes are enumerated, or 4
     sampled where the model cannot enumerate them."""
 
     @field_validator("exploration")
@@ -124,7 +125,7 @@ class MCTS(Budget):
 
 
 Kind = Auto | Expectimax | Sampled | MCTS
-"""Each is an argument of `PGTS`, and what `search.kind` chooses in a configuration."""
+"""The values of the argument `search` of `PGTS`, between which `search.kind` chooses in a configuration."""
 
 
 class Depth(Part):
@@ -132,26 +133,26 @@ class Depth(Part):
 
     depth: Natural | Literal["adaptive"] = 4
     """m, how often the Bellman optimality operator is applied; 0 is plain policy gradient. adaptive: in each iteration
-    the smallest m that sees most of what may be missing, see tolerance."""
+    the smallest m whose lookahead finds a large enough improvement, see tolerance."""
 
     max_depth: Natural | None = null(adaptive=64)
     """The largest adaptive depth."""
 
     tolerance: NonNegative | None = null(adaptive=0.7)
-    """An adaptive depth is enough if the gap that it sees, summed over the occupancy, is more than this share of
-    what may be missing at the visited states."""
+    """An adaptive depth is enough if its stationarity gap, summed over the occupancy, is more than this fraction of the
+    upper bound on the optimality gap of the visited states."""
 
     stop_at: NonNegative | None = None
-    """Training ends once the certificate says that the policy is this close to the optimal return; null: never. It is a
+    """Training ends once the certificate, an upper bound on the optimality gap, is at most this; null: never. It is a
     proof if the start distribution is known, the critic exact and the model the environment; else an estimate."""
 
     action_repeat: Count = 1
-    """How often the lookahead takes an action before it takes the next, so that it sees as many times further. Not in
-    numbered environments."""
+    """How often the lookahead repeats each action, so that it looks as many times further ahead. Not in environments
+    with numbered states."""
 
     model_check: Literal["error", "warn", "off"] = "error"
-    """Each step of the environment is held to its model. error: the first contradiction stops the training; warn: it is
-    said and counted; off: nobody looks."""
+    """Whether each step of the environment is checked against its model. error: the first contradiction stops the
+    training; warn: it is a warning and is counted; off: steps are not checked."""
 
     @property
     def depths(self) -> Sequence[int]:
@@ -163,7 +164,7 @@ class Depth(Part):
     def _only_adaptive(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("depth", "adaptive") != "adaptive":
             raise conflict(
-                "search.{name} is {value}, which only search.depth adaptive heeds; search.depth is {depth}",
+                "search.{name} is {value}, which only search.depth adaptive uses; search.depth is {depth}",
                 f"search.{info.field_name}",
                 "search.depth",
                 name=str(info.field_name),
@@ -174,19 +175,19 @@ class Depth(Part):
 
 
 class AutoSearch(Auto, Depth):
-    """Picks by what the model can do and by the budget."""
+    """The search that suits the model and the budget."""
 
 
 class ExpectimaxSearch(Expectimax, Depth):
-    """Looks at all outcomes of all actions."""
+    """Enumerates all outcomes of all actions."""
 
 
 class SampledSearch(Sampled, Depth):
-    """Looks at outcomes that are drawn."""
+    """Samples outcomes of all actions."""
 
 
 class MCTSSearch(MCTS, Depth):
-    """Looks where it seems worth while."""
+    """A tree search that expands the most promising states (Monte-Carlo tree search)."""
 
 
 Search = AutoSearch | ExpectimaxSearch | SampledSearch | MCTSSearch

@@ -1,4 +1,4 @@
-"""All options of a training, and which of them go together."""
+"""All options of a training, and the rules between them."""
 
 from typing import Annotated, Any
 
@@ -26,20 +26,19 @@ class Env(Part):
     """Arguments for gymnasium.make, for instance --env.kwargs.n 7."""
 
     actions_per_dimension: Annotated[int, Field(ge=2, le=10_000)] | None = None
-    """Into how many evenly spaced values each dimension of continuous actions is divided; null: actions are
-    discrete."""
+    """The number of evenly spaced values of each dimension of continuous actions; null: actions are discrete."""
 
     observation_key: Key | None = None
-    """The part of dictionary observations that policy and critic see, for instance image; null: they are no
+    """The entry of dictionary observations that policy and critic use, for instance image; null: observations are no
     dictionaries."""
 
     reward_range: Ascending | None = None
-    """The lowest and the highest reward of a single step, for instance [0, 1], to which the run holds the environment.
-    search.stop_at and search.depth adaptive need it where the model does not know; null: the model's own."""
+    """The lowest and the highest reward of a single step, for instance [0, 1]; a reward outside of it is an error.
+    search.stop_at and search.depth adaptive need it where the model has no largest reward; null: the model's own."""
 
 
 class Training(Part):
-    """What `PGTS` is made from, but for seed and device. Rules between parts do not speak of those that are auto."""
+    """The options of `PGTS` but for seed and device. The rules between parts do not apply to those that are auto."""
 
     env: Env = Env()
     policy: AutoPolicy | Table | Network = Field(default=AutoPolicy(), discriminator="type")
@@ -50,13 +49,13 @@ class Training(Part):
     """Where the values at the leaves of the lookahead come from."""
 
     search: Search = Field(default=AutoSearch(), discriminator="kind")
-    """How the lookahead is made."""
+    """The search that computes the lookahead."""
 
     estimator: Estimator = Field(default=LookaheadAdvantages(), discriminator="type")
-    """Where the advantages come from that the policy is moved by."""
+    """Where the advantages in the update come from."""
 
     update: AutoUpdate | Update = Field(default=AutoUpdate(), discriminator="type")
-    """How the policy moves toward the lookahead values."""
+    """How the policy is changed by the advantages."""
 
     @field_validator("policy")
     @classmethod
@@ -101,7 +100,7 @@ class Training(Part):
             )
         if network and {critic.network.type, policy.type} in ({"cnn", kind} for kind in ("mlp", "softmax", "simplex")):
             raise conflict(
-                "critic.network.type is {critic} and policy.type is {policy}; a cnn sees images, the others do not",
+                "critic.network.type is {critic} and policy.type is {policy}; a cnn takes images, the others do not",
                 "critic.network.type",
                 "policy.type",
                 critic=critic.network.type,
@@ -138,8 +137,8 @@ class Training(Part):
             isinstance(critic, TabularValues | NetworkValues) and critic.target == "v"
         ):
             raise conflict(
-                "critic.type is {critic} of target {target}; sampled advantages stand on what was learned before, so "
-                "estimator.type sampled needs critic.type tabular or network, of target v",
+                "critic.type is {critic} of target {target}; sampled advantages use values learned from earlier "
+                "episodes, so estimator.type sampled needs critic.type tabular or network, of target v",
                 "critic.type",
                 "critic.target",
                 "estimator.type",
@@ -196,12 +195,12 @@ def _check_mirror(update: Mirror, policy: Any) -> None:
             "update.floor",
             "policy.init.probability",
         )
-    heeded = {"type", *Mirror.standing("tables" if is_table else "networks")}
+    used = {"type", *Mirror.standing("tables" if is_table else "networks")}
     for name in Mirror.model_fields:
         value = getattr(update, name)
-        if name not in heeded and value is not None:
+        if name not in used and value is not None:
             raise conflict(
-                "update.{name} is {value}, which the mirror update of a {kind} does not heed; policy.type is {policy}",
+                "update.{name} is {value}, which the mirror update of a {kind} does not use; policy.type is {policy}",
                 f"update.{name}",
                 "policy.type",
                 name=name,

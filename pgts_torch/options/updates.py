@@ -1,4 +1,4 @@
-"""How the policy moves toward the lookahead values."""
+"""Options of the update of a policy."""
 
 from typing import Literal
 
@@ -9,7 +9,7 @@ StateWeight = Literal["occupancy", "visits", "uniform"]
 
 
 class AutoUpdate(Part):
-    """By the policy: mirror and projected for the tables; cmpo for networks, ppo where advantages are sampled."""
+    """By the policy: mirror for softmax, projected for simplex, cmpo for networks; ppo with sampled advantages."""
 
     type: Literal["auto"] = "auto"
 
@@ -21,7 +21,7 @@ class TableUpdate(Part):
     """eta, by which the weighted lookahead values are multiplied."""
 
     state_weight: StateWeight = "occupancy"
-    """What a visited state counts for: its discounted occupancy, its share of all visits, or 1."""
+    """The weight of a visited state: its discounted occupancy, its fraction of all visits, or 1."""
 
 
 class Projected(TableUpdate):
@@ -46,10 +46,10 @@ class NetworkUpdate(Part):
     """Adam, or plain gradient descent."""
 
     max_grad_norm: Clip = 0.5
-    """Longer gradients are shortened to it."""
+    """The norm to which longer gradients are clipped."""
 
     state_weight: StateWeight = "visits"
-    """What a visited state counts for: its discounted occupancy, its share of all visits, or 1."""
+    """The weight of a visited state: its discounted occupancy, its fraction of all visits, or 1."""
 
 
 class Gradient(NetworkUpdate):
@@ -58,11 +58,11 @@ class Gradient(NetworkUpdate):
     type: Literal["gradient"] = "gradient"
 
     entropy_coef: NonNegative = 0.0
-    """What a nat of entropy is worth, in reward units."""
+    """The weight of the entropy (in nats), in reward units."""
 
 
 class Epochs(NetworkUpdate):
-    """Many steps, on parts of the visited states."""
+    """Many steps, on minibatches of the visited states."""
 
     num_epochs: Count = 10
     """Passes over the visited states in each iteration."""
@@ -77,21 +77,21 @@ class PPO(Epochs):
     type: Literal["ppo"] = "ppo"
 
     clip_range: Positive = 0.2
-    """How far the probability of an action may move, as a share of itself, before it is pushed no further."""
+    """The relative change of an action's probability at which the objective is clipped."""
 
     entropy_coef: NonNegative = 0.0
-    """What a nat of entropy is worth, in units of the advantages."""
+    """The weight of the entropy (in nats), in units of the advantages."""
 
     target_kl: Positive | None = None
-    """No further step once pi has moved this far from the old one, in nats; null: never."""
+    """The steps end once KL(pi_old || pi) exceeds this, in nats; null: never."""
 
     normalize_advantage: bool = True
-    """Divide advantages by the root of their mean square."""
+    """Divide advantages by their root mean square."""
 
 
 class CMPO(Epochs):
-    """A step toward better actions of a length that no reward scale changes (Hessel et al. 2021); needs a network
-    policy and the advantages of all actions."""
+    """Clipped MPO, whose steps do not depend on the scale of rewards (Hessel et al. 2021); needs a network policy and
+    the advantages of all actions."""
 
     type: Literal["cmpo"] = "cmpo"
 
@@ -99,10 +99,10 @@ class CMPO(Epochs):
     """Step size of the optimizer."""
 
     temperature: Positive = 0.1
-    """By which advantages are divided, in units of their mean size; small ones make long steps."""
+    """By which advantages, in units of their mean size, are divided; smaller temperatures make longer steps."""
 
     clip: Positive = 3.0
-    """The most that an action gains or loses in log pi in one iteration."""
+    """The largest change of log pi(a|s) in one iteration, before normalisation."""
 
 
 class Mirror(Part):
@@ -112,17 +112,17 @@ class Mirror(Part):
     type: Literal["mirror"] = "mirror"
 
     state_weight: StateWeight | None = null(tables="uniform", networks="visits")
-    """What a visited state counts for: its discounted occupancy, its share of all visits, or 1."""
+    """The weight of a visited state: its discounted occupancy, its fraction of all visits, or 1."""
 
     step_size: Positive | None = null(tables=1.0)
     """eta, by which the weighted advantages are multiplied. Only for tables, as the next two."""
 
     normalize: Literal["rms", "none"] | None = null(tables="rms")
     """rms: advantages are divided by their root mean square, or by the standard error of the lookahead where that is
-    larger; none: they count in reward units, as in the paper."""
+    larger; none: they are in reward units, as in the paper."""
 
     floor: Clip | None = null(tables=12.0)
-    """The most that the log of a probability may fall below the largest one of its state."""
+    """How far the log of a probability may be below the largest of its state."""
 
     temperature: Positive | None = null(networks=1.0)
     """By which the lookahead values are divided, in reward units. Only for networks, as all that follow."""
@@ -134,7 +134,7 @@ class Mirror(Part):
     """Adam, or plain gradient descent."""
 
     max_grad_norm: Clip | None = null(networks=0.5)
-    """Longer gradients are shortened to it."""
+    """The norm to which longer gradients are clipped."""
 
     num_epochs: Count | None = null(networks=10)
     """Passes over the visited states in each iteration."""

@@ -99,8 +99,8 @@ def test_where_gamma_is_1_there_is_no_certificate():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"depth": 3, "max_depth": 4}, "max_depth is 4, which only depth adaptive heeds; depth is 3"),
-        ({"depth": 3, "tolerance": 0.1}, "tolerance is 0.1, which only depth adaptive heeds"),
+        ({"depth": 3, "max_depth": 4}, "max_depth is 4, which only depth adaptive uses; depth is 3"),
+        ({"depth": 3, "tolerance": 0.1}, "tolerance is 0.1, which only depth adaptive uses"),
         ({"depth": "adaptive", "max_depth": -1}, "depth is -1"),
         ({"depth": "adaptive", "tolerance": -1.0}, "tolerance is -1.0; it must be a number >= 0"),
         ({"depth": "deep"}, "depth is 'deep'"),

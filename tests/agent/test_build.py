@@ -146,7 +146,7 @@ def test_the_environment_chooses_what_is_left_out():
         ({"num_envs": 1.5}, "^num_envs is 1.5; it must be a whole number >= 1$"),
         ({"num_envs": 4.0}, r"^num_envs is 4.0; it must be a whole number >= 1 \(write 4\)$"),
         ({"depth": -1}, "^depth is -1; it must be a whole number >= 0 or adaptive$"),
-        ({"depth": 2, "max_depth": 3}, "^max_depth is 3, which only depth adaptive heeds; depth is 2$"),
+        ({"depth": 2, "max_depth": 3}, "^max_depth is 3, which only depth adaptive uses; depth is 2$"),
         ({"horizon": 7}, "horizon is 7; it must be a mapping with the key type"),
         (
             {"update": "adam"},
@@ -176,7 +176,7 @@ def test_the_environment_chooses_what_is_left_out():
         ({"estimator": "sampled"}, "^depth is 4; with estimator.type sampled there is no lookahead, it must be 0$"),
         (
             {"policy": "mlp", "update": {"type": "mirror", "step_size": 1}},
-            "^update.step_size is 1.0, which the mirror update of a network does not heed; policy.type is mlp$",
+            "^update.step_size is 1.0, which the mirror update of a network does not use; policy.type is mlp$",
         ),
     ],
 )
@@ -205,7 +205,7 @@ def test_what_was_chosen_by_the_environment_and_does_not_fit_is_one_clear_line()
         with pytest.raises(PgtsError) as caught:
             PGTS("CartPole-v1", update=update, num_envs=1, depth=0)
         assert str(caught.value) == (
-            "update.step_size is 0.5, which the mirror update of a network does not heed; policy.type is mlp"
+            "update.step_size is 0.5, which the mirror update of a network does not use; policy.type is mlp"
         )
 
 

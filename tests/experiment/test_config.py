@@ -212,7 +212,7 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ),
         (
             "{policy: {type: mlp}, critic: {network: {type: cnn}}}",
-            "critic.network.type is cnn and policy.type is mlp; a cnn sees images, the others do not",
+            "critic.network.type is cnn and policy.type is mlp; a cnn takes images, the others do not",
         ),
         (
             "{policy: {type: mlp}, critic: tabular}",
@@ -220,7 +220,7 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ),
         (
             "{policy: {type: cnn}, critic: {network: {type: mlp}}}",
-            "critic.network.type is mlp and policy.type is cnn; a cnn sees images, the others do not",
+            "critic.network.type is mlp and policy.type is cnn; a cnn takes images, the others do not",
         ),
         (
             "{policy: {type: mlp}, estimator: {type: sampled}}",
@@ -256,11 +256,11 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ),
         (
             "{policy: {type: softmax}, update: {type: mirror, temperature: 2}}",
-            "update.temperature is 2.0, which the mirror update of a table does not heed; policy.type is softmax",
+            "update.temperature is 2.0, which the mirror update of a table does not use; policy.type is softmax",
         ),
         (
             "{policy: {type: mlp}, update: {type: mirror, step_size: 2}}",
-            "update.step_size is 2.0, which the mirror update of a network does not heed; policy.type is mlp",
+            "update.step_size is 2.0, which the mirror update of a network does not use; policy.type is mlp",
         ),
     ],
 )
@@ -551,7 +551,7 @@ def test_any_configuration_survives_printing_and_loading(config: Config) -> None
 @pytest.mark.parametrize("key", ["max_depth", "tolerance"])
 def test_what_only_an_adaptive_depth_heeds_is_refused_beside_a_number(key: str) -> None:
     assert load(None, ["--search.depth", "adaptive", f"--search.{key}", "1"]).search.depth == "adaptive"
-    with pytest.raises(ConfigError, match=f"search.{key} is 1.*, which only search.depth adaptive heeds"):
+    with pytest.raises(ConfigError, match=f"search.{key} is 1.*, which only search.depth adaptive uses"):
         load(None, ["--search.depth", "4", f"--search.{key}", "1"])
 
 

@@ -239,7 +239,7 @@ MISTAKES = {
     "--out o --seeds 0": f"argument --seeds: '0' is not a whole number >= 1 and below 2**63 {HELP}",
     "--out o --depths 1,x": f"argument --depths: 'x' is not a whole number >= 0 and below 2**63 {HELP}",
     "--out o --depths adaptive,2 --search.tolerance 1": "--search.tolerance: search.tolerance is 1.0, which only "
-    "search.depth adaptive heeds; search.depth is 2",
+    "search.depth adaptive uses; search.depth is 2",
     "--out o --update.step_size -1": "--update.step_size is -1; it must be a number > 0 or null",
     "--out o --env.id CartPole-v1 --policy.type softmax --depths 0,1": "the policy 'softmax' is a table of numbered "
     "states, which CartPole-v1 does not have; take a network: mlp or cnn as policy, network as critic",
