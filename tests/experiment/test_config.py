@@ -502,6 +502,8 @@ def configurations(draw: st.DrawFn) -> Config:
     types["critic.type"] = "network" if policy == "cnn" else types["critic.type"]
     needs_all = is_table or types["update.type"] in ("mirror", "cmpo")
     types["estimator.type"] = "lookahead" if needs_all else types["estimator.type"]
+    if types["estimator.type"] == "sampled" and types["critic.type"] in ("exact", "rollout"):
+        types["critic.type"] = "network"
     for option in OPTIONS:
         if _holds(option.when, types):
             words = st.sampled_from(_words(option))
@@ -522,6 +524,7 @@ def configurations(draw: st.DrawFn) -> Config:
         given |= {"search.exploration": None} if given["search.rule"] == "gumbel" else {"search.prior": "uniform"}
         given |= {"search.merge": False} if given["search.backup"] == "mean" else {}
     if types["estimator.type"] == "sampled":
+        given |= {"critic.target": "v"} if types["critic.type"] != "auto" else {}
         given = {key: value for key, value in given.items() if not key.startswith("search.")} | {"search.depth": 0}
     return Config.model_validate(_nested(given))
 
