@@ -226,7 +226,7 @@ def test_options_are_documented_and_import_no_torch():
         assert kind.__doc__, name
         assert all(field.description or each in ("type", "kind") for each, field in kind.model_fields.items()), name
     program = "import sys, pgts_torch.options, pgts_torch.options.arguments; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+    assert subprocess.run([sys.executable, "-c", program], check=False, timeout=120).returncode == 0
 
 
 def test_a_network_critic_has_fresh_targets_with_a_lookahead_unless_its_target_network_lags():
