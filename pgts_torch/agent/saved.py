@@ -1,4 +1,4 @@
-"""The state of a training, and the file it is saved in: what a model of the same arguments goes on from."""
+"""Save and load the state of a training: a model with the same arguments continues from it."""
 
 from collections.abc import Mapping
 from inspect import signature
@@ -24,7 +24,7 @@ COUNTERS = ("num_iterations", "num_env_steps", "num_model_calls")
 
 
 class Training(Protocol):
-    """What has a state: the parts of a training, and its counters."""
+    """The parts of a training that have a state, and its counters."""
 
     policy: Policy
     critic: Critic
@@ -43,8 +43,8 @@ T = TypeVar("T", bound=Training)
 
 
 def state_of(training: Training) -> dict[str, Any]:
-    """Policy, critic, update, what the search of each rank remembers, and counters: tensors on the CPU and plain
-    values. Of several processes all must ask for it."""
+    """Return the states of policy, critic, update and of each rank's search, and the counters: tensors on the CPU and
+    plain values. If several processes train together all must call it."""
     searches = training.ranks.gather("searches", lambda: _search_state(training))
     return {
         "searches": dict(enumerate(searches)),
@@ -59,7 +59,7 @@ def state_of(training: Training) -> dict[str, Any]:
 @torch.inference_mode(False)
 @torch.enable_grad()
 def restore(training: Training, state: dict[str, Any]) -> None:
-    """Have a training take over what `state_of` gave; or nothing of it, where it is no state of such a training.
+    """Load what `state_of` returned; nothing is loaded if it is no state of such a training.
 
     Raises:
         PgtsError: the part of it that does not fit is named.
@@ -89,7 +89,7 @@ def restore(training: Training, state: dict[str, Any]) -> None:
 
 
 def _search_state(training: Training) -> dict[str, Any]:
-    """What the search of this rank remembers, and its bounds."""
+    """The state of this rank's search, and its upper bounds."""
     if training.search is None or training.certificates is None:
         return {}
     with_states = isinstance(training.world, ModelWorld) and training.world.keeps_numbers
@@ -98,7 +98,7 @@ def _search_state(training: Training) -> dict[str, Any]:
 
 
 def _restore_search(training: Training, searches: Any) -> None:
-    """Take over what the search of this rank remembered."""
+    """Load the state of this rank's search."""
     if not isinstance(searches, Mapping) or set(searches) != set(range(len(searches))) or not searches:
         raise PgtsError("the saved state of searches is not one of each rank")
     rank, search, certificates = training.ranks.rank % len(searches), training.search, training.certificates
