@@ -263,7 +263,7 @@ def test_rewards_of_a_table_are_refused_where_values_would_be_no_numbers(gamma, 
         of(1.01 * 1.124 * most)
     with pytest.raises(PgtsError, match=r"P\[0\]\[0\] has reward 1e\+308; rewards must be finite, at most 2.2e\+307"):
         of(1e308)
-    sets, unit = stationary_sets.enumerate_sets(of(most)), stationary.enumerate_sets(of(1.0))
+    sets, unit = stationary_sets.enumerate_sets(of(most)), stationary_sets.enumerate_sets(of(1.0))
     assert sets.J_optimal == pytest.approx(most * unit.J_optimal)
     assert sets.histogram == unit.histogram
     for depth in range(3):
@@ -300,7 +300,7 @@ def test_a_discount_of_a_model_outside_0_to_1_is_refused(wrong):
     model = type("Wrong", (Growing,), {"wrong": wrong})()
     root_B = model.number(torch.zeros(1, 1))
     zeros = lambda state_N: torch.zeros(len(state_N))  # noqa: E731
-    message = rf"with the discount {wrong:.4}\d*; it must be in \[0, 1\]"
+    message = rf"the discount {wrong:.4}\d*; it must be in \[0, 1\]"
     with pytest.raises(PgtsError, match=message):
         expectimax(model, root_B, depth=1, v_leaf=zeros)
     with pytest.raises(PgtsError, match=message):
