@@ -17,11 +17,12 @@ _HANG_UP = getattr(signal, "SIGHUP", None)
 class StopFlag:
     """Records the first signal; a second one ends the process at once, with exit code 128 + signal.
 
-    Handles SIGTERM, SIGINT and, unless it is ignored (as under nohup), SIGHUP. A second SIGHUP is ignored: a closing
-    terminal may send two. A signal that another library's C code handles (`faulthandler.register`) is left to it,
-    because Python could not restore that handler; this is detected on Linux.
+    Handles SIGTERM, SIGINT and SIGHUP. SIGHUP is left alone where it is ignored (as under nohup) or handled by C code
+    (`faulthandler.register`, detected on Linux), and a second one is ignored: a closing terminal may send two.
+    SIGTERM and SIGINT are always handled: SDL, which pygame starts, would swallow them.
 
-    Use it as a context: leaving it restores the previous handlers. Outside the main thread, where Python receives no
+    Use it as a context: leaving it restores the previous handlers, but those of C code are lost, for Python does not
+    know them. Outside the main thread, where Python receives no
     signals, it records nothing.
 
     Args:
@@ -39,16 +40,16 @@ class StopFlag:
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             heard = [signal.SIGTERM, signal.SIGINT]
-            if _HANG_UP is not None and signal.getsignal(_HANG_UP) is not signal.SIG_IGN:
+            if _HANG_UP is not None and signal.getsignal(_HANG_UP) is not signal.SIG_IGN and not _is_foreign(_HANG_UP):
                 heard.append(_HANG_UP)
-            self._before = {each: signal.signal(each, self._on_signal) for each in heard if not _is_foreign(each)}
+            self._before = {each: signal.signal(each, self._on_signal) for each in heard}
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         for each, handler in self._before.items():
-            signal.signal(each, handler)
+            signal.signal(each, signal.SIG_DFL if handler is None else handler)  # None: a handler of C code
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.signal is None:
