@@ -11,7 +11,7 @@ import torch
 from pgts_torch.agent.frequencies import MARGINS, Frequencies
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.world import TabularWorld, World
+from pgts_torch.agent.world import DynamicsWorld, TabularWorld, World
 from pgts_torch.errors import ModelMismatch, PgtsError
 from pgts_torch.models.base import CONTRADICTED, RANDOM, ExactModel, Happened, step_text
 from pgts_torch.models.snapshots import env_name
@@ -26,6 +26,10 @@ _QUERY_PROB = 1 / 64
 
 _FALSE_ALARM = 1e-9
 """The probability that a right table is ever called wrong in a run."""
+
+_OBSERVATION_TOLERANCE = 1e-6
+"""Observations of dynamics and of their environment may differ by this times (1 + the size of a number): one of the two
+may compute them in float32."""
 
 _KINDS = "steps", "starts"
 """The probabilities that are tested: of outcomes and of start states."""
@@ -49,8 +53,8 @@ class ModelCheck:
     Only models that claim to be the environment are checked (`Model.exact`). Each step must be an outcome of positive
     probability (`ExactModel.outcome_of`) and each episode must begin in a possible state. Tables and dynamics are
     checked by all steps, simulators by those that the lookahead has queried already and by one in 64 of the others,
-    sampled from a stream of its own. Where a simulator only samples outcomes its steps cannot be checked, which is a
-    warning.
+    sampled from a stream of its own. Dynamics must also show in the visited states what the environment did, within
+    1e-6 (1 + its size). Where a simulator only samples outcomes its steps cannot be checked, which is a warning.
     The probabilities of tables are tested (`Frequencies`): an event whose probability is wrong by more than 0.02 is a
     contradiction, a smaller difference a warning. The probability of calling a right model wrong is below 1e-9, in a
     run of any length.
@@ -108,6 +112,8 @@ class ModelCheck:
                 self._warn("drawn", self._samples_only())
             if each.contradictions:
                 self._contradicted("steps", each.text, each.contradictions)
+        if isinstance(self._world, DynamicsWorld) and not self._world.model.transforms.observations:
+            self._check_observations(self._world, experience)
         if isinstance(self._model, TabularModel):
             self._check_starts(experience.state_TB[0].cpu().numpy())
             self._check_frequencies()
@@ -153,6 +159,19 @@ class ModelCheck:
             f"{self._name} has random steps whose outcomes its {self._kind} does not enumerate: whether these steps "
             "are possible, and with which probability, is not checked"
         )
+
+    def _check_observations(self, world: DynamicsWorld, experience: Rollout) -> None:
+        """Check that critics see at the leaves of a lookahead what the environment shows in such states."""
+        state_V, seen_VO = experience.state_TB[experience.alive_TB], experience.observation_V
+        told_VO = world.observe(state_V)
+        wrong_V = ((seen_VO - told_VO).abs() > _OBSERVATION_TOLERANCE * (1 + told_VO.abs())).any(-1)
+        if wrong_V.any():
+            first = int(wrong_V.nonzero()[0, 0])
+            text = (
+                f"{self._name} contradicts its {self._kind}: {world.model.state_text(int(state_V[first]))} shows "
+                f"{seen_VO[first].tolist()}; the {self._kind} says {told_VO[first].tolist()}. {_WAY_OUT}"
+            )
+            self._contradicted("observations", text, int(wrong_V.sum()))
 
     def _check_starts(self, start_B: np.ndarray) -> None:
         """Check that episodes begin in states of positive start probability."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from gymnasium.envs.classic_control import AcrobotEnv
 
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import ModelMismatch, PgtsError
@@ -18,6 +19,7 @@ from pgts_torch.models import CartPole, SimulatorModel, TabularModel
 from pgts_torch.models.base import CONTRADICTED, NOT_QUERIED, RANDOM, Happened, Model
 from pgts_torch.tabular import TabularMDP
 from tests.forks import on_ranks
+from tests.support import same_values
 
 A, S, LENGTH = 2, 6, 10
 SMALL = {"num_envs": 4, "horizon": {"type": "fixed", "length": LENGTH}, "seed": 0}
@@ -181,14 +183,34 @@ def test_an_environment_that_does_what_its_model_says_is_never_stopped(kind, uni
 
 
 @pytest.mark.parametrize(
-    "env", ["FrozenLake-v1", "Taxi-v4", "CliffWalking-v1", "pgts/Random-v0", "pgts/DeepSea-v0", "MountainCar-v0"]
+    ("env", "actions"),
+    [
+        *((env, None) for env in ("FrozenLake-v1", "Taxi-v4", "CliffWalking-v1", "pgts/Random-v0", "pgts/DeepSea-v0")),
+        *((env, None) for env in ("CartPole-v1", "Acrobot-v1", "MountainCar-v0")),
+        *((env, 3) for env in ("Pendulum-v1", "MountainCarContinuous-v0")),
+    ],
 )
-def test_the_tables_and_dynamics_that_come_along_agree_with_their_environments(env):
-    policy = "mlp" if env == "MountainCar-v0" else None
-    model = PGTS(env, depth=1, policy=policy, **{**SMALL, "num_envs": 16})
+def test_the_tables_and_dynamics_that_come_along_agree_with_their_environments(env, actions):
+    model = PGTS(env, depth=1, actions_per_dimension=actions, **{**SMALL, "num_envs": 16})
     model.learn(500)
     assert model.model_check.is_active
     assert model.model_check.contradictions == 0
+
+
+def test_dynamics_are_held_to_what_the_environment_shows(monkeypatch):
+    model = PGTS("Acrobot-v1", depth=1, **SMALL)
+    before, shown = model.policy.state_dict(), AcrobotEnv._get_ob
+    monkeypatch.setattr(AcrobotEnv, "_get_ob", lambda env: shown(env) + np.float32(5e-7))
+    model.iterate()
+    moved = model.policy.state_dict()
+    assert not same_values(before, moved)
+    monkeypatch.setattr(AcrobotEnv, "_get_ob", lambda env: shown(env)[[0, 1, 3, 2, 4, 5]])
+    with pytest.raises(
+        ModelMismatch, match=r"Acrobot-v1 contradicts its dynamics: state .* shows \[.*\]; the dynamics"
+    ):
+        model.iterate()
+    assert same_values(model.policy.state_dict(), moved)
+    assert model.model_check.contradictions > 20  # of 40 visits
 
 
 def test_a_reward_that_is_paid_in_float32_agrees_with_the_one_that_it_was_rounded_from():
