@@ -54,7 +54,7 @@ class PolicyLookahead:
         return _moved(_joined([part for part in parts if part is not None]), state_N.device)
 
     def restart(self) -> None:
-        """Reset the search before an iteration in which states are numbered anew."""
+        """Reset the search before an iteration in which states get new numbers."""
         if not self.world.keeps_numbers:
             self.search.reset()
 

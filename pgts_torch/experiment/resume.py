@@ -109,7 +109,7 @@ def find(
             raise PgtsError(f"run.dir {run} has lost its checkpoints and cannot go on: bring them back, or {_ADVICE}")
         if files.kind(run / CONFIG_FILE) is not None:
             _check_config(config, flat(load(run / CONFIG_FILE)), run)
-            print(f"note: the run in {run} was ended before its first checkpoint; it starts anew", file=sys.stderr)
+            print(f"note: the run in {run} was ended before its first checkpoint; it starts over", file=sys.stderr)
         return None
     path, notes, content = found
     _check_config(config, notes.config, run)
@@ -119,7 +119,7 @@ def find(
     lost_best = _lost_best(run, notes) if config.eval.keep_best else ""
     if lost_events:
         _complain(
-            [f"{lost_events} since {path} was written: the events are made anew from {METRICS_FILE}"], strict=strict
+            [f"{lost_events} since {path} was written: the events are rebuilt from {METRICS_FILE}"], strict=strict
         )
     if lost_best:
         _complain([f"{lost_best}: the model of {path} takes its place until a better one comes"], strict=strict)

@@ -26,7 +26,7 @@ Given = str | EnvSpec | gymnasium.Env | VectorEnv | Callable[[], gymnasium.Env]
 """What a user may give as an environment."""
 
 _Maker = Callable[..., gymnasium.Env]
-"""Makes a new environment; takes the arguments of `gymnasium.make`, and heeds them where it is made by that."""
+"""Makes a new environment; takes the arguments of `gymnasium.make`, which it uses if it makes environments by an id."""
 
 
 @final

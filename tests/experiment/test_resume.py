@@ -382,7 +382,7 @@ def test_lost_events_are_made_anew_from_the_metrics(damage, tmp_path, monkeypatc
     with pytest.raises(PgtsError, match="events"):
         run.train(config, strict_resume=True)
     run.train(config)
-    assert "the events are made anew from metrics.jsonl" in capsys.readouterr().err
+    assert "the events are rebuilt from metrics.jsonl" in capsys.readouterr().err
     assert same_values(left(tmp_path / "cut"), left(tmp_path / "whole"))
     assert [step for step, _ in curve(tmp_path / "cut")] == [60, 120, 180, 240, 300]
 
