@@ -2,6 +2,6 @@
 
 import sys
 
-from pgts_torch.experiment.cli import main
+from pgts_torch.cli.main import main
 
 sys.exit(main(["train", *sys.argv[1:]]))

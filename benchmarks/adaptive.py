@@ -18,8 +18,8 @@ import common
 
 from pgts_torch import PGTS
 from pgts_torch.agent.certificate import Certificates
+from pgts_torch.config import load
 from pgts_torch.experiment import run
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.summary import Summary
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pgts_torch.experiment.loading import load
+from pgts_torch.config import load
 from pgts_torch.experiment.run import build
 
 ROOT = Path(__file__).parent.parent

@@ -24,7 +24,7 @@ import torch
 
 from pgts_torch import PGTS
 from pgts_torch.agent.ranks import joined_ranks
-from pgts_torch.experiment.loading import load
+from pgts_torch.config import load
 from pgts_torch.experiment.run import build
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"

@@ -17,8 +17,8 @@ from typing import Any
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
+from pgts_torch.config import load
 from pgts_torch.experiment import run
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.summary import Summary
 from pgts_torch.experiment.tracking import read_metrics
 

@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from records import Key, Record, benchmark
 
 from pgts_torch.agent.evaluate import evaluate
+from pgts_torch.config import load
 from pgts_torch.experiment import run as experiment
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.sweep import bootstrap_interval, interquartile_mean
 
 ROOT = Path(__file__).resolve().parent.parent

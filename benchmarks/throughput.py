@@ -27,7 +27,7 @@ from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 import pgts_torch.agent.visit as visit_module
 from pgts_torch import PGTS
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
-from pgts_torch.experiment.loading import load
+from pgts_torch.config import load
 from pgts_torch.experiment.run import build
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"

@@ -5,8 +5,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pgts_torch.experiment.arguments import Parser, output_folder
-from pgts_torch.experiment.cli import exit_code
+from pgts_torch.cli.arguments import Parser, output_folder
+from pgts_torch.cli.main import exit_code
 from study import PARTS
 
 

@@ -16,7 +16,7 @@ from typing import IO, Any
 import torch
 from torch import distributed
 
-from pgts_torch.experiment.cli import main
+from pgts_torch.cli.main import main
 
 PATIENCE = 120
 """Seconds that a child may take: more than it needs on a busy machine, and less than the time limit of a test."""
@@ -70,7 +70,7 @@ class ForkedCommand:
             with open(os.devnull, "w") as sys.stdout, os.fdopen(os.dup(stderr.fileno()), "w") as sys.stderr:
                 return main(command[3:])
 
-        assert (stdout, command[:3]) == (subprocess.DEVNULL, [sys.executable, "-m", "pgts_torch.experiment.cli"])
+        assert (stdout, command[:3]) == (subprocess.DEVNULL, [sys.executable, "-m", "pgts_torch.cli"])
         self.returncode: int | None = None
         self._pid = _forked(work)
 

@@ -28,7 +28,9 @@ ROOMS = [
     "search",
     "agent",
     "pgts_torch",
+    "config",
     "experiment",
+    "cli",
 ]
 """Each may import itself and what stands before it; "pgts_torch" is `__init__.py`, the public face of the rooms."""
 
@@ -100,10 +102,11 @@ def test_imports_point_one_way():
         ("pgts_torch.search.expectimax", "from pgts_torch import PGTS"),
         (
             "pgts_torch.agent.pgts",
-            "import torch\nif TYPE_CHECKING:\n    from pgts_torch.experiment.config import Config",
+            "import torch\nif TYPE_CHECKING:\n    from pgts_torch.config import Config",
         ),
-        ("pgts_torch", "from pgts_torch.experiment import cli"),
-        ("pgts_torch.experiment.cli", "def figures():\n    from study import command"),
+        ("pgts_torch", "from pgts_torch import cli"),
+        ("pgts_torch.experiment.run", "from pgts_torch.cli.main import main"),
+        ("pgts_torch.cli.main", "def figures():\n    from study import command"),
     ],
 )
 def test_an_import_from_a_later_room_would_be_found(module, source):
@@ -116,7 +119,7 @@ def test_an_import_from_a_later_room_would_be_found(module, source):
         ("pgts_torch.tabular.exact", "import torch\nfrom pgts_torch.bellman import backup"),
         ("pgts_torch.tabular.exact", "from pgts_torch.tabular.mdp import TabularMDP\nfrom . import mdp"),
         ("pgts_torch.agent.pgts", "from pgts_torch import tabular, search"),
-        ("pgts_torch.experiment.run", "from pgts_torch import PGTS\nfrom .config import Config"),
+        ("pgts_torch.experiment.run", "from pgts_torch import PGTS\nfrom ..config import Config"),
     ],
 )
 def test_an_import_from_an_earlier_room_is_allowed(module, source):

@@ -1,1 +1,1 @@
-"""From a configuration to a run: the command line, the loop around the algorithm and what it leaves behind."""
+"""The loop around the algorithm, the folder of a run and what is left in it."""

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from pgts_torch import files
+from pgts_torch.config import Config, dump
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
-from pgts_torch.experiment.config import Config, dump
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.ownership import (
     BEST_FILE,

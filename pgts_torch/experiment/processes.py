@@ -69,7 +69,7 @@ class _Training:
         self._started, self._is_terminated = time.perf_counter(), False
         self.stderr = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 (outlives this)
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "pgts_torch.experiment.cli", "train", *arguments],
+            [sys.executable, "-m", "pgts_torch.cli", "train", *arguments],
             stdout=subprocess.DEVNULL,
             stderr=self.stderr,
             env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},

@@ -14,10 +14,9 @@ from torch import Tensor
 from pgts_torch import files
 from pgts_torch.agent import saving
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
-from pgts_torch.experiment.config import Config
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.ownership import (
     BEST_FILE,
     CONFIG_FILE,

@@ -21,18 +21,18 @@ from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.ranks import joined_ranks
 from pgts_torch.agent.states import check_keys, take_over
+from pgts_torch.config import Config
+from pgts_torch.config.sections import EvalConfig
 from pgts_torch.errors import Failed, ModelMismatch, NotFinite, PgtsError, Stopped, check_count, failure
 from pgts_torch.experiment import checkpoint, diagnostics
 from pgts_torch.experiment.advice import Movement, greedy_is_worse, hardly_moved, not_converged, span_of
 from pgts_torch.experiment.checkpoint import Notes
-from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import KINDS
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.opening import check_dir, claimed, opened
 from pgts_torch.experiment.ownership import BEST_FILE, FAILURE_FILE, SUMMARY_FILE
 from pgts_torch.experiment.progress import Reporter
 from pgts_torch.experiment.resume import Start, find, flat, resuming
-from pgts_torch.experiment.sections import EvalConfig
 from pgts_torch.experiment.signals import StopFlag
 from pgts_torch.experiment.summary import EndedBy, Summary
 from pgts_torch.experiment.tracking import Folder, NoFolder, event_writer, versions

@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pgts_torch import files
+from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.config import Config
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.processes import train_all
 
 CONFIDENCE = 0.95

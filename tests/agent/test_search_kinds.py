@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pgts_torch import PGTS
+from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.run import build
 from pgts_torch.models import TabularModel
 from pgts_torch.search import mcts

@@ -10,8 +10,8 @@ import torch
 
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.cli.main import main
 from pgts_torch.experiment import checkpoint, run
-from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.tracking import read_metrics
 
 assert run.train  # imported before any process is forked, so that none has to

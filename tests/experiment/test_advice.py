@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from pgts_torch.agent.evaluate import Evaluation, Score
+from pgts_torch.config import load
 from pgts_torch.experiment import run
 from pgts_torch.experiment.advice import greedy_is_worse
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.report.page import write
 from pgts_torch.experiment.summary import Summary, describe, from_json
 

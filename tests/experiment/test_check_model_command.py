@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pgts_torch.experiment.cli import main
+from pgts_torch.cli.main import main
 from tests.forks import PATIENCE
 
 HELP = "(see pgts check-model --help)"
@@ -148,7 +148,7 @@ def test_a_missing_extra_is_named(monkeypatch, capsys):
 
 TORCH_FREE = """
 import sys
-from pgts_torch.experiment.cli import main
+from pgts_torch.cli.main import main
 assert [main(["check-model", *arguments.split()]) for arguments in ("--help", "", "X --seed x")] == [0, 2, 2]
 sys.exit(3 if "torch" in sys.modules else 0)
 """

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.cli.main import main
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import ModelMismatch, NotFinite
 from pgts_torch.experiment import run
-from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.evaluate import last_checkpoint
 
 ROOT = Path(__file__).parents[2]

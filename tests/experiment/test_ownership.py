@@ -10,11 +10,10 @@ import pytest
 
 from pgts_torch import PGTS, EvalCallback
 from pgts_torch.agent import saving
+from pgts_torch.cli.main import main
+from pgts_torch.config import Config, dump, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint, opening, run
-from pgts_torch.experiment.cli import main
-from pgts_torch.experiment.config import Config, dump
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.ownership import MARK_FILE, digest, sealed
 from pgts_torch.experiment.tracking import RunFolder, read_metrics

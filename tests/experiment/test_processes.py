@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pgts_torch.cli.main import main
 from pgts_torch.experiment import checkpoint
-from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.tracking import read_metrics
 from tests import reliability
 from tests.experiment.runs import arguments, left, train_under_fire

@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 
 import pytest
 
+from pgts_torch.cli.main import main
 from pgts_torch.envs import vector
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.report import facts
 from pgts_torch.experiment.report import page as page_module
 from pgts_torch.experiment.report.curves import draw, panels

@@ -13,12 +13,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.cli.main import main
+from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import diagnostics, pictures, run
-from pgts_torch.experiment.cli import main
-from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import last_checkpoint
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.pictures import policy_picture  # before conftest.py puts a smaller one in its place
 from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import RunFolder, read_metrics

@@ -13,11 +13,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import run
-from pgts_torch.experiment.config import Config
 from pgts_torch.experiment.evaluate import evaluate_run, last_checkpoint
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import read_metrics
 

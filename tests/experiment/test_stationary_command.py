@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pgts_torch.experiment.cli import STATIONARY_OPTIONS, main
+from pgts_torch.cli.commands import STATIONARY_OPTIONS
+from pgts_torch.cli.main import main
 from pgts_torch.tabular import deep_sea, exact, grid, ladder, random_mdp, stationary_sets, tightrope
 from tests.forks import PATIENCE
 
@@ -185,7 +186,7 @@ def test_a_mistake_is_one_line_with_exit_code_2(arguments, npz, capsys):
 
 TORCH_FREE = """
 import sys
-from pgts_torch.experiment.cli import main
+from pgts_torch.cli.main import main
 codes = [main(["stationary", *arguments.split()]) for arguments in
          ("--help", "laddr", "none.npz", "ladder --n x", "tightrope --n 3", "ladder --gamma 2")]
 assert codes == [0, 2, 2, 2, 2, 2], codes

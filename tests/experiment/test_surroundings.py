@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import progress, run
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.tracking import read_metrics, versions
 from tests.forks import PATIENCE
 
@@ -22,7 +22,7 @@ def started(folder: Path, redirections: str, *arguments: str) -> "subprocess.Com
     """`pgts` by a shell, in a session without a terminal and in the C locale."""
     environment = {name: value for name, value in os.environ.items() if name not in ("TERM", "LANG", "LC_CTYPE")}
     return subprocess.run(
-        ["sh", "-c", f'"$@" {redirections}', "sh", sys.executable, "-m", "pgts_torch.experiment.cli", *arguments],
+        ["sh", "-c", f'"$@" {redirections}', "sh", sys.executable, "-m", "pgts_torch.cli", *arguments],
         cwd=folder,
         env=environment | BARE,
         stdin=subprocess.DEVNULL,

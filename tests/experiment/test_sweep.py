@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from pgts_torch.cli.main import main
+from pgts_torch.config import dump
 from pgts_torch.errors import PgtsError, Stopped
 from pgts_torch.experiment import checkpoint, run, sweep
-from pgts_torch.experiment.cli import main
-from pgts_torch.experiment.config import dump
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.processes import train_all
 from tests.forks import PATIENCE, ForkedCommand, in_child, started
@@ -112,7 +112,7 @@ def test_a_sweep_that_is_stopped_saves_and_the_same_command_ends_with_the_table_
     expected = asdict(sweep.sweep(whole, jobs=1, out=Path("whole")))
     arguments = ["sweep", "--out", "out", "--depths", "1", "--seeds", "1", *SMALL, *long]
     folder = Path("out/depth-1/seed-0")
-    command = [sys.executable, "-m", "pgts_torch.experiment.cli", *arguments]
+    command = [sys.executable, "-m", "pgts_torch.cli", *arguments]
     with started(command) as process:
         until(lambda: bool(checkpoint.listed(folder)))
         process.terminate()
@@ -288,8 +288,7 @@ def test_the_interval_shrinks_with_the_root_of_the_number_of_runs():
 
 TORCH_FREE = """
 import sys
-from pgts_torch.experiment.cli import main
-from pgts_torch.experiment.config import dump
+from pgts_torch.cli.main import main
 assert [main(["sweep", *arguments.split()]) for arguments in ("--help", "", "--out o --seed 1")] == [0, 2, 2]
 sys.exit(3 if "torch" in sys.modules else 0)
 """

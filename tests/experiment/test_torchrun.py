@@ -14,8 +14,8 @@ import torch
 
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
+from pgts_torch.cli.main import main
 from pgts_torch.experiment import checkpoint
-from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.search.lookahead import check_finite
 from tests.experiment.runs import SHORT, SMALL, arguments, left, train_under_fire

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from pgts_torch import PGTS
+from pgts_torch.cli.main import main
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.cli import main
 from pgts_torch.trust import check_imports
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint, ownership
-from pgts_torch.experiment.config import Config
-from pgts_torch.experiment.loading import load
 from pgts_torch.experiment.report.curves import panels
 from pgts_torch.experiment.resume import flat
 from pgts_torch.experiment.summary import Summary, from_json, rows

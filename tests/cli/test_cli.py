@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 
 from pgts_torch import experiment
+from pgts_torch.cli.commands import COMMANDS
+from pgts_torch.cli.main import main
+from pgts_torch.config import Config, dump, load, strict_yaml
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import strict_yaml, summary
-from pgts_torch.experiment.cli import COMMANDS, main
-from pgts_torch.experiment.config import Config, dump
-from pgts_torch.experiment.loading import load
+from pgts_torch.experiment import summary
 from pgts_torch.options.schema import Schema
 from tests.forks import PATIENCE, started
 
@@ -246,7 +246,7 @@ def shell(tmp_path: Path) -> Callable[..., "subprocess.CompletedProcess[str]"]:
 
 TORCH_FREE = """
 import sys
-from pgts_torch.experiment.cli import main
+from pgts_torch.cli.main import main
 for arguments in (["--help"], ["train", "--help"], ["train", "--print-config"], ["train", "--search.depth", "-1"],
                   ["train", "--config", "none.yaml"], ["evaluate", "none"], ["trian"]):
     main(arguments)
@@ -269,7 +269,7 @@ def test_train_py_is_pgts_train(shell: Callable[..., "subprocess.CompletedProces
 
 @pytest.mark.fault("reader that leaves early")
 def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pgts_torch.experiment.cli", "train", "--help"]
+    command = [sys.executable, "-m", "pgts_torch.cli", "train", "--help"]
     with started(command, cwd=tmp_path, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stderr is not None

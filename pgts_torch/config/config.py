@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from pgts_torch.experiment import strict_yaml
-from pgts_torch.experiment.sections import EvalConfig, LogConfig, RunConfig
+from pgts_torch.config import strict_yaml
+from pgts_torch.config.sections import EvalConfig, LogConfig, RunConfig
 from pgts_torch.options import CMPO, CNN, MLP, PPO, Mirror, NetworkValues, OwnNetwork, Projected, Softmax, TabularValues
 from pgts_torch.options.fields import Count, Device, Name, Natural
 from pgts_torch.options.part import Part

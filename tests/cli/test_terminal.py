@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from pgts_torch.cli.main import main
+from pgts_torch.cli.terminal import SafeStream
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.cli import main
 from pgts_torch.experiment.signals import StopFlag
-from pgts_torch.experiment.terminal import SafeStream
 from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.tabular import TabularMDP
 from tests.experiment.test_surroundings import started
@@ -131,7 +131,8 @@ def test_a_sweep_names_a_damaged_summary(content, tmp_path, monkeypatch, capsys)
 
 WARNS = """
 import warnings
-from pgts_torch.experiment.cli import COMMANDS, main
+from pgts_torch.cli.commands import COMMANDS
+from pgts_torch.cli.main import main
 
 def warns(arguments):
     warnings.warn("the table is odd")
@@ -146,7 +147,7 @@ def test_a_warning_on_the_command_line_is_one_line_without_its_place_in_the_code
     done = subprocess.run([sys.executable, "-c", WARNS], capture_output=True, text=True, timeout=PATIENCE)
     first, second, *_ = done.stderr.splitlines()
     assert first == "warning: the table is odd"
-    assert second == "<string>:7: RuntimeWarning: of another kind"
+    assert second == "<string>:8: RuntimeWarning: of another kind"
 
 
 @pytest.mark.parametrize(("number", "is_left"), [(signal.SIGHUP, True), (signal.SIGTERM, False)])

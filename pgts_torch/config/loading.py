@@ -8,10 +8,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from pgts_torch import files
+from pgts_torch.config import strict_yaml
+from pgts_torch.config.config import Config, with_types
+from pgts_torch.config.strict_yaml import Document, YamlMistake
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import strict_yaml
-from pgts_torch.experiment.config import Config, with_types
-from pgts_torch.experiment.strict_yaml import Document, YamlMistake
 from pgts_torch.options.mistakes import Mistake, escape, explain, quote, schema_of, show, what
 from pgts_torch.options.schema import KeyPath, Node, Schema, is_nullable, is_text
 

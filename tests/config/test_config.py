@@ -25,9 +25,8 @@ from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import TabularWorld
-from pgts_torch.experiment import strict_yaml
-from pgts_torch.experiment.config import Config, dump
-from pgts_torch.experiment.loading import MAX_BYTES, MAX_MISTAKES, ConfigError, load
+from pgts_torch.config import Config, ConfigError, dump, load, strict_yaml
+from pgts_torch.config.loading import MAX_BYTES, MAX_MISTAKES
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.options import CMPO, FixedHorizon, Mirror, TabularValues
 from pgts_torch.options.arguments import read

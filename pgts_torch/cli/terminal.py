@@ -102,3 +102,8 @@ def print_kept(text: str, *, kept: str) -> None:
         print(text, flush=True)
     except PgtsError as error:
         print(f"warning: {error}; it is in {kept}", file=sys.stderr)
+
+
+def rank() -> int:
+    """The rank of this process under torchrun, else 0; rank 0 prints."""
+    return int(os.environ["RANK"]) if "TORCHELASTIC_RUN_ID" in os.environ else 0

@@ -1,18 +1,13 @@
-"""The command `pgts`: one function for each subcommand.
-
-Torch is imported only after the arguments have been checked, so that errors and help appear at once.
-"""
+"""The subcommands of `pgts`, a function each."""
 
 import argparse
 import difflib
 import json
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 
-from pgts_torch.errors import NotFinite, PgtsError, RankLost, Stopped
-from pgts_torch.experiment.arguments import (
+from pgts_torch.cli.arguments import (
     Parser,
     depth_list,
     describe_options,
@@ -27,15 +22,13 @@ from pgts_torch.experiment.arguments import (
     whole,
     whole_list,
 )
-from pgts_torch.experiment.config import Config, dump
-from pgts_torch.experiment.loading import load
+from pgts_torch.cli.terminal import print_kept, rank
+from pgts_torch.config import Config, dump, load
 from pgts_torch.experiment.ownership import SUMMARY_FILE
-from pgts_torch.experiment.terminal import plain_warnings, print_kept, safe_output
 from pgts_torch.options.schema import Schema
 from pgts_torch.trust import check_imports
 
-CHECK_FAILED = TRAINING_FAILED = 1
-USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
+CHECK_FAILED = 1
 
 Arguments = Sequence[str]
 COMMANDS: dict[str, Callable[[Arguments], None]] = {}
@@ -46,45 +39,6 @@ def command(function: Callable[[Arguments], None]) -> Callable[[Arguments], None
     """Register a subcommand under the function's name, with dashes for underscores."""
     COMMANDS[function.__name__.replace("_", "-")] = function
     return function
-
-
-def main(arguments: Arguments | None = None) -> int:
-    """Run `pgts` with these arguments (default: those of the process).
-
-    Returns:
-        The exit code: 0; 1 if `check-model` says no, a run of a sweep failed or a number in training was not finite; 2
-        after a mistake of the caller, reported on stderr, a line each; 130 after Ctrl-C, 143 after SIGTERM, 129 after
-        SIGHUP.
-    """
-    return exit_code(_run_command, sys.argv[1:] if arguments is None else arguments)
-
-
-def exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> int:
-    """Run a command and return its exit code, as `main` says; mistakes and failures go to stderr, a line each."""
-    with safe_output(), plain_warnings():
-        return _exit_code(function, arguments)
-
-
-def _exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> int:
-    try:
-        code = _dispatch(function, arguments)
-        sys.stdout.flush()  # so that a broken pipe is noticed here, not while the interpreter shuts down
-        return code
-    except PgtsError as error:
-        rank = _rank()
-        if rank == (error.rank or 0):  # an error that all processes raise is printed by the first
-            for line in str(error).splitlines():
-                print(f"error: {f'[rank {rank}] ' if rank else ''}{line}", file=sys.stderr)
-        return TRAINING_FAILED if isinstance(error, NotFinite | RankLost) else USAGE_ERROR
-    except BrokenPipeError:
-        return BROKEN_PIPE
-    except Stopped as stopped:
-        if _rank() == 0:
-            print(stopped, file=sys.stderr)
-        return 128 + stopped.signal
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
 
 
 @command
@@ -123,13 +77,13 @@ def train(arguments: Arguments) -> None:
         typed = {override.removeprefix("--").partition("=")[0] for override in overrides}
         saved_id = None if typed & {"env", "env.id"} else config.env.id
         check_imports(fixed.resume / "config.yaml", saved_id, config.env.kwargs)
-    if fixed.config is None and fixed.resume is None and _rank() == 0:
+    if fixed.config is None and fixed.resume is None and rank() == 0:
         print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
     from pgts_torch.experiment import run
     from pgts_torch.experiment.summary import describe
 
     summary = run.train(config, strict_resume=fixed.strict_resume, any_world_size=fixed.any_world_size)
-    if _rank() == 0:
+    if rank() == 0:
         print_kept(json.dumps(asdict(summary)) if fixed.json else describe(summary), kept=f"{SUMMARY_FILE} of the run")
 
 
@@ -287,50 +241,6 @@ def _add_trust(parser: Parser, when: str = "") -> None:
     )
 
 
-def _dispatch(function: Callable[[Arguments], None], arguments: Arguments) -> int:
-    """Run a command and return its exit code; argparse raises SystemExit after --help."""
-    try:
-        function(arguments)
-    except SystemExit as leave:
-        return leave.code if isinstance(leave.code, int) else int(leave.code is not None)
-    return 0
-
-
-def _run_command(arguments: Arguments) -> None:
-    """Call the function of a subcommand with the arguments after it."""
-    summaries = [f"  {name:<12}{(function.__doc__ or '').partition(chr(10))[0]}" for name, function in COMMANDS.items()]
-    parser = Parser("", main, usage="pgts [-h] [--version] COMMAND ...")
-    parser.description = "Policy gradient with tree search."
-    parser.epilog = "\n".join(["commands:", *summaries, "", "pgts COMMAND --help explains each."])
-    parser.add_argument("--version", action="store_true", help="print the version and stop")
-    parser.add_argument("command", metavar="COMMAND", nargs="?", help="what to do")
-    parser.add_argument("arguments", metavar="...", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
-    given = parser.parse_args(arguments)
-    if given.version:
-        print(f"pgts {_version()}")
-    elif given.command is None:
-        parser.error(f"a command is missing; choose from {', '.join(COMMANDS)}")
-    elif given.command == "figures":
-        parser.error("'figures' is no longer a command of pgts; run python -m study in a checkout of the repository")
-    elif given.command not in COMMANDS:
-        close = difflib.get_close_matches(given.command, COMMANDS, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(COMMANDS)}"
-        parser.error(f"{given.command!r} is not a command; {hint}")
-    else:
-        COMMANDS[given.command](given.arguments)
-
-
-def _rank() -> int:
-    """The rank of this process under torchrun, else 0; rank 0 prints."""
-    return int(os.environ["RANK"]) if "TORCHELASTIC_RUN_ID" in os.environ else 0
-
-
-def _version() -> str:
-    from importlib.metadata import version
-
-    return version("pgts_torch")
-
-
 def _mdp_name(text: str) -> str:
     """An argparse type: the name of an MDP, or the path of a file that ends in .npz."""
     names = [name for name in STATIONARY_OPTIONS if not name.endswith(".npz")]
@@ -343,7 +253,3 @@ def _mdp_name(text: str) -> str:
     if path_kind(text) != "file":
         raise argparse.ArgumentTypeError(f"{text!r} is not a file")
     return text
-
-
-if __name__ == "__main__":
-    sys.exit(main())
