@@ -7,11 +7,11 @@ numbers as it meets them, equal states the same one, so that a search can merge 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
@@ -51,6 +51,21 @@ class Happened:
         return Happened(*(column_N[at] for column_N in vars(self).values()))
 
 
+class Experience(NamedTuple):
+    """N steps of an environment in observations, in the order in which they happened, for a model to learn from.
+
+    reward_N: in reward units.   discount_N: in [0, 1], 0 where the episode terminated.
+    follows_N: whether the next row is another step of the same episode.
+    """
+
+    observation_N: Shaped[Tensor, "N ..."]
+    action_N: Int[Tensor, "N"]
+    reward_N: Float[Tensor, "N"]
+    discount_N: Float[Tensor, "N"]
+    next_observation_N: Shaped[Tensor, "N ..."]
+    follows_N: Bool[Tensor, "N"]
+
+
 CONTRADICTED, RANDOM, NOT_QUERIED = -1, -2, -3
 """What `ExactModel.outcome_of` returns in place of an outcome: the model has none like this step with a positive
 probability; the model samples what follows, and enumerates nothing to compare with; the answer would cost a call."""
@@ -66,7 +81,8 @@ class Model(ABC):
     reward_range: between which numbers its rewards must be; None: any.
     action_repeat: how often an action is taken in one outcome.
     is_certain: whether it is known that no action has more than one outcome.
-    generation: how often the model has been cleared, so that states have got other numbers.
+    generation: how often the model has changed, so that what was remembered of it is no longer true: it has learned,
+        or has been cleared, after which states have other numbers.
     """
 
     num_states: int
@@ -115,6 +131,22 @@ class ExactModel(Model):
     @abstractmethod
     def outcomes_text(self, state: int, action: int) -> str:
         """The outcomes of a state and an action, in a message."""
+
+
+class LearningModel(Model):
+    """A model that learns from the steps of an environment. It is never called exact."""
+
+    @abstractmethod
+    def learn(self, experience: Experience, *, generator: torch.Generator) -> dict[str, float]:
+        """Learn from steps that were not learned from before; `generation` moves. Return losses and errors, by name."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Return what was learned and seen, as tensors on the CPU and plain values."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load what `state_dict` returned; PgtsError if it does not fit."""
 
 
 def promise(model: Model, reward_range: RewardRange, *, gamma: float) -> None:
