@@ -18,10 +18,14 @@ DENSE = (
     "search/tree.py",
     "search/topology.py",
     "search/split.py",
+    "search/outcome_table.py",
+    "search/levels.py",
+    "search/nodes.py",
     "search/empirical.py",
     "search/sampled.py",
     "models/state_index.py",
     "models/simulator.py",
+    "models/stepper.py",
 )
 """Masks, scatters and index arithmetic: here a reader needs comments."""
 

@@ -66,7 +66,7 @@ def tree_search_run(method: str, size: int, seed: int) -> Record:
     family, _, depth = method.rpartition("-")
     model = PGTS(
         "pgts/DeepSea-v0",
-        depth=depth if depth == "adaptive" else int(depth),
+        depth="adaptive" if depth == "adaptive" else int(depth),
         num_envs=BATCH,
         gamma=GAMMA,
         seed=seed,
@@ -206,7 +206,7 @@ def picture(records: list[Record]) -> Figure:
     left, right = figure.subplots(1, 2)
     for depth in DEPTHS:
         mine = [r for r in records if r["method"] == f"pgts-{depth}"]
-        share = [np.mean([_solved(r) for r in mine if r["size"] == n] or [np.nan]) for n in sizes]
+        share = [np.mean([float(_solved(r)) for r in mine if r["size"] == n] or [np.nan]) for n in sizes]
         dots = left.scatter(sizes, [depth] * len(sizes), c=share, cmap="RdYlBu", vmin=0, vmax=1, s=42, edgecolors="k")
     left.step(
         sizes, [least_depth(n) for n in sizes], where="mid", color="k", label="exact world: deep enough from here"
@@ -241,17 +241,7 @@ def _sizes(records: list[Record]) -> list[int]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    benchmark(
-        __doc__,
-        arguments,
-        problem="size",
-        problems=SIZES,
-        methods=METHODS,
-        runs=RUNS,
-        run=run,
-        describe=describe,
-        draw=picture,
-    )
+    benchmark(__doc__, arguments, "size", SIZES, METHODS, RUNS, run, describe, picture)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """A puzzle that is seen as an image: fetch the key, pass the door, reach the goal; nothing is rewarded before."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -15,13 +15,13 @@ MOVES: tuple[Cell, ...] = ((-1, 0), (0, 1), (1, 0), (0, -1))
 class KeyAndDoor(gymnasium.Env[np.ndarray, np.int64]):
     """A 6x6 room with a wall across it; the door in the wall opens for who has the key.
 
-    Agent and key start in cells of the left half that are drawn in each episode. Reaching the goal in the far corner
+    Agent and key start in cells of the left half that are sampled in each episode. Reaching the goal in the far corner
     pays 1 and ends the episode.
 
     An observation has four channels of 0 and 255: agent, key (until it is taken), goal, wall and closed door (128).
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's type)
     size, wall, door, goal = 6, 3, (1, 3), (5, 5)
 
     def __init__(self) -> None:
@@ -66,4 +66,4 @@ class KeyAndDoor(gymnasium.Env[np.ndarray, np.int64]):
 
 
 ID = "KeyAndDoor-v0"
-gymnasium.register(ID, KeyAndDoor, max_episode_steps=100)
+gymnasium.register(ID, KeyAndDoor, max_episode_steps=100)  # type: ignore[arg-type]

@@ -49,7 +49,7 @@ def cost(name: str, options: dict[str, Any], iterations: int) -> dict[str, float
             call(self, *args)
             checked += time.thread_time() - begin
 
-        ModelCheck.__call__ = timed  # type: ignore[method-assign]
+        ModelCheck.__call__ = timed  # type: ignore[method-assign, assignment]
         begin = time.thread_time()
         model.iterate()
         if k >= 10:

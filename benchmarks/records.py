@@ -22,7 +22,6 @@ Record = dict[str, Any]
 def benchmark(
     doc: str,
     arguments: list[str] | None,
-    *,
     problem: str,
     problems: Sequence[Any],
     methods: Sequence[str],
@@ -81,10 +80,10 @@ def measure(keys: Sequence[Key], run: Callable[[Key], Record], *, path: Path, jo
         waiting = {pool.submit(run, key): key for key in missing}
         for number, future in enumerate(as_completed(waiting), 1):
             key = waiting[future]
-            record = {**key, **future.result()}
-            file.write(json.dumps(record) + "\n")
+            made = {**key, **future.result()}
+            file.write(json.dumps(made) + "\n")
             file.flush()
-            kept.append(record)
+            kept.append(made)
             print(f"[{number}/{len(missing)}] {' '.join(map(str, key.values()))}", file=sys.stderr, flush=True)
     return [record for key in keys if (record := _find(kept, key)) is not None]
 

@@ -41,11 +41,18 @@ def row(name: str, seeds: int) -> dict[str, Any]:
     answer: dict[str, Any] = {"config": name}
     for label, depth in (("plain", 0), ("lookahead", None)):
         summaries = [trained(name, seed, depth)[0] for seed in range(seeds)]
-        answer[label] = [summary.J / summary.J_optimal for summary in summaries]
+        answer[label] = [share_of_optimum(summary) for summary in summaries]
         answer[f"{label}_seconds"] = statistics.median(summary.seconds for summary in summaries)
         answer["depth"], answer["env_steps"] = summaries[0].depth, summaries[0].env_steps
         answer["model_calls"] = max(summary.model_calls for summary in summaries)
     return answer
+
+
+def share_of_optimum(summary: Summary) -> float:
+    """J / J*, which a tabular environment has."""
+    assert summary.J is not None
+    assert summary.J_optimal is not None
+    return summary.J / summary.J_optimal
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -74,7 +81,7 @@ def ladder_picture(seeds: int) -> Figure:
     for depth in LADDER_DEPTHS:
         for seed in range(seeds):
             summary, metrics = trained("ladder", seed, depth)
-            optimum = summary.J_optimal
+            optimum = summary.J_optimal or optimum
             axes.plot(
                 [line["step"] for line in metrics],
                 [line["exact/J"] for line in metrics],

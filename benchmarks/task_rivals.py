@@ -81,11 +81,13 @@ EXPLORATION_STEPS = {"CartPole-v1": 8_000, "Acrobot-v1": 12_000, "MountainCar-v0
 """The zoo's exploration_fraction of its n_timesteps."""
 
 
-def train(method: str, env_id: str, *, seed: int, gamma: float, budget: int, watch: Callable[..., bool]) -> None:
-    """One training, watched."""
+def train(
+    method: str, env_id: str, episodes: int, *, seed: int, gamma: float, budget: int, watch: Callable[..., bool]
+) -> None:
+    """One training, watched by evaluations of so many episodes."""
     copies = 1 if method == "dqn" else COPIES.get(env_id, 8)
     env = _copies(env_id, copies, "train", seed)
-    fresh = _copies(env_id, min(50, watch.task.episodes), "eval", seed + 1000)
+    fresh = _copies(env_id, min(50, episodes), "eval", seed + 1000)
     untuned = {"n_steps": 256, "batch_size": 256} if method == "ppo" else {}
     options = {"gamma": gamma} | TUNED.get((method, env_id), untuned)
     if method == "dqn" and env_id in EXPLORATION_STEPS:
@@ -97,7 +99,7 @@ def train(method: str, env_id: str, *, seed: int, gamma: float, budget: int, wat
 
     def score() -> float:
         sync_envs_normalization(env, fresh)
-        return float(evaluate_policy(model, fresh, watch.task.episodes, deterministic=True, warn=False)[0])
+        return float(evaluate_policy(model, fresh, episodes, deterministic=True, warn=False)[0])
 
     class Watched(BaseCallback):
         def _on_step(self) -> bool:

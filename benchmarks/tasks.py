@@ -103,8 +103,9 @@ def run(key: Key) -> Record:
         return watch.record()
     from task_rivals import train
 
-    watch = Watch(task)
-    train(key["method"], config.env.id, seed=key["seed"], gamma=config.env.gamma, watch=watch, budget=task.budget)
+    watch, gamma = Watch(task), config.env.gamma
+    assert gamma is not None, "these configurations say it"
+    train(key["method"], config.env.id, task.episodes, seed=key["seed"], gamma=gamma, watch=watch, budget=task.budget)
     return watch.record()
 
 
@@ -171,17 +172,7 @@ def picture(records: list[Record]) -> Figure:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    benchmark(
-        __doc__,
-        arguments,
-        problem="task",
-        problems=tuple(TASKS),
-        methods=METHODS,
-        runs=RUNS,
-        run=run,
-        describe=table,
-        draw=picture,
-    )
+    benchmark(__doc__, arguments, "task", tuple(TASKS), METHODS, RUNS, run, table, picture)
 
 
 if __name__ == "__main__":
