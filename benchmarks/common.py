@@ -51,7 +51,7 @@ def uniform_evaluation(mdp: TabularMDP) -> exact.Evaluation:
     return exact.evaluate(mdp, pi_SA)
 
 
-def drawn_roots(mdp: TabularMDP, count: int) -> torch.Tensor:
+def sampled_roots(mdp: TabularMDP, count: int) -> torch.Tensor:
     """States in which something can still follow, drawn with a fixed seed: distinct ones if there are that many."""
     goes_on_S = ((mdp.outcomes.prob_NAK > 0) & (mdp.outcomes.discount_NAK > 0)).any(-1).any(-1)
     states = torch.nonzero(goes_on_S).flatten().numpy()

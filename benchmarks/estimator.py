@@ -29,9 +29,9 @@ import torch
 from common import (
     MDPS,
     about,
-    drawn_roots,
     milliseconds,
     parser,
+    sampled_roots,
     short,
     uniform_evaluation,
     unmerged_nodes,
@@ -88,7 +88,7 @@ def task(name: str, depth: int, device: str) -> Task:
     mdp = MDPS[name]()
     evaluation = uniform_evaluation(mdp)
     diagonal = name.startswith("DeepSea")
-    root_B = torch.arange(mdp.shape[0]) * (mdp.shape[0] + 1) if diagonal else drawn_roots(mdp, ROOTS)
+    root_B = torch.arange(mdp.shape[0]) * (mdp.shape[0] + 1) if diagonal else sampled_roots(mdp, ROOTS)
     truth_BA = exact.lookahead(mdp, evaluation.q_SA, depth)[root_B]
     model = TabularModel(mdp, device=device)
     return Task(mdp, model, root_B.to(device), evaluation.v_S.to(device), depth, truth_BA)

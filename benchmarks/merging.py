@@ -6,12 +6,12 @@ from itertools import cycle
 from typing import Any
 
 import torch
-from common import MDPS, drawn_roots, median_ratio, milliseconds, take_turns, uniform_evaluation, unmerged_nodes
+from common import MDPS, median_ratio, milliseconds, sampled_roots, take_turns, uniform_evaluation, unmerged_nodes
 
 from pgts_torch.models import TabularModel
 from pgts_torch.search import Lookahead, Topology, expectimax
 from pgts_torch.search.empirical import Empirical
-from pgts_torch.seeding import draw_keys, stream
+from pgts_torch.seeding import sample_keys, stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, random_mdp
 
 DEPTH = 8
@@ -34,7 +34,7 @@ def new_leaf_values(repeats: int, device: str) -> dict[str, Any]:
 
 
 def _second_search(mdp: TabularMDP, repeats: int, device: str) -> dict[str, Any]:
-    model, root_B = TabularModel(mdp, device=device), drawn_roots(mdp, 32).to(device)
+    model, root_B = TabularModel(mdp, device=device), sampled_roots(mdp, 32).to(device)
     values = torch.rand(64, mdp.num_states, dtype=torch.float64, generator=stream(0, "leaves")).to(device)
     leaves, topology = cycle(values), Topology(model)
 
@@ -120,7 +120,7 @@ def cost_against_depth(repeats: int, device: str) -> dict[str, list[dict[str, An
 def unmerged_searcher(mdp: TabularMDP, root: int, depth: int, device: str) -> Callable[[], Lookahead]:
     """The same search in a model whose states are paths: no two of them meet."""
     model, v_S = TabularModel(mdp, device=device), uniform_evaluation(mdp).v_S.to(device)
-    root_B, key = torch.tensor([root], device=device), draw_keys(1, generator=stream(0, "unmerged", device=device))
+    root_B, key = torch.tensor([root], device=device), sample_keys(1, generator=stream(0, "unmerged", device=device))
 
     def search() -> Lookahead:
         paths = Empirical(model, root_B, samples=[None] * (depth + 1), share="none", key=key)

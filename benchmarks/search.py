@@ -25,10 +25,10 @@ import torch
 from common import (
     Form,
     about,
-    drawn_roots,
     garnet,
     median_ratio,
     parser,
+    sampled_roots,
     take_turns,
     uniform_evaluation,
     use_one_core,
@@ -89,7 +89,7 @@ def mcts_throughput(repeats: int, device: str) -> dict[str, Any]:
     # A grid of 12 x 12, because roots that are alike would be searched once by ours and again and again by mctx.
     mdps = {"Grid, 12 x 12": grid(12, traps=(14, 38)), "Garnet(200,4,5)": garnet(), "DeepSea(20)": deep_sea(20)}
     for name, mdp in mdps.items():
-        root_B, v_S = drawn_roots(mdp, MCTS_ROOTS), uniform_evaluation(mdp).v_S
+        root_B, v_S = sampled_roots(mdp, MCTS_ROOTS), uniform_evaluation(mdp).v_S
         forms: dict[str, Form] = {}
         for merge in (False, True):
             for keep in (True, False):

@@ -15,11 +15,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 _INT32_LIMIT = 2**31
-_LARGE = 2**23
 
-
-LARGEST_REWARD = float(torch.finfo(torch.float64).max) ** (1 / 3)
-"""The largest size of a reward that is learned from: means of squares of returns stay numbers."""
+LARGE = 2**23
+"""A table of so many outcomes is multiplied by scipy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +67,8 @@ class Outcomes:
         """Sparse CSR matrix of p_k gamma_k, shape [N * A, num_children]; its indices are int32 where they fit,
         which makes its product with a vector two to four times faster than int64 does."""
         N, A, K = self.child_NAK.shape
+        # Row n A + a holds exactly the K outcomes of (n, a), padding and repeated children included: so the arrays are
+        # those of this table, and nothing is sorted or added up.
         index = torch.int32 if max(N * A * K, self.num_children) < _INT32_LIMIT else torch.int64
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
@@ -91,7 +91,7 @@ class Outcomes:
     def expected(self, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
         """sum_k p_k gamma_k v(s'_k)."""
         # Where memory is the limit scipy's product is up to a third faster than torch's; before that it is slower.
-        if self.device.type == "cpu" and self.child_NAK.numel() >= _LARGE:
+        if self.device.type == "cpu" and self.child_NAK.numel() >= LARGE:
             product = torch.from_numpy(self._scipy_weight @ v_C.numpy())
         else:
             product = torch.mv(self.weight, v_C)

@@ -1,5 +1,7 @@
 """The errors that a caller can cause. Each message names what is wrong, its value and what is required."""
 
+from numbers import Integral
+
 
 class PgtsError(ValueError):
     """An argument, a file or an environment of the caller cannot be used.
@@ -93,7 +95,8 @@ class Stopped(Exception):
         self.signal = signal
 
 
-def check_count(name: str, value: int, *, least: int = 1) -> None:
-    """PgtsError unless it is a whole number of at least `least`."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+def check_count(name: str, value: int, *, least: int = 1) -> int:
+    """The value; PgtsError unless it is a whole number of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise PgtsError(f"{name} is {value!r}; it must be a whole number of at least {least}")
+    return value

@@ -61,7 +61,7 @@ class SharedGenerators:
     """A context in which the global generators of `random`, `numpy.random` and torch are seeded from a stream. At its
     end, also after an error, their states are restored.
 
-    drawn: after the context: the modules whose generators were used in it.
+    used: after the context: the modules whose generators were used in it.
 
     Args:
         seed, names: the stream, as in `stream`. Without a seed the generators go on from where they are.
@@ -69,7 +69,7 @@ class SharedGenerators:
 
     def __init__(self, seed: int | None = None, *names: str | int) -> None:
         self._seed, self._names = seed, names
-        self.drawn: tuple[str, ...] = ()
+        self.used: tuple[str, ...] = ()
 
     def __enter__(self) -> Self:
         self._before = _shared_states()
@@ -84,7 +84,7 @@ class SharedGenerators:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         ended = _shared_states()
-        self.drawn = tuple(name for name, state in ended.items() if state != self._begun[name])
+        self.used = tuple(name for name, state in ended.items() if state != self._begun[name])
         if ended != self._before:
             random.setstate(self._before["random"])
             state: Any = pickle.loads(self._before["numpy.random"])
@@ -101,7 +101,7 @@ def _shared_states() -> dict[str, Any]:
     }
 
 
-def draw_keys(count: int, *, generator: torch.Generator) -> Int[Tensor, "N"]:
+def sample_keys(count: int, *, generator: torch.Generator) -> Int[Tensor, "N"]:
     """Keys, 64 bits each, from a stream."""
     return torch.randint(-(2**63), 2**63 - 1, (count,), generator=generator, device=generator.device)
 

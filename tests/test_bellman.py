@@ -44,7 +44,7 @@ def test_the_product_for_large_tables_is_the_same(name, monkeypatch):
     outcomes = zoo(name).outcomes
     v_S = torch.randn(outcomes.num_states, dtype=torch.float64, generator=stream(0, "v"))
     small = backup(outcomes, v_S)
-    monkeypatch.setattr("pgts_torch.bellman._LARGE", 1)
+    monkeypatch.setattr("pgts_torch.bellman.LARGE", 1)
     torch.testing.assert_close(backup(outcomes, v_S), small, rtol=1e-13, atol=1e-13)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy import stats
 
-from pgts_torch.seeding import draw_keys, mix, numpy_stream, seed_sequence, stream, uniform
+from pgts_torch.seeding import mix, numpy_stream, sample_keys, seed_sequence, stream, uniform
 
 KEYS = [
     (seed, *names)
@@ -82,7 +82,7 @@ def test_keys_are_mixed_as_the_published_generator_does_it():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_neighbouring_keys_draw_independent_uniform_numbers(dtype):
     """Each of six p-values is below 1e-4 with probability 1e-4: false alarms in 6 of 10,000 seeds."""
-    key = draw_keys(1, generator=stream(0, "keys"))
+    key = sample_keys(1, generator=stream(0, "keys"))
     u_N = uniform(mix(key, torch.arange(20_000)), dtype).double().numpy()
     v_N = uniform(mix(key, torch.arange(20_000), 1), dtype).double().numpy()
     assert u_N.min() >= 0
@@ -94,7 +94,7 @@ def test_neighbouring_keys_draw_independent_uniform_numbers(dtype):
 
 
 def test_the_order_of_names_counts_and_shapes_broadcast():
-    key_N, a, b = draw_keys(5, generator=stream(0, "keys")), 3, 4
+    key_N, a, b = sample_keys(5, generator=stream(0, "keys")), 3, 4
     assert not torch.equal(mix(key_N, a, b), mix(key_N, b, a))
     grid_NA = mix(key_N.unsqueeze(-1), torch.arange(3))
     assert grid_NA.shape == (5, 3)

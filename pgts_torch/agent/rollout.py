@@ -19,7 +19,7 @@ from pgts_torch.models.base import SamplingModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, Horizon
 from pgts_torch.options.updates import StateWeight
-from pgts_torch.seeding import SharedGenerators, draw_keys, seed_sequence
+from pgts_torch.seeding import SharedGenerators, sample_keys, seed_sequence
 
 
 def survival(horizon: Horizon, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
@@ -174,10 +174,10 @@ def rollout(
         return _episodes(world, policy, horizon, seed=seed, names=names, generator=generator)
     with SharedGenerators(seed, *names) as shared:
         made = _episodes(world, policy, horizon, seed=seed, names=names, generator=generator)
-    if shared.drawn and not world.warned:
+    if shared.used and not world.warned:
         world.warned = True
         warnings.warn(
-            f"{env_name(world.env)} uses the generator of {shared.drawn[0]}, which the whole process shares: it is "
+            f"{env_name(world.env)} uses the generator of {shared.used[0]}, which the whole process shares: it is "
             "seeded for each iteration and restored afterwards; better use self.np_random",
             stacklevel=3,
         )
@@ -266,7 +266,7 @@ def simulated_returns(
     action_N = policy.sample(state_B, generator=generator) if first_action_B is None else first_action_B
     num_steps = 0
     for _ in range(horizon.limit):
-        sampled = model.sample(state_N, action_N, key_N=draw_keys(len(state_N), generator=generator))
+        sampled = model.sample(state_N, action_N, key_N=sample_keys(len(state_N), generator=generator))
         if bool((off_N := ~((sampled.discount_N >= 0) & (sampled.discount_N <= 1))).any()):
             n = int(torch.nonzero(off_N)[0, 0])
             raise PgtsError(

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from pgts_torch.envs.drawing import Drawing
 from pgts_torch.envs.sampler import OutcomeSampler
 from pgts_torch.envs.tabular import RENDER_FPS, check_options, check_render_mode
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.tabular.mdp import TabularMDP
 
 MAX_FRAMES = 64
@@ -59,10 +59,9 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
     ) -> None:
-        if num_envs < 1:
-            raise PgtsError(f"num_envs is {num_envs}; it must be at least 1")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise PgtsError(f"max_episode_steps is {max_episode_steps}; it must be at least 1, or None for no limit")
+        check_count("num_envs", num_envs)
+        if max_episode_steps is not None:
+            check_count("max_episode_steps", max_episode_steps)
         check_render_mode(render_mode, ["rgb_array"])
         if render_mode is not None and num_envs > MAX_FRAMES:
             raise PgtsError(f"num_envs is {num_envs}; at most {MAX_FRAMES} environments can be rendered")

@@ -23,7 +23,7 @@ from pgts_torch.models.snapshots import env_name, generator_state
 from pgts_torch.models.trial import claims
 from pgts_torch.models.walks import Setup, Walk, again, live, replays, walks_of
 from pgts_torch.models.wrappers import transforms_of
-from pgts_torch.seeding import SharedGenerators, draw_keys, numpy_stream, stream
+from pgts_torch.seeding import SharedGenerators, numpy_stream, sample_keys, stream
 
 _CONTINUOUS_ACTIONS = 8
 """How many actions of a continuous space are tried."""
@@ -303,8 +303,8 @@ def _chance(setup: Setup, walks: Sequence[Walk]) -> str:
             )
         with SharedGenerators() as shared:
             differ += again(setup, env, replace(walk, key=setup.number())).seen != walk.seen
-        if shared.drawn:
-            raise _Missing(f"step draws from the global generator of {shared.drawn[0]}: draw from self.np_random only")
+        if shared.used:
+            raise _Missing(f"step draws from the global generator of {shared.used[0]}: draw from self.np_random only")
     return f"of the key alone; {differ} of {len(walks)} continuations differ under another key"
 
 
@@ -350,7 +350,7 @@ def _untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
     for level in range(_LEVELS):
         state_N = frontier_N[:width].repeat_interleave(len(setup.actions))
         action_N = torch.arange(len(setup.actions)).repeat(len(frontier_N[:width]))
-        key_N = draw_keys(len(state_N), generator=stream(seed, "untouched", level))
+        key_N = sample_keys(len(state_N), generator=stream(seed, "untouched", level))
         sampled = model.sample(state_N, action_N, key_N=key_N)
         frontier_N = sampled.next_state_N[sampled.discount_N > 0].unique()
         after.add((_stable_key(setup, real), repr(generator_state(real))))

@@ -251,10 +251,10 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         for pair in zip(state_N.tolist(), action_N.tolist(), strict=True):
             with SharedGenerators() as shared:
                 step = self._step(*pair, _KEY_OF_CERTAINTY, repeat=self.action_repeat)
-            if shared.drawn:
+            if shared.used:
                 # A step that used a global generator looked certain, and may have been remembered.
                 self._sure.clear()
-            random.append(step.random or bool(shared.drawn))
+            random.append(step.random or bool(shared.used))
         return torch.tensor(random, dtype=torch.bool, device=self.device)
 
     @contextmanager
@@ -265,10 +265,10 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             return
         with SharedGenerators() as shared:
             yield
-        if shared.drawn:
+        if shared.used:
             self._sure.clear()
             raise MissingModel(
-                f"{self.name} cannot be a model: step draws from the global generator of {shared.drawn[0]}: draw from "
+                f"{self.name} cannot be a model: step draws from the global generator of {shared.used[0]}: draw from "
                 "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
             )
 

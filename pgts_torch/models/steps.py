@@ -9,8 +9,10 @@ import numpy as np
 from gymnasium import spaces
 from torch import Tensor, float64
 
-from pgts_torch.bellman import LARGEST_REWARD
 from pgts_torch.errors import NotFinite, PgtsError
+
+LARGEST_REWARD = float(np.finfo(np.float64).max) ** (1 / 3)
+"""The largest size of a reward that is learned from: means of squares of returns stay numbers."""
 
 
 def number_of(what: str, value: Any) -> float:

@@ -19,7 +19,7 @@ from pgts_torch.search.mcts import grow
 from pgts_torch.search.pruned import pruned
 from pgts_torch.search.sampled import plan_levels, sparse
 from pgts_torch.search.topology import Topology
-from pgts_torch.seeding import draw_keys
+from pgts_torch.seeding import sample_keys
 
 DEFAULT_SAMPLES = Sampled().samples
 REPLICATES = 8
@@ -201,7 +201,7 @@ class MCTSSearch(Search):
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
         topology, calls_each = self.topology, 1
         if topology is None:
-            key = draw_keys(1, generator=generator).to(self.model.device)
+            key = sample_keys(1, generator=generator).to(self.model.device)
             samples = FixedSamples(sampling(self.model, "mcts"), samples=self._samples, key=key)
             topology = Topology(samples, max_bytes=self.options.max_bytes)
             calls_each = self._samples

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.models.base import Model
-from pgts_torch.tabular.exact import check_depth
 
 Leaf = Callable[[Tensor], Tensor]
 """A critic or a policy as a search calls it: states [N] to values of Q^pi [N, A] or of v^pi [N], or to pi [N, A]."""
@@ -128,7 +127,7 @@ class Leaves:
         if (q_leaf is None) == (v_leaf is None):
             raise PgtsError("give exactly one of q_leaf and v_leaf")
         self.calls = 0
-        self.expansions = check_depth(depth) + (v_leaf is not None)
+        self.expansions = check_count("depth", depth, least=0) + (v_leaf is not None)
         self._model, self._q_leaf, self._v_leaf, self._prior = model, q_leaf, v_leaf, prior
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:

@@ -16,7 +16,7 @@ from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_states, c
 from pgts_torch.search.split import Rule, Selection, sigma
 from pgts_torch.search.topology import Topology, topology_of
 from pgts_torch.search.tree import Backup, Tree
-from pgts_torch.seeding import draw_keys, mix, uniform
+from pgts_torch.seeding import mix, sample_keys, uniform
 
 Root = Literal["gumbel", "rule"]
 
@@ -243,7 +243,7 @@ def _preference(known: KnownStates, state_B: Tensor, generator: torch.Generator 
     log_prior_BA = known.prior_TA[known.rows(state_B)].log()
     if generator is None:
         return log_prior_BA
-    key = draw_keys(1, generator=generator).to(known.device)
+    key = sample_keys(1, generator=generator).to(known.device)
     action_A = torch.arange(known.num_actions, device=known.device)
     u_BA = uniform(mix(key, state_B.unsqueeze(1), action_A)).clamp_min(torch.finfo(torch.float64).tiny)
     return log_prior_BA - (-u_BA.log()).log().to(known.dtype)

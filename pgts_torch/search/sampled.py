@@ -23,7 +23,7 @@ from pgts_torch.search.lookahead import (
 )
 from pgts_torch.search.memory import RESAMPLED
 from pgts_torch.search.topology import Topology
-from pgts_torch.seeding import draw_keys, mix, uniform
+from pgts_torch.seeding import mix, sample_keys, uniform
 
 _RESAMPLE = 0x626F6F74
 """Mixed into the keys of the bootstrap, so that they differ from those of the samples."""
@@ -117,7 +117,7 @@ def sparse(
     plan = plan_levels(samples, leaves.expansions, share, model)
     if replicates < 0 or replicates == 1:
         raise PgtsError(f"replicates is {replicates}; it must be 0 or at least 2")
-    key = draw_keys(1, generator=generator).to(model.device)
+    key = sample_keys(1, generator=generator).to(model.device)
     if not plan:
         return unexpanded(leaves, root_B)
     # Without a sampled level there is nothing empirical: the search is exact.

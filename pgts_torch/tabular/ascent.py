@@ -9,53 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgts_torch.bellman import policy_mean
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
-
-
-@dataclass(frozen=True, eq=False)
-class Ascent:
-    """What Algorithm 1 did in K iterations: the return of pi_0 .. pi_K, and pi_K."""
-
-    J_K: Float[Tensor, "K"]
-    pi_SA: Float[Tensor, "S A"]
-
-
-def ascend(
-    mdp: TabularMDP,
-    pi_SA: Float[Tensor, "S A"],
-    *,
-    depth: int,
-    step_size: float,
-    iterations: int,
-    step: Callable[[Tensor, Tensor, Tensor, float], Tensor] | None = None,
-) -> Ascent:
-    """Algorithm 1 with exact quantities: only states with d^pi(s) > 0 move.        [PGTS Alg. 1]
-
-    Args:
-        mdp: the MDP.
-        pi_SA: the initial policy pi_0.
-        depth: m, how often T is applied to Q^pi. 0 is plain policy gradient [PGTS Eq. (2)].
-        step_size: eta, finite and at least 0; the same in every iteration.
-        iterations: how many updates.
-        step: `projected_step` (the paper's, default), `softmax_step` or `mirror_step`.
-    """
-    step = step or projected_step
-    if not 0 <= step_size < math.inf:
-        raise PgtsError(f"step_size is {step_size}; it must be finite and at least 0")
-    exact.check_depth(depth)
-    pi_SA = exact.check_policy(mdp, pi_SA)
-    returns = []
-    for _ in range(iterations):
-        evaluation = exact.evaluate(mdp, pi_SA)
-        returns.append(evaluation.J)
-        look_SA = exact.lookahead(mdp, evaluation.q_SA, depth)
-        visited = evaluation.d_S > 0
-        pi_SA = pi_SA.clone()
-        pi_SA[visited] = step(pi_SA[visited], look_SA[visited], evaluation.d_S[visited], step_size)
-    returns.append(exact.evaluate(mdp, pi_SA).J)
-    return Ascent(torch.tensor(returns, dtype=torch.float64), pi_SA)
 
 
 def centred(q_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"], *, rounding: float = 0.0) -> Float[Tensor, "N A"]:
@@ -165,3 +121,46 @@ def softmax_step(
 ) -> Float[Tensor, "N A"]:
     """One gradient step of size eta on the logits log pi. It leaves zeros at zero."""
     return (pi_NA.log() + step_size * softmax_direction(pi_NA, q_NA, weight_N)).softmax(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Ascent:
+    """What Algorithm 1 did in K iterations: the return of pi_0 .. pi_K, and pi_K."""
+
+    J_K: Float[Tensor, "K"]
+    pi_SA: Float[Tensor, "S A"]
+
+
+def ascend(
+    mdp: TabularMDP,
+    pi_SA: Float[Tensor, "S A"],
+    *,
+    depth: int,
+    step_size: float,
+    iterations: int,
+    step: Callable[[Tensor, Tensor, Tensor, float], Tensor] = projected_step,
+) -> Ascent:
+    """Algorithm 1 with exact quantities: only states with d^pi(s) > 0 move.        [PGTS Alg. 1]
+
+    Args:
+        mdp: the MDP.
+        pi_SA: the initial policy pi_0.
+        depth: m, how often T is applied to Q^pi. 0 is plain policy gradient [PGTS Eq. (2)].
+        step_size: eta, finite and at least 0; the same in every iteration.
+        iterations: how many updates.
+        step: `projected_step` (the paper's, default), `softmax_step` or `mirror_step`.
+    """
+    if not 0 <= step_size < math.inf:
+        raise PgtsError(f"step_size is {step_size}; it must be finite and at least 0")
+    check_count("depth", depth, least=0)
+    pi_SA = exact.check_policy(mdp, pi_SA)
+    returns = []
+    for _ in range(iterations):
+        evaluation = exact.evaluate(mdp, pi_SA)
+        returns.append(evaluation.J)
+        look_SA = exact.lookahead(mdp, evaluation.q_SA, depth)
+        visited = evaluation.d_S > 0
+        pi_SA = pi_SA.clone()
+        pi_SA[visited] = step(pi_SA[visited], look_SA[visited], evaluation.d_S[visited], step_size)
+    returns.append(exact.evaluate(mdp, pi_SA).J)
+    return Ascent(torch.tensor(returns, dtype=torch.float64), pi_SA)

@@ -6,11 +6,11 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes, backup
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.tabular.mdp import TabularMDP
 
 DENSE_LIMIT = 1500
@@ -80,8 +80,8 @@ def occupancy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S"
     return torch.where(support(mdp, pi_SA), d_S.clamp(min=least), 0.0)
 
 
-def support(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Tensor:
-    """sigma_pi = {s : d^pi(s) > 0} as a mask, by reachability instead of rounding.        [PGTS Sec. 4]"""
+def support(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Bool[Tensor, "S"]:
+    """sigma_pi = {s : d^pi(s) > 0} as a mask, by reachability, which does not round.        [PGTS Sec. 4]"""
     matrix = _policy_matrix(mdp, check_policy(mdp, pi_SA))
     reached = mdp.start_S.numpy() > 0
     frontier = reached
@@ -101,7 +101,7 @@ def lookahead(mdp: TabularMDP, q_SA: Float[Tensor, "S A"], depth: int) -> Float[
 
     With Q = Q^pi it equals h-PMD's Q_h for h = m + 1 (Protopapas and Barakat, NeurIPS 2024).
     """
-    for _ in range(check_depth(depth)):
+    for _ in range(check_count("depth", depth, least=0)):
         q_SA = bellman(mdp, q_SA)
     return q_SA
 
@@ -141,17 +141,11 @@ def check_policy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, 
     return pi_SA / pi_SA.sum(-1, keepdim=True)
 
 
-def check_depth(depth: int) -> int:
-    """The depth; PgtsError unless it is a finite whole number of at least 0."""
-    if isinstance(depth, bool) or not isinstance(depth, int) or depth < 0:
-        raise PgtsError(f"depth is {depth!r}; it must be a finite whole number of at least 0")
-    return depth
-
-
 def _policy_matrix(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> scipy.sparse.csr_array:
     """gamma P^pi as a sparse [S, S] matrix, without the entries of actions that pi never takes."""
     S, A, K = mdp.outcomes.child_NAK.shape
     weight = mdp.outcomes.weight
+    # The A rows of a state, which stand side by side in `weight`, become one; what is 0 is left out.
     values = (pi_SA[:, :, None] * weight.values().view(S, A, K)).view(S, A * K).numpy()
     children, kept = weight.col_indices().numpy(), values != 0
     rows = np.zeros(S + 1, dtype=children.dtype)
@@ -167,8 +161,8 @@ def _solve(mdp: TabularMDP, pi_SA: Tensor, b_S: Float[Tensor, "S"], *, transpose
     return torch.from_numpy(solve(matrix.T if transpose else matrix, b_S.numpy()))
 
 
-def _ends(outcomes: Outcomes) -> Tensor:
-    """Where an outcome of (s, a) discounts or terminates, as a mask of shape [S, A]."""
+def ends(outcomes: Outcomes) -> Bool[Tensor, "S A"]:
+    """Where an outcome of (s, a) discounts or terminates."""
     if float(outcomes.discount_NAK.amax()) < UNDISCOUNTED:
         return torch.ones_like(outcomes.reward_NA, dtype=torch.bool)
     return ((outcomes.discount_NAK < UNDISCOUNTED) & (outcomes.prob_NAK > 0)).any(-1)
@@ -176,7 +170,7 @@ def _ends(outcomes: Outcomes) -> Tensor:
 
 def _ending_actions(outcomes: Outcomes, action_S: Tensor) -> Tensor:
     """The given actions, but in states from which these might never end, one that leads toward an end."""
-    ends_SA, found_S = _ends(outcomes), torch.zeros(outcomes.num_states, dtype=torch.bool)
+    ends_SA, found_S = ends(outcomes), torch.zeros(outcomes.num_states, dtype=torch.bool)
     while True:
         leads_SA = ends_SA | (torch.mv(outcomes.weight, found_S.double()).view(ends_SA.shape) > 0)
         new_S = leads_SA.any(-1) & ~found_S
@@ -189,15 +183,15 @@ def _ending_actions(outcomes: Outcomes, action_S: Tensor) -> Tensor:
 
 def _check_ends(outcomes: Outcomes, pi_SA: Tensor, matrix: scipy.sparse.csr_array) -> None:
     """PgtsError unless every state can reach one where the policy discounts or terminates: else I - M is singular."""
-    ends = (_ends(outcomes) & (pi_SA > 0)).any(-1).numpy()
-    while not ends.all():
-        grown = ends | ((matrix @ ends.astype(np.float64)) > 0)
-        if (grown == ends).all():
+    found = (ends(outcomes) & (pi_SA > 0)).any(-1).numpy()
+    while not found.all():
+        grown = found | ((matrix @ found.astype(np.float64)) > 0)
+        if (grown == found).all():
             raise PgtsError(
-                f"the policy has no finite value in state {int(np.argmin(ends))}: from there on it neither "
+                f"the policy has no finite value in state {int(np.argmin(found))}: from there on it neither "
                 f"discounts (gamma is 1) nor terminates"
             )
-        ends = grown
+        found = grown
 
 
 def _solve_dense(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array, b: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
@@ -22,6 +23,9 @@ from pgts_torch.errors import PgtsError
 
 Order = Literal["SAS", "ASS"]
 """Whether P[s, a] or P[a, s] is the distribution over next states."""
+
+Start = int | ArrayLike | None
+"""A state, a distribution over states, or None for the uniform one."""
 
 EXACT, STORED = 1e-9, 1e-5
 """How far from 1 the probabilities of a row may sum: up to EXACT they are taken as they are, up to STORED they were
@@ -43,6 +47,17 @@ def normalised(prob: Float[np.ndarray, "... K"]) -> Float[np.ndarray, "... K"]:
     off = np.abs(total - 1)
     rounded = (off > EXACT) & (off <= STORED)
     return prob / np.where(rounded, total, 1.0) if rounded.any() else prob
+
+
+def start_distribution(start: Start, num_states: int) -> Float[Tensor, "S"]:
+    """mu as a vector."""
+    if start is None:
+        return torch.full((num_states,), 1 / num_states, dtype=torch.float64)
+    if isinstance(start, int | np.integer):
+        if not 0 <= start < num_states:
+            raise PgtsError(f"start state {start} does not exist; states are 0 to {num_states - 1}")
+        return torch.nn.functional.one_hot(torch.tensor(int(start)), num_states).double()
+    return torch.from_numpy(normalised(np.array(start, dtype=np.float64, ndmin=1)))
 
 
 def outcomes_from(P: Any, R: Any, gamma: float, order: Order | None) -> tuple[Outcomes, Float[Tensor, "S A K"] | None]:
@@ -126,7 +141,7 @@ def _from_dense(P: Float[np.ndarray, "S A S"]) -> _Table:
         s, a, t = np.argwhere(off)[0]
         raise PgtsError(f"P_SAS[{s}, {a}, {t}] is {P[s, a, t]}; probabilities are finite and at least 0")
     K = max(1, int((P > 0).sum(-1).max()))
-    child = np.argsort(P == 0, axis=-1, kind="stable")[..., :K]
+    child = np.argsort(P == 0, axis=-1, kind="stable")[..., :K]  # the successors first, in their order
     return _Table(np.take_along_axis(P, child, axis=-1), child)
 
 
@@ -151,8 +166,9 @@ def _from_sparse(matrices: Sequence[Any]) -> _Table:
     prob = np.zeros((S, A, K))
     child = np.broadcast_to(np.arange(S)[:, None, None], prob.shape).copy()
     for a, matrix in enumerate(rows):
-        state = np.repeat(np.arange(S), count_AS[a])  # of each stored entry, and its place k in its row
-        k = np.arange(matrix.nnz) - np.repeat(matrix.indptr[:-1], count_AS[a])
+        # The state of each stored entry, and its place k among the entries of this state.
+        state = np.repeat(np.arange(S), count_AS[a])
+        k = np.arange(matrix.nnz) - matrix.indptr[state]
         prob[state, a, k], child[state, a, k] = matrix.data, matrix.indices
     return _Table(prob, child)
 
@@ -172,8 +188,9 @@ def _rewards(R: Any, table: _Table, order: Order) -> tuple[Float[np.ndarray, "S 
     if _is_sparse_list(R):
         if order != "ASS" or len(R) != A:
             raise PgtsError(f"R is a list of {len(R)} matrices; that needs P in the order 'ASS' with {len(R)} actions")
-        matrices = [_csr(f"R[{a}]", matrix, S) for a, matrix in enumerate(R)]
-        return _expected(np.stack([_entries(R, table.child_SAK[:, a]) for a, R in enumerate(matrices)], 1), table)
+        states = np.arange(S)[:, None]
+        rows = [_csr(f"R[{a}]", matrix, S)[states, table.child_SAK[:, a]] for a, matrix in enumerate(R)]
+        return _expected(np.stack([row.toarray() for row in rows], axis=1), table)
     R = np.asarray(R, dtype=np.float64)
     if R.shape == (S, A):
         return R.copy(), None
@@ -186,17 +203,6 @@ def _rewards(R: Any, table: _Table, order: Order) -> tuple[Float[np.ndarray, "S 
         f"R_SA has shape {R.shape}; P_SAS needs {(S, A)}, or {(S,)} where the action does not matter, or one reward "
         "for each entry of P"
     )
-
-
-def _entries(matrix: Any, child_SK: Int[np.ndarray, "S K"]) -> Float[np.ndarray, "S K"]:
-    """matrix[s, child_SK[s, k]]; 0 where nothing is stored."""
-    S = matrix.shape[0]
-    stored = np.repeat(np.arange(S, dtype=np.int64), np.diff(matrix.indptr)) * S + matrix.indices  # ascending
-    wanted = np.arange(S)[:, None] * S + child_SK
-    place = np.searchsorted(stored, wanted).clip(max=max(len(stored) - 1, 0))
-    if not len(stored):
-        return np.zeros(child_SK.shape)
-    return np.where(stored[place] == wanted, matrix.data[place], 0.0)
 
 
 def _expected(

@@ -1,13 +1,10 @@
 """Finite Markov decision processes, validated when they are made."""
 
-import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import gymnasium
-import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -16,16 +13,12 @@ from torch import Tensor
 from pgts_torch import files
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.tabular import npz
-from pgts_torch.tabular.forms import EXACT, STORED, Order, normalised, outcomes_from
+from pgts_torch.tabular import npz, transitions
+from pgts_torch.tabular.forms import EXACT, Order, Start, outcomes_from, start_distribution
+from pgts_torch.tabular.transitions import LARGEST_VALUE, Transitions
 
 MEAN_TOLERANCE = 1e-8
 """How far the mean of the rewards of outcomes may be from r(s, a), as a share of the largest of them."""
-
-_LARGEST_VALUE = torch.finfo(torch.float64).max / 8
-
-Transition = tuple[float, int, float, bool]
-"""(probability, next state, reward, terminated), as in the P tables of Gymnasium's toy-text environments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +77,7 @@ class TabularMDP:
         return self.outcomes.reward_NA.unsqueeze(-1).expand(self.outcomes.prob_NAK.shape)
 
     @classmethod
-    def from_dense(
-        cls, P: Any, R: Any, gamma: float, *, start: int | ArrayLike | None = None, order: Order | None = None
-    ) -> Self:
+    def from_dense(cls, P: Any, R: Any, gamma: float, *, start: Start = None, order: Order | None = None) -> Self:
         """An MDP from transitions and rewards as textbooks, pymdptoolbox and QuantEcon have them.
 
         Rows that sum to 1 within 1e-5, as those of float32 or of six digits, are divided by their sums.
@@ -109,10 +100,10 @@ class TabularMDP:
     @classmethod
     def from_transitions(
         cls,
-        P: Mapping[int, Mapping[int, Sequence[Transition]]] | Sequence[Sequence[Sequence[Transition]]],
+        P: Transitions,
         gamma: float,
         *,
-        start: int | ArrayLike | None = None,
+        start: Start = None,
         action_names: tuple[str, ...] = (),
         shape: tuple[int, int] = (0, 0),
     ) -> Self:
@@ -129,31 +120,11 @@ class TabularMDP:
             start: a state, a distribution over states, or None for the uniform one.
         """
         check_gamma(gamma)
-        S = len(P)
-        A = len(P[0]) if S else 0
-        if S == 0 or A == 0:
-            raise PgtsError("P is empty; it must hold at least one state and one action")
-        rows = [[_merge_successors(P, s, a, S, A) for a in range(A)] for s in range(S)]
-        start_S = start_distribution(start, S)
-        for s in _terminal_states(rows, start_S):
-            rows[s] = [(0.0, {(s, True, 0.0): 1.0}) for _ in range(A)]
-        K = max(len(successors) for row in rows for _, successors in row)
-        reward, outcome_reward = np.zeros((S, A)), np.zeros((S, A, K))
-        prob, discount = np.zeros((S, A, K)), np.zeros((S, A, K))
-        child = np.zeros((S, A, K), dtype=np.int64)
-        for s, row in enumerate(rows):
-            for a, (expected_reward, successors) in enumerate(row):
-                reward[s, a] = outcome_reward[s, a] = expected_reward
-                child[s, a] = s
-                for k, ((next_state, terminated, paid), p) in enumerate(successors.items()):
-                    prob[s, a, k], child[s, a, k], outcome_reward[s, a, k] = p, next_state, paid
-                    discount[s, a, k] = 0.0 if terminated else gamma
-        reward_SA, prob_SAK, discount_SAK, child_SAK = map(torch.from_numpy, (reward, prob, discount, child))
-        reward_SAK = torch.from_numpy(outcome_reward) if (outcome_reward != reward[..., None]).any() else None
-        return cls(Outcomes(reward_SA, prob_SAK, discount_SAK, child_SAK, S), start_S, action_names, shape, reward_SAK)
+        outcomes, start_S, reward_SAK = transitions.outcomes_of(P, gamma, start)
+        return cls(outcomes, start_S, action_names, shape, reward_SAK)
 
     @classmethod
-    def from_gymnasium(cls, env: gymnasium.Env, gamma: float, *, start: int | ArrayLike | None = None) -> Self:
+    def from_gymnasium(cls, env: gymnasium.Env, gamma: float, *, start: Start = None) -> Self:
         """The MDP of a Gymnasium environment that publishes its transitions as `env.unwrapped.P`.
 
         Args:
@@ -190,9 +161,8 @@ class TabularMDP:
         outcomes = self.outcomes
         happens_SAK = outcomes.prob_NAK > 0
         gamma = float(outcomes.discount_NAK[happens_SAK][0])
-        other = happens_SAK & (outcomes.discount_NAK != gamma)
         _refuse(
-            other.any(-1),
+            (happens_SAK & (outcomes.discount_NAK != gamma)).any(-1),
             lambda s, a: (
                 f"outcomes of ({s}, {a}) have discounts {outcomes.discount_NAK[s, a].tolist()}, others {gamma}; an npz "
                 f"file holds one gamma: let an end lead to a state that earns 0 for ever"
@@ -200,22 +170,17 @@ class TabularMDP:
         )
         P_SAS = torch.zeros(self.num_states, self.num_actions, self.num_states, dtype=torch.float64)
         P_SAS.scatter_add_(-1, outcomes.child_NAK, outcomes.prob_NAK)
-        arrays: dict[str, ArrayLike] = {
-            "P": P_SAS.numpy(),
-            "R": outcomes.reward_NA.numpy(),
-            "gamma": gamma,
-            "start": self.start_S.numpy(),
-        }
-        npz.write_arrays(files.target(path, lambda _: self._is_npz(path), "an MDP that load_npz reads", most=1), arrays)
 
-    @classmethod
-    def _is_npz(cls, path: str | Path) -> bool:
-        """Whether a file holds an MDP."""
-        try:
-            cls.load_npz(path)
-        except PgtsError:
-            return False
-        return True
+        def is_mdp(_: bytes) -> bool:
+            try:
+                self.load_npz(path)
+            except PgtsError:
+                return False
+            return True
+
+        target = files.target(path, is_mdp, "an MDP that load_npz reads", most=1)
+        arrays: dict[str, ArrayLike] = {"P": P_SAS, "R": outcomes.reward_NA, "gamma": gamma, "start": self.start_S}
+        npz.write_arrays(target, arrays)
 
     @classmethod
     def load_npz(cls, path: str | Path) -> Self:
@@ -240,69 +205,10 @@ class TabularMDP:
             raise PgtsError(f"{path}: {npz.in_words_of_the_file(str(error))}") from error
 
 
-def start_distribution(start: int | ArrayLike | None, num_states: int) -> Float[Tensor, "S"]:
-    """mu as a vector: one state, a given distribution, or None for the uniform one."""
-    if start is None:
-        return torch.full((num_states,), 1 / num_states, dtype=torch.float64)
-    if isinstance(start, int | np.integer):
-        if not 0 <= start < num_states:
-            raise PgtsError(f"start state {start} does not exist; states are 0 to {num_states - 1}")
-        return torch.nn.functional.one_hot(torch.tensor(int(start)), num_states).double()
-    return torch.from_numpy(normalised(np.array(start, dtype=np.float64, ndmin=1)))
-
-
 def check_gamma(gamma: float) -> None:
     """Raise PgtsError unless gamma is in [0, 1]."""
     if not 0 <= gamma <= 1:
         raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
-
-
-_Row = tuple[float, dict[tuple[int, bool, float], float]]
-"""Expected reward of (s, a), and the probability of each (next state, terminated, reward) that it may lead to."""
-
-
-def _merge_successors(P: Any, s: int, a: int, S: int, A: int) -> _Row:
-    if len(P[s]) != A:
-        raise PgtsError(f"P[{s}] has {len(P[s])} actions; P[0] has {A}")
-    successors = dict[tuple[int, bool, float], float]()
-    # Counted from the first reward, so that equal rewards have exactly this mean.
-    first_reward = float(P[s][a][0][2]) if len(P[s][a]) else 0.0
-    expected_reward = first_reward
-    for p, next_state, reward, terminated in P[s][a]:
-        if not 0 <= next_state < S:
-            raise PgtsError(f"P[{s}][{a}] leads to state {next_state}; states are 0 to {S - 1}")
-        if p < 0 or not np.isfinite(p):
-            raise PgtsError(f"P[{s}][{a}] has probability {p}; probabilities are finite and at least 0")
-        reward = float(reward)  # a float32 would turn the largest value into infinity
-        if not abs(reward) <= _LARGEST_VALUE:
-            raise PgtsError(f"P[{s}][{a}] has reward {reward}; rewards must be finite, at most {_LARGEST_VALUE:.2g}")
-        if p > 0:
-            key = (int(next_state), bool(terminated), reward)
-            successors[key] = successors.get(key, 0.0) + float(p)
-            expected_reward += float(p) * (reward - first_reward)
-    if not successors:
-        raise PgtsError(f"P[{s}][{a}] has no outcome with positive probability")
-    total = sum(successors.values())
-    if EXACT < abs(total - 1) <= STORED:  # as `normalised` does
-        expected_reward = first_reward + (expected_reward - first_reward) / total
-        successors = {key: p / total for key, p in successors.items()}
-    return expected_reward, successors
-
-
-def _terminal_states(rows: list[list[_Row]], start_S: Tensor) -> set[int]:
-    """States entered by terminated transitions only, as far as the start distribution reaches them."""
-    frontier = torch.nonzero(start_S).flatten().tolist()
-    alive, ended = set(frontier), set[int]()
-    while frontier:
-        s = frontier.pop()
-        for _, successors in rows[s]:
-            for next_state, terminated, _ in successors:
-                if terminated:
-                    ended.add(next_state)
-                elif next_state not in alive:
-                    alive.add(next_state)
-                    frontier.append(next_state)
-    return ended - alive
 
 
 def _check_start(start_S: Tensor, num_states: int) -> None:
@@ -366,7 +272,8 @@ def _check_outcomes(outcomes: Outcomes) -> None:
         ~((discount >= 0) & (discount <= 1)).all(-1),
         lambda s, a: f"discount of ({s}, {a}) is {discount[s, a].tolist()}; each must be in [0, 1]",
     )
-    most = _largest_reward(float(discount.max()))
+    # So that no value, 1 / (1 - discount) times a reward, and no difference of values is infinite.
+    most = LARGEST_VALUE * max(1 - float(discount.max()), 1e-100)
     _refuse(
         reward.abs() > most,
         lambda s, a: (
@@ -379,12 +286,6 @@ def _check_outcomes(outcomes: Outcomes) -> None:
         ((child < 0) | (child >= outcomes.num_children)).any(-1),
         lambda s, a: f"children of ({s}, {a}) are {child[s, a].tolist()}; states are 0 to {outcomes.num_children - 1}",
     )
-
-
-def _largest_reward(discount: float) -> float:
-    """The largest size of rewards with which no value, and no difference of values, overflows."""
-    steps = 1 / (1 - discount) if discount < 1 else math.inf
-    return _LARGEST_VALUE / min(steps, 1e100)
 
 
 def _refuse(bad_SA: Tensor, message: Any) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes, backup, sweep
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.exact import UNDISCOUNTED
 from pgts_torch.tabular.mdp import TabularMDP
@@ -57,7 +57,7 @@ def closed_form_bound(mdp: TabularMDP, depth: int) -> float:
     gamma is the largest discount. Where some outcome has a smaller one, an end for instance, 0 counts as a reward:
     after an end nothing is earned. Infinite where gamma is 1.
     """
-    return _reward_bound(mdp, exact.check_depth(depth), torch.ones(mdp.num_states, dtype=torch.bool))
+    return _reward_bound(mdp, check_count("depth", depth, least=0), torch.ones(mdp.num_states, dtype=torch.bool))
 
 
 def depth_for(mdp: TabularMDP, eps: float) -> int:
@@ -88,7 +88,7 @@ def reachable_bound(mdp: TabularMDP, depth: int) -> float:
 
     0 where every path has ended by then, also with gamma 1.
     """
-    first_S = _reached(mdp, exact.check_depth(depth) + 1)
+    first_S = _reached(mdp, check_count("depth", depth, least=0) + 1)
     return _reward_bound(mdp, depth, _reached_within(mdp, first_S, mdp.num_states))
 
 
@@ -102,7 +102,7 @@ def worst_case_bound(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -
     """
     lack_S = (exact.optimal(mdp).v_S - exact.policy_values(mdp, pi_SA)).clamp(min=0)
     free = replace(mdp.outcomes, reward_NA=torch.zeros_like(mdp.outcomes.reward_NA))
-    return float(mdp.start_S @ sweep(free, lack_S, exact.check_depth(depth) + 1))
+    return float(mdp.start_S @ sweep(free, lack_S, check_count("depth", depth, least=0) + 1))
 
 
 def worst_policy(mdp: TabularMDP) -> Float[Tensor, "S A"]:
@@ -141,7 +141,7 @@ def certificate(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -> flo
     It never grows with m, and it is J* - J^pi itself once the expanded states lead nowhere else. Nothing smaller
     follows from the expanded states and r_max. Infinite where w is (gamma is 1).
     """
-    expanded_S = _reached_within(mdp, mdp.start_S > 0, exact.check_depth(depth))
+    expanded_S = _reached_within(mdp, mdp.start_S > 0, check_count("depth", depth, least=0))
     beyond_S = _followers(mdp, expanded_S) & ~expanded_S
     w = highest_value(mdp.outcomes) if beyond_S.any() else 0.0
     if math.isinf(w):

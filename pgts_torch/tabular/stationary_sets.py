@@ -15,14 +15,13 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import PgtsError
 from pgts_torch.tabular import exact
-from pgts_torch.tabular.exact import UNDISCOUNTED
 from pgts_torch.tabular.mdp import TabularMDP
-from pgts_torch.tabular.stationary import TOLERANCE, largest_discount
+from pgts_torch.tabular.stationary import TOLERANCE
 
 MAX_POLICIES = 2**20
 """Most deterministic policies that are enumerated."""
 
-_BATCH_ENTRIES = 2**18
+BATCH_ENTRIES = 2**18
 """Values that are worked on at once: more leave the processor's cache."""
 
 NEVER = -1
@@ -95,7 +94,7 @@ def enumerate_sets(
     optimum = exact.optimal(mdp)
     slack = _slack(mdp, optimum, tolerance)
     weight_SAS = _dense_weight(mdp.outcomes)
-    free = next(n for n in range(S, 0, -1) if S * A**n <= _BATCH_ENTRIES or n == 1)
+    free = next(n for n in range(S, 0, -1) if S * A**n <= BATCH_ENTRIES or n == 1)
     parts = []
     for first in range(0, A**S, A**free):
         action_SP = _policies(first, first + A**free, S, A)
@@ -219,13 +218,13 @@ def _dense_weight(outcomes: Outcomes) -> Float[Tensor, "S A S"]:
 
 def _check_all_end(outcomes: Outcomes) -> None:
     """PgtsError if a policy may go on for ever undiscounted: then I - gamma P^pi is singular."""
-    if largest_discount(outcomes) < UNDISCOUNTED:
+    ends_SA = exact.ends(outcomes)
+    if ends_SA.all():
         return
-    may_end_SA = ((outcomes.discount_NAK < UNDISCOUNTED) & (outcomes.prob_NAK > 0)).any(-1)
     endless_S = torch.ones(outcomes.num_states, dtype=torch.bool)
     for _ in range(outcomes.num_states):
         leaves_SA = ((outcomes.prob_NAK > 0) & ~endless_S[outcomes.child_NAK]).any(-1)
-        endless_S = endless_S & ~(may_end_SA | leaves_SA).all(-1)
+        endless_S = endless_S & ~(ends_SA | leaves_SA).all(-1)
     if endless_S.any():
         raise PgtsError(
             f"gamma is 1 and from state {int(endless_S.nonzero()[0])} some policy never ends: it has no finite value; "

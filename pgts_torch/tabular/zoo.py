@@ -6,15 +6,16 @@
 import numpy as np
 import torch
 from jaxtyping import Int
-from numpy.typing import ArrayLike
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.seeding import numpy_stream
-from pgts_torch.tabular.mdp import TabularMDP, Transition, check_gamma, start_distribution
+from pgts_torch.tabular.forms import Start, start_distribution
+from pgts_torch.tabular.mdp import TabularMDP, check_gamma
+from pgts_torch.tabular.transitions import Transition
 
-LEFT, RIGHT = 0, 1
-Start = int | ArrayLike | None
+LEFT_RIGHT = ("left", "right")
+FOUR_WAYS = ("left", "right", "up", "down")
 
 
 def ladder(n: int = 5, *, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
@@ -22,15 +23,12 @@ def ladder(n: int = 5, *, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
 
     Always 'left' is stationary for every depth below n - 1. J* = gamma^(n-1) / (1 - gamma) from state 0.
     """
-    _check_size("n", n, 1)
+    check_count("n", n)
     P = [
-        [
-            [(1.0, max(s - 1, 0), 0.0, False)],
-            [(1.0, min(s + 1, n - 1), float(s == n - 1), False)],
-        ]
+        [[(1.0, max(s - 1, 0), 0.0, False)], [(1.0, min(s + 1, n - 1), float(s == n - 1), False)]]  # left, right
         for s in range(n)
     ]
-    return TabularMDP.from_transitions(P, gamma, start=start, action_names=("left", "right"))
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=LEFT_RIGHT)
 
 
 def tightrope(*, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
@@ -43,10 +41,10 @@ def tightrope(*, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
     P = [
         [[(1.0, 0, 0.0, False)], [(1.0, 1, 0.0, False)]],
         [[(1.0, 3, 0.0, False)], [(1.0, 2, 0.0, False)]],
-        [loop_2, loop_2],
-        [loop_3, loop_3],
+        [loop_2] * 2,
+        [loop_3] * 2,
     ]
-    return TabularMDP.from_transitions(P, gamma, start=start, action_names=("left", "right"))
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=LEFT_RIGHT)
 
 
 def random_mdp(
@@ -61,20 +59,19 @@ def random_mdp(
 ) -> TabularMDP:
     """Random transitions and rewards.        [PGTS Ex. 2; with `branching` a Garnet, Archibald et al. 1995]
 
-    Each (s, a) leads to `branching` distinct states, drawn uniformly, with probabilities uniform on the simplex and a
-    reward uniform in [0, 1].
+    Each (s, a) leads to `branching` distinct states, sampled uniformly, with probabilities uniform on the simplex
+    and a reward uniform in [0, 1].
 
     Args:
         branching: successors of each (s, a); None: every state.
-        reward_share: the share of (s, a) that keep their reward, drawn at random, at least one; the others earn 0.
+        reward_share: the share of (s, a) that keep their reward, sampled uniformly, at least one; the others earn 0.
     """
-    _check_size("num_states", num_states, 1)
-    _check_size("num_actions", num_actions, 1)
+    check_count("num_states", num_states)
+    check_count("num_actions", num_actions)
     K = num_states if branching is None else branching
     if not 1 <= K <= num_states:
         raise PgtsError(f"branching is {branching}; it must be between 1 and num_states = {num_states}")
-    if not 0 <= reward_share <= 1:
-        raise PgtsError(f"reward_share is {reward_share}; it must be in [0, 1]")
+    _check_share("reward_share", reward_share)
     check_gamma(gamma)
     random = numpy_stream(seed, "random_mdp")
     prob = random.exponential(size=(num_states, num_actions, K))
@@ -116,30 +113,26 @@ def grid(
         traps: the text says states 12 and 32; the paper's drawing shows 11 and 32.
         absorbing: goal and traps end the episode when they are left, instead of being ordinary states.
     """
-    _check_size("size", size, 1)
+    check_count("size", size)
     goal = size * size - 1 if goal is None else goal
     for name, state in [("goal", goal), *(("trap", trap) for trap in traps)]:
         if not 0 <= state < size * size:
             raise PgtsError(f"{name} {state} is not on the grid; states are 0 to {size * size - 1}")
     if goal in traps:
         raise PgtsError(f"state {goal} is both goal and trap")
-    if not 0 <= slip <= 1:
-        raise PgtsError(f"slip is {slip}; it must be in [0, 1]")
+    _check_share("slip", slip)
     reward = {goal: goal_reward} | dict.fromkeys(traps, trap_reward)
 
-    P = [
-        [
-            [
-                (slip / 4 + (1 - slip) * (a == intended), next_state, reward.get(s, 0.0), absorbing and s in reward)
-                for a, next_state in enumerate(_neighbours(s, size))
-            ]
-            for intended in range(4)
+    def moves(s: int, intended: int) -> list[Transition]:
+        row, column = divmod(s, size)
+        beside = s - (column > 0), s + (column < size - 1), s - size * (row > 0), s + size * (row < size - 1)
+        return [
+            (slip / 4 + (1 - slip) * (a == intended), next_state, reward.get(s, 0.0), absorbing and s in reward)
+            for a, next_state in enumerate(beside)
         ]
-        for s in range(size * size)
-    ]
-    return TabularMDP.from_transitions(
-        P, gamma, start=start, action_names=("left", "right", "up", "down"), shape=(size, size)
-    )
+
+    P = [[moves(s, intended) for intended in range(4)] for s in range(size * size)]
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=FOUR_WAYS, shape=(size, size))
 
 
 def mirage(width: int = 10, *, delta: float = 0.05, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
@@ -154,14 +147,13 @@ def mirage(width: int = 10, *, delta: float = 0.05, gamma: float = 0.9, start: S
     which falls from gamma / (1 - gamma) to delta gamma / (1 - gamma): what 'left' could still be made of counts more
     and more with depth (docs/theory.md, Sec. 5). The wider, the slower it is made of it.
     """
-    _check_size("width", width, 1)
+    check_count("width", width)
     if not 0 < delta < 1:
         raise PgtsError(f"delta is {delta}; it must be above 0 and below 1")
     scattered = [(1 / width, 2 + i, 0.0, False) for i in range(width)]
     P: list[list[list[Transition]]] = [[scattered, [(1.0, 1, 0.0, False)]], [[(1.0, 1, 1.0, False)]] * 2]
-    for s in range(2, width + 2):
-        P.append([[(1.0, s, 0.0, False)], [(1.0, s, 1 - delta, False)]])
-    return TabularMDP.from_transitions(P, gamma, start=start, action_names=("left", "right"))
+    P += [[[(1.0, s, 0.0, False)], [(1.0, s, 1 - delta, False)]] for s in range(2, width + 2)]
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=LEFT_RIGHT)
 
 
 def deep_sea(
@@ -181,43 +173,42 @@ def deep_sea(
     reaches the lowest cell only.
 
     Args:
-        mapping_seed: which of the two actions is 'right' is drawn for each cell; None: action 1 everywhere.
+        mapping_seed: which of the two actions is 'right' is sampled for each cell; None: action 1 everywhere.
         stochastic: going right fails with probability 1/n.
     """
-    _check_size("n", n, 1)
-    right_action = np.ones((n, n), dtype=int)
+    check_count("n", n)
+    right_action, fails = np.ones((n, n), dtype=int), 1 / n if stochastic else 0.0
     if mapping_seed is not None:
         right_action = numpy_stream(mapping_seed, "deep_sea").integers(0, 2, size=(n, n))
 
-    fails = 1 / n if stochastic else 0.0
-    P = [
-        [_sink(n, row, column, a == right_action[row, column], move_cost / n, fails) for a in range(2)]
-        for row in range(n)
-        for column in range(n)
-    ]
-    names = ("left", "right") if mapping_seed is None else ("0", "1")
+    def sinks(row: int, column: int, action: int) -> list[Transition]:
+        ends = row == n - 1
+        below = n * (row if ends else row + 1)  # the first state of the next row; after the last one none counts
+        if action != right_action[row, column]:
+            return [(1.0, below + max(column - 1, 0), 0.0, ends)]
+        reward = float(column == n - 1) - move_cost / n
+        return [(1 - fails, below + min(column + 1, n - 1), reward, ends), (fails, below + column, reward, ends)]
+
+    P = [[sinks(row, column, action) for action in range(2)] for row, column in np.ndindex(n, n)]
+    names = LEFT_RIGHT if mapping_seed is None else ()
     return TabularMDP.from_transitions(P, gamma, start=start, action_names=names, shape=(n, n))
 
 
 def combination_lock(
     n: int = 12, num_actions: int = 4, *, seed: int = 0, gamma: float = 0.99, start: Start = 0
 ) -> TabularMDP:
-    """A lock of n dials: in each state one action, drawn at random, goes on to the next and every other one back to
+    """A lock of n dials: in each state one action, sampled uniformly, goes on to the next and every other one back to
     the first. The right action in the last state earns 1 and ends the episode.
     [Koenig and Simmons 1993, "reset state space"]
 
     A uniform policy opens it once in num_actions^n attempts. J* = gamma^(n-1) from state 0.
     """
-    _check_size("n", n, 1)
-    _check_size("num_actions", num_actions, 2)
+    check_count("n", n)
+    check_count("num_actions", num_actions, least=2)
     right_S = numpy_stream(seed, "combination_lock").integers(0, num_actions, size=n)
-    P = [
-        [
-            [(1.0, min(s + 1, n - 1), float(s == n - 1), s == n - 1) if a == right else (1.0, 0, 0.0, False)]
-            for a in range(num_actions)
-        ]
-        for s, right in enumerate(right_S.tolist())
-    ]
+    back = (1.0, 0, 0.0, False)
+    onward = [(1.0, min(s + 1, n - 1), float(s == n - 1), s == n - 1) for s in range(n)]
+    P = [[[onward[s] if a == right_S[s] else back] for a in range(num_actions)] for s in range(n)]
     return TabularMDP.from_transitions(P, gamma, start=start)
 
 
@@ -230,7 +221,7 @@ def river_swim(n: int = 12, *, gamma: float = 0.99, start: Start = 0) -> Tabular
     6 states. Strehl and Littman start in the second or third and pay 5 and, where 'right' stays in the last state,
     10,000; the current of Osband et al. is weaker (0.35, 0.6 and 0.05).
     """
-    _check_size("n", n, 2)
+    check_count("n", n, least=2)
     P: list[list[list[Transition]]] = []
     for s in range(n):
         left, right = max(s - 1, 0), min(s + 1, n - 1)
@@ -238,11 +229,11 @@ def river_swim(n: int = 12, *, gamma: float = 0.99, start: Start = 0) -> Tabular
         reward = float(s == n - 1)
         swims = [(drift, left, reward, False), (stay, s, reward, False), (swim, right, reward, False)]
         P.append([[(1.0, left, 0.005 * (s == 0), False)], swims])
-    return TabularMDP.from_transitions(P, gamma, start=start, action_names=("left", "right"))
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=LEFT_RIGHT)
 
 
 def corridor(
-    width: int = 3, length: int = 25, *, slip: float = 0.2, gamma: float = 0.99, start: Start | None = None
+    width: int = 3, length: int = 25, *, slip: float = 0.2, gamma: float = 0.99, start: Start = None
 ) -> TabularMDP:
     """A slippery corridor without walls: whoever steps off its long sides is back at the start. Reaching the last
     column earns 1 and ends the episode. State `length * row + column`; actions left, right, up, down.
@@ -255,10 +246,9 @@ def corridor(
     Args:
         start: default the middle of the first column.
     """
-    _check_size("width", width, 1)
-    _check_size("length", length, 2)
-    if not 0 <= slip <= 1:
-        raise PgtsError(f"slip is {slip}; it must be in [0, 1]")
+    check_count("width", width)
+    check_count("length", length, least=2)
+    _check_share("slip", slip)
     home = length * (width // 2)
     moves = ((0, -1), (0, 1), (-1, 0), (1, 0))
 
@@ -268,50 +258,26 @@ def corridor(
             return home, 0.0, False
         return length * row + min(column, length - 1), float(column >= length - 1), column >= length - 1
 
-    P: list[list[list[Transition]]] = []
-    for row in range(width):
-        for column in range(length):
-            P.append([])
-            for intended, move in enumerate(moves):
-                sideways = moves[2:] if intended < 2 else moves[:2]
-                shares = [(1 - slip, move), *((slip / 2, side) for side in sideways)]
-                P[-1].append([(share, *after(row, column, step)) for share, step in shares])
-    names = ("left", "right", "up", "down")
+    def slides(row: int, column: int, action: int) -> list[Transition]:
+        sideways = moves[2:] if action < 2 else moves[:2]
+        shares = [(1 - slip, moves[action]), *((slip / 2, side) for side in sideways)]
+        return [(share, *after(row, column, move)) for share, move in shares]
+
+    P = [[slides(row, column, action) for action in range(4)] for row, column in np.ndindex(width, length)]
     start = home if start is None else start
-    return TabularMDP.from_transitions(P, gamma, start=start, action_names=names, shape=(width, length))
-
-
-def _sink(n: int, row: int, column: int, goes_right: bool, cost: float, fails: float) -> list[Transition]:
-    """What may follow in one cell of the deep sea."""
-    ends = row == n - 1
-    first = n * (row if ends else row + 1)
-    if not goes_right:
-        return [(1.0, first + max(column - 1, 0), 0.0, ends)]
-    reward = float(column == n - 1) - cost
-    return [(1 - fails, first + min(column + 1, n - 1), reward, ends), (fails, first + column, reward, ends)]
-
-
-def _neighbours(s: int, size: int) -> tuple[int, int, int, int]:
-    """The states left, right, above and below; the state itself where there is a wall."""
-    row, column = divmod(s, size)
-    return (
-        s - (column > 0),
-        s + (column < size - 1),
-        s - size * (row > 0),
-        s + size * (row < size - 1),
-    )
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=FOUR_WAYS, shape=(width, length))
 
 
 def _distinct(random: np.random.Generator, rows: int, high: int, count: int) -> Int[np.ndarray, "rows count"]:
     """`count` distinct integers below `high` in each row, every set equally likely (Floyd's algorithm by rows)."""
     chosen = np.empty((rows, count), dtype=np.int64)
     for k, top in enumerate(range(high - count, high)):
-        drawn = random.integers(0, top + 1, size=rows)
-        taken = (chosen[:, :k] == drawn[:, None]).any(-1)
-        chosen[:, k] = np.where(taken, top, drawn)
+        sampled = random.integers(0, top + 1, size=rows)
+        taken = (chosen[:, :k] == sampled[:, None]).any(-1)
+        chosen[:, k] = np.where(taken, top, sampled)
     return chosen
 
 
-def _check_size(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise PgtsError(f"{name} is {value}; it must be at least {least}")
+def _check_share(name: str, value: float) -> None:
+    if not 0 <= value <= 1:
+        raise PgtsError(f"{name} is {value}; it must be in [0, 1]")

@@ -141,10 +141,10 @@ def test_the_context_gives_a_stream_of_its_own_to_each_name_and_says_what_was_dr
     assert all(x != y for x, y in zip(first, another_seed, strict=True))
     with SharedGenerators(0) as shared:
         pass
-    assert shared.drawn == ()
+    assert shared.used == ()
     for module, draw in DRAWS.items():
         before = states()
         with SharedGenerators() as shared:
             draw()
-        assert shared.drawn == (module,)
+        assert shared.used == (module,)
         assert states() == before

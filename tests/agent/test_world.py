@@ -19,7 +19,7 @@ from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, Ta
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel, with_torques
 from pgts_torch.options import MLP, FixedHorizon
-from pgts_torch.seeding import draw_keys, seed_sequence, stream
+from pgts_torch.seeding import sample_keys, seed_sequence, stream
 from tests.agent import cells
 from tests.agent.helpers import same_bits
 
@@ -298,7 +298,7 @@ def test_a_simulator_repeats_random_actions_as_the_key_says():
     env = gymnasium.make("FrozenLake-v1")
     env.reset(seed=0)
     state_N, action_N = torch.full((300,), model.root(env)), torch.full((300,), 1)
-    key_N = draw_keys(300, generator=stream(0, "keys"))
+    key_N = sample_keys(300, generator=stream(0, "keys"))
     first, second = (model.sample(state_N, action_N, key_N=key_N) for _ in range(2))
     assert torch.equal(first.next_state_N, second.next_state_N)
     flipped = model.sample(state_N.flip(0), action_N, key_N=key_N.flip(0))

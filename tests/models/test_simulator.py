@@ -18,7 +18,7 @@ from pgts_torch.models.actions import all_actions, grid_actions, sampled_actions
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.snapshots import generator_state
 from pgts_torch.search import Topology, expectimax, sampled
-from pgts_torch.seeding import draw_keys, stream
+from pgts_torch.seeding import sample_keys, stream
 from pgts_torch.tabular import TabularMDP, exact
 from tests.models.corridors import Bare, Broken, Corridor
 from tests.support import outcomes_of
@@ -49,7 +49,7 @@ def zeros(state_N: Tensor) -> Tensor:
 
 
 def keys(count: int, seed: int = 0) -> Tensor:
-    return draw_keys(count, generator=stream(seed, "keys"))
+    return sample_keys(count, generator=stream(seed, "keys"))
 
 
 # The truth

@@ -12,7 +12,7 @@ from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel
 from pgts_torch.models import TabularModel, Transitions, tabular
 from pgts_torch.models.tabular import tabular_truth
-from pgts_torch.seeding import draw_keys, stream
+from pgts_torch.seeding import sample_keys, stream
 from pgts_torch.tabular import TabularMDP, grid, ladder
 from tests.support import ZOO, outcomes_of, zoo
 
@@ -42,7 +42,7 @@ def p_value(mdp: TabularMDP, drawn: Transitions, times: int) -> float:
 
 
 def keys(count: int, seed: int) -> Tensor:
-    return draw_keys(count, generator=stream(seed, "keys"))
+    return sample_keys(count, generator=stream(seed, "keys"))
 
 
 def sample(mdp: TabularMDP, times: int, dtype: torch.dtype = torch.float64) -> Transitions:

@@ -12,7 +12,7 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.models import StateIndex, TensorModel, state_index
 from pgts_torch.models.state_index import hash_rows
 from pgts_torch.search import Topology, expectimax
-from pgts_torch.seeding import draw_keys, stream
+from pgts_torch.seeding import sample_keys, stream
 from tests.search.models import walk_the_tree
 
 DTYPES = [torch.float32, torch.float64, torch.int64]
@@ -264,7 +264,7 @@ def test_a_drawn_outcome_is_the_listed_one_in_the_dtype_of_the_model_whatever_th
     action_N = torch.arange(3).repeat(len(STARTS))
     answer = model.outcomes(state_N[::3])
     for seed in (0, 1):
-        drawn = model.sample(state_N, action_N, key_N=draw_keys(len(state_N), generator=stream(seed, "keys")))
+        drawn = model.sample(state_N, action_N, key_N=sample_keys(len(state_N), generator=stream(seed, "keys")))
         assert torch.equal(drawn.reward_N, answer.reward_NA.reshape(-1))
         assert torch.equal(drawn.discount_N, answer.discount_NAK.reshape(-1))
         assert torch.equal(drawn.next_state_N, answer.child_NAK.reshape(-1))

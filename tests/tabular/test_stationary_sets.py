@@ -48,7 +48,7 @@ def test_the_enumeration_finds_what_plain_numpy_finds():
 def test_the_enumeration_does_not_depend_on_how_much_is_worked_on_at_once(entries, monkeypatch):
     mdps = [random_mdp(5, 3, branching=2, seed=1), ladder(6), deep_sea(2, gamma=1.0), random_mdp(40, 1)]
     expected = [stationary_sets.enumerate_sets(mdp) for mdp in mdps]
-    monkeypatch.setattr(stationary_sets, "_BATCH_ENTRIES", entries)
+    monkeypatch.setattr(stationary_sets, "BATCH_ENTRIES", entries)
     for mdp, all_at_once in zip(mdps, expected, strict=True):
         sets = stationary_sets.enumerate_sets(mdp)
         np.testing.assert_allclose(sets.J_P, all_at_once.J_P, rtol=1e-12, atol=1e-12)

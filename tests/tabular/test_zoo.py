@@ -263,7 +263,7 @@ def test_the_advantage_of_right_on_the_mirage_is_that_of_the_formula(width, delt
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ladder(0), "n is 0; it must be at least 1"),
+        (lambda: ladder(0), "n is 0; it must be a whole number of at least 1"),
         (lambda: ladder(gamma=1.5), "gamma is 1.5"),
         (lambda: ladder(3, start=3), "start state 3 does not exist"),
         (lambda: random_mdp(0), "num_states is 0"),
@@ -272,7 +272,7 @@ def test_the_advantage_of_right_on_the_mirage_is_that_of_the_formula(width, delt
         (lambda: random_mdp(3, branching=4), "branching is 4"),
         (lambda: random_mdp(gamma=-0.1), "gamma is -0.1"),
         (lambda: random_mdp(reward_share=math.nan), r"reward_share is nan; it must be in \[0, 1\]"),
-        (lambda: mirage(0), "width is 0; it must be at least 1"),
+        (lambda: mirage(0), "width is 0"),
         (lambda: mirage(delta=0.0), "delta is 0.0; it must be above 0 and below 1"),
         (lambda: mirage(delta=1.0), "delta is 1.0; it must be above 0 and below 1"),
         (lambda: mirage(gamma=2.0), "gamma is 2.0"),
