@@ -1,13 +1,15 @@
 """One episode in each of several environments, step by step."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, final
 
 import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from pgts_torch.errors import PgtsError
-from pgts_torch.models.snapshots import each_of
+from pgts_torch.errors import PgtsError, failure
+from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.steps import (
     check_discounts,
     check_rewards,
@@ -21,7 +23,7 @@ from pgts_torch.models.steps import (
 
 @final
 class Episodes:
-    """One episode in each environment, from a reset on.
+    """One episode in each environment, from `reset` on.
 
     An environment whose episode is over is not stepped any more where environments can be stepped one by one (a plain
     `SyncVectorEnv`); else it is reset, and its further steps are ignored.
@@ -42,8 +44,14 @@ class Episodes:
         self._over_B = np.zeros(env.num_envs, dtype=bool)
         self._reward_B = np.zeros(env.num_envs)
         self._stepping: int | None = None  # the index of the environment whose step is running
-        self.observation: Any = env.reset(seed=seeds)[0]  # type: ignore[arg-type]  # or one seed for all
-        self._each = list(iterate(env.observation_space, self.observation)) if self._one_by_one else []
+        self._each: list[Any] = []  # the latest observation of each environment, where these are stepped one by one
+        self.observation: Any = None
+
+    def reset(self) -> None:
+        """Begin the episodes."""
+        self.observation = self._env.reset(seed=self._seeds)[0]  # type: ignore[arg-type]  # or one seed for all
+        if self._one_by_one:
+            self._each = list(iterate(self._env.observation_space, self.observation))
 
     def step(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Take one step. Return rewards, discounts and truncations; they have no meaning outside `alive_B`.
@@ -87,8 +95,21 @@ class Episodes:
         self.observation = concatenate(space, self._each, rows)
         return reward_B, discount_B, truncated_B
 
-    def blame(self, error: BaseException) -> tuple[list[int], BaseException]:
-        """Return the seeds of the environments that may have caused an error, and the error.
+    @contextmanager
+    def named(self, when: str) -> Iterator[None]:
+        """A context whose errors become PgtsErrors that name the environment, `when`, and the seeds of the episodes
+        that may have caused them."""
+        try:
+            yield
+        except BaseException as error:
+            seeds, cause = self._cause(error)
+            which = (
+                f"the episode with the seed {seeds[0]}" if len(seeds) == 1 else f"the episodes with the seeds {seeds}"
+            )
+            raise failure(f"{env_name(self._env)} failed {when} of {which}", cause) from error
+
+    def _cause(self, error: BaseException) -> tuple[list[int], BaseException]:
+        """The seeds of the environments that may have caused an error, and the error.
 
         Where a single environment has returned something invalid, these are its seed and the error that says so.
         """

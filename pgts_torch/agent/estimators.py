@@ -11,10 +11,8 @@ from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.depth import DepthChoice
 from pgts_torch.agent.iteration import PolicyBatch
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.ranks import Draws
 from pgts_torch.agent.rollout import Rollout, StateWeight
-from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.tabular.ascent import centred
 
 _ROUNDINGS = 16
@@ -22,25 +20,19 @@ _ROUNDINGS = 16
 
 
 class Estimator(ABC):
-    """Estimates advantages from episodes of a policy and a critic.
-
-    comes_first: whether it is called before the critic is fitted to these episodes.
-    """
-
-    comes_first: bool
-
-    @property
-    @abstractmethod
-    def model_calls(self) -> int:
-        """For how many (state, action) the model has been queried so far, by the critic too."""
+    """Evaluates a policy by its episodes, and estimates the advantages that it is updated by."""
 
     @abstractmethod
-    def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
-        """Return the advantages of the policy that collected these episodes.
+    def evaluate(self, experience: Rollout, draws: Draws) -> dict[str, float]:
+        """Fit the critic to the policy that collected these episodes. Return its losses, by name.
 
         Args:
             draws: the random generators of the iteration.
         """
+
+    @abstractmethod
+    def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
+        """Return the advantages in these episodes, after `evaluate`."""
 
 
 @final
@@ -48,19 +40,17 @@ class LookaheadEstimator(Estimator):
     """Advantages of all actions, by a lookahead from the distinct visited states: (T^m Q)(s, a) - <pi, T^m Q>(s).
 
     Args:
-        look: the lookahead of the policy that collected the episodes.
-        choose: chooses its depth.
+        choose: computes the lookahead, and chooses its depth.
         weight: the weights of states in the update.
     """
 
-    comes_first = False
+    def __init__(self, choose: DepthChoice, weight: StateWeight) -> None:
+        self._look, self._choose, self._weight = choose.look, choose, weight
 
-    def __init__(self, look: PolicyLookahead, choose: DepthChoice, weight: StateWeight) -> None:
-        self._look, self._choose, self._weight = look, choose, weight
-
-    @property
-    def model_calls(self) -> int:
-        return self._look.search.model_calls + self._look.critic.model_calls
+    def evaluate(self, experience: Rollout, draws: Draws) -> dict[str, float]:
+        critic = self._look.critic
+        generator = draws.own if critic.samples_when_queried else draws.common
+        return critic.fit(self._look.policy, experience, generator=generator)
 
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
         self._look.restart()
@@ -68,20 +58,19 @@ class LookaheadEstimator(Estimator):
         observation_N = experience.first_observation_N
         pi_NA = self._look.policy.probs(observation_N)
         chosen = self._choose(experience, pi_NA, draws)
+        q_NA = chosen.look.q_BA
+        # Differences that rounding may have caused are no advantages.
+        eps = max(torch.finfo(dtype).eps for dtype in (q_NA.dtype, self._look.critic.dtype))
+        rounding = _ROUNDINGS * eps * float(q_NA[q_NA.isfinite()].abs().amax())
         return PolicyBatch(
-            observation_N=observation_N,
+            observation_N,
+            centred(q_NA, pi_NA, rounding=rounding),
+            weight_N,
+            chosen.look.noise,
             state_N=state_N,
-            weight_N=weight_N,
             pi_NA=pi_NA,
-            advantage_NA=centred(chosen.look.q_BA, pi_NA, rounding=self._rounding(chosen.look)),
-            noise=chosen.look.noise,
             **chosen._asdict(),
         )
-
-    def _rounding(self, look: Lookahead) -> float:
-        """The largest difference of lookahead values that rounding may have caused, in reward units."""
-        eps = max(torch.finfo(dtype).eps for dtype in (look.q_BA.dtype, self._look.critic.dtype))
-        return _ROUNDINGS * eps * float(look.q_BA[look.q_BA.isfinite()].abs().amax())
 
 
 @final
@@ -90,32 +79,33 @@ class SampledEstimator(Estimator):
 
     Args:
         policy: that collected the episodes.
-        critic: fitted to earlier episodes; fitted to these, its values would depend on the actions taken.
+        critic: gives values of states. They are those from before its fit to the same episodes, after which they depend
+            on the actions taken.
         lambda_: in [0, 1].
         weight: the weights of visits in the update.
     """
 
-    comes_first = True
-
     def __init__(self, policy: Policy, critic: Critic, lambda_: float, weight: StateWeight) -> None:
         self._policy, self._critic, self._lambda, self._weight = policy, critic, lambda_, weight
 
-    @property
-    def model_calls(self) -> int:
-        return self._critic.model_calls
+    def evaluate(self, experience: Rollout, draws: Draws) -> dict[str, float]:
+        self._batch = self._before_fit(experience)
+        return self._critic.fit(self._policy, experience, generator=draws.common)
 
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
+        return self._batch
+
+    def _before_fit(self, experience: Rollout) -> PolicyBatch:
         alive_TB, observation_N = experience.alive_TB, experience.observation_V
         pi_NA = self._policy.probs(observation_N)
         advantage_TB = gae(experience, *self._critic.values(experience), self._lambda)
         weight_N = experience.visit_weight(self._weight)
         return PolicyBatch(
-            observation_N=observation_N,
+            observation_N,
+            score_function(experience.action_TB[alive_TB], advantage_TB[alive_TB], pi_NA),
+            weight_N,
             state_N=None,
-            weight_N=weight_N,
             pi_NA=pi_NA,
-            advantage_NA=score_function(experience.action_TB[alive_TB], advantage_TB[alive_TB], pi_NA),
-            noise=0.0,
             depth=0,
             look=None,
             gap_N=torch.full_like(weight_N, torch.nan),

@@ -10,15 +10,29 @@ from pgts_torch.search.lookahead import Lookahead
 
 
 @dataclass(frozen=True, eq=False)
-class PolicyBatch:
-    """The batch that an update of the policy pi_k is computed from.
+class Batch:
+    """The batch that an update of a policy is computed from.
 
     observation_N: the observation in each distinct visited state; with sampled advantages, in each visit.
-    weight_N: the weight of each row in the update.
-    state_N: the states of the rows; None with sampled advantages, which need none.
-    pi_NA: pi_k in each row.
     advantage_NA: with sum_a pi(a|s) A(s, a) = 0. Of a lookahead: (T^m Q)(s, a) - <pi, T^m Q>(s). Sampled advantages
         have this mean in expectation only.
+    weight_N: w(s), the weight of each row in the update.
+    noise: the standard error of the advantages of a sampled lookahead (root mean square), in reward units, by which
+        normalised steps divide at least; 0 where nothing was sampled or no standard errors are computed.
+    """
+
+    observation_N: Shaped[Tensor, "N ..."]
+    advantage_NA: Float[Tensor, "N A"]
+    weight_N: Float[Tensor, "N"]
+    noise: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PolicyBatch(Batch):
+    """A batch of the policy pi_k, and where it is from.
+
+    state_N: the states of the rows; None with sampled advantages, which need none.
+    pi_NA: pi_k in each row.
     depth: m.
     look: (T^m Q)(s, .) at these states; None with sampled advantages.
     gap_N: max_a (T^m Q)(s, a) - v(s) >= 0, with v(s) = <pi(.|s), Q(s, .)> of the same critic.
@@ -27,24 +41,18 @@ class PolicyBatch:
         to the critic's error at the start states, and with 95 % confidence where these are sampled. Infinite where the
         model has no `highest_value`, the search samples outcomes, or there are too few episodes.
     is_enough: whether the certificate is at most `stop_at`: then pi_k is not updated, and training ends.
-    noise: root mean square of the standard errors of a sampled lookahead, in reward units; 0 where nothing was sampled
-        or no standard errors are computed.
     """
 
-    observation_N: Shaped[Tensor, "N ..."]
     state_N: Int[Tensor, "N"] | None
-    weight_N: Float[Tensor, "N"]
     pi_NA: Float[Tensor, "N A"]
-    advantage_NA: Float[Tensor, "N A"]
     depth: int
     look: Lookahead | None
     gap_N: Float[Tensor, "N"]
     certificate: float
     is_enough: bool
-    noise: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Iteration(PolicyBatch):
     """The results of one iteration of Algorithm 1.
 

@@ -77,7 +77,7 @@ class ModelCheck:
         self._world, self._seed, self._ranks = world, seed, ranks
         model = world.model if is_queried and mode != "off" else None
         self._model = model if isinstance(model, ExactModel) else None
-        self._said: list[str] = []
+        self._warned: list[str] = []
         self._frequencies: dict[str, Frequencies] = {}
         if isinstance(self._model, TabularModel):
             assert isinstance(world, TabularWorld)
@@ -195,7 +195,7 @@ class ModelCheck:
         """Check the evidence against the probabilities of outcomes and starts. The same in all ranks."""
         for what, frequencies in self._frequencies.items():
             kind, (beyond_margin, any_error) = f"frequencies of {what}", frequencies.log_evidence
-            if beyond_margin >= ENOUGH and kind not in self._said:
+            if beyond_margin >= ENOUGH and kind not in self._warned:
                 self._contradicted(kind, f"{self._unlikely(what)}. {_WAY_OUT}", 1)
             elif any_error >= ENOUGH and beyond_margin < 0:  # bets on an error beyond the margin have lost
                 self._warn(kind, f"{self._unlikely(what)}; the probabilities are wrong, but by less than 0.02 so far")
@@ -225,8 +225,8 @@ class ModelCheck:
 
     def _warn(self, kind: str, text: str) -> None:
         """Warn once for each kind, in rank 0 only."""
-        if kind not in self._said:
-            self._said.append(kind)
+        if kind not in self._warned:
+            self._warned.append(kind)
             if self._ranks.leads:
                 warnings.warn(text, stacklevel=4)
 
@@ -245,14 +245,14 @@ class ModelCheck:
         return {
             "contradictions": self.contradictions,
             "model_calls": self.model_calls,
-            "said": list(self._said),
+            "warned": list(self._warned),
             "frequencies": frequencies,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load what `state_dict` returned; frequencies that the saved check did not count begin empty."""
         self.contradictions, self.model_calls = state["contradictions"], state["model_calls"]
-        self._said = list(state["said"])
+        self._warned = list(state["warned"])
         for what, each in self._frequencies.items():
             if what in state["frequencies"]:
                 each.load_state_dict(state["frequencies"][what])

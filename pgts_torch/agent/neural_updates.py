@@ -12,12 +12,14 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, NamedTuple, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.optimisers import Optimiser, minibatches
@@ -27,19 +29,6 @@ from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.options.fields import limit
 from pgts_torch.options.updates import PPO, Gradient
 from pgts_torch.search.lookahead import check_finite
-
-
-class Batch(NamedTuple):
-    """The batch of one update.
-
-    input_N: encoded observations.   weight_N: float32.   advantage_NA: in reward units, in the dtype of the lookahead.
-    noise: the standard error of the advantages, in reward units (`Update.__call__`).
-    """
-
-    input_N: Float[Tensor, "N ..."]
-    advantage_NA: Float[Tensor, "N A"]
-    weight_N: Float[Tensor, "N"]
-    noise: float
 
 
 class Move(NamedTuple):
@@ -70,16 +59,7 @@ class NetworkUpdate(Update):
             method=options.optimizer,
         )
 
-    def __call__(
-        self,
-        policy: Policy,
-        observation_N: Tensor,
-        advantage_NA: Float[Tensor, "N A"],
-        weight_N: Float[Tensor, "N"],
-        *,
-        generator: torch.Generator,
-        noise: float = 0.0,
-    ) -> dict[str, float]:
+    def __call__(self, policy: Policy, batch: Batch, *, generator: torch.Generator) -> dict[str, float]:
         """Take the gradient steps.
 
         Returns:
@@ -92,19 +72,20 @@ class NetworkUpdate(Update):
             PgtsError: all weights are 0.
         """
         assert isinstance(policy, NetworkPolicy)
-        _check_numbers(advantage_NA, weight_N)
+        _check_numbers(batch.advantage_NA, batch.weight_N)
         with self._restored_unless_finite(policy):
             network, encoder = policy.network, policy.network.trunk.encoder
             if fresh := encoder.fresh:
-                encoder.absorb(observation_N)
-            batch = Batch(network.encode(observation_N), advantage_NA, weight_N.float(), noise)
-            old_NA, new_NA, losses = self.move(network, batch, generator)
+                encoder.absorb(batch.observation_N)
+            weight_N = batch.weight_N.float()
+            input_N = network.encode(batch.observation_N)
+            old_NA, new_NA, losses = self.move(network, input_N, replace(batch, weight_N=weight_N), generator)
             check_finite("probability", "the next policy", new_NA, None)
-            weight_N = batch.weight_N / batch.weight_N.sum()
+            weight_N = weight_N / weight_N.sum()
             losses["entropy"] = float(weight_N @ entropy(new_NA))
             losses["kl"] = float(weight_N @ divergence(old_NA, new_NA))
             if not fresh:
-                encoder.absorb(observation_N)
+                encoder.absorb(batch.observation_N)
         return losses
 
     @contextmanager
@@ -130,8 +111,8 @@ class NetworkUpdate(Update):
             self._optimiser.check_fits(policy.network.weights)
 
     @abstractmethod
-    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
-        """Take the gradient steps of this kind of update."""
+    def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
+        """Take the gradient steps of this kind of update; `input_N` are the encoded observations of the batch."""
 
     def step(self, network: Network, loss: Tensor, *, through: tuple[Tensor, Tensor] | None = None) -> float:
         """Take one step down the loss (see `Optimiser.step`). Return the norm of its gradient."""
@@ -152,15 +133,15 @@ class GradientUpdate(NetworkUpdate):
     def __init__(self, options: Gradient = Gradient()) -> None:  # noqa: B008 - frozen
         super().__init__(options)
 
-    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
+    def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
         """Losses: policy, minus the objective without entropy, before the step; grad_norm, before clipping."""
-        log_NA = network(batch.input_N).log_softmax(-1)
+        log_NA = network(input_N).log_softmax(-1)
         policy_loss = -(batch.weight_N @ (log_NA.exp() * batch.advantage_NA.float()).sum(-1))
         coef = self.options.entropy_coef
         bonus = batch.weight_N @ entropy(log_NA) if coef else 0.0
         norm = self.step(network, policy_loss - coef * bonus)
         losses = {"policy": float(policy_loss.detach()), "grad_norm": norm}
-        return Move(log_NA.detach(), log_probs(network, batch.input_N), losses)
+        return Move(log_NA.detach(), log_probs(network, input_N), losses)
 
 
 @final
@@ -181,12 +162,11 @@ class PPOUpdate(NetworkUpdate):
     def __init__(self, options: PPO = PPO()) -> None:  # noqa: B008 - frozen
         super().__init__(options)
 
-    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
+    def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
         """Losses: policy, minus the objective without entropy, mean over the steps; grad_norm, mean, before clipping;
         clip_fraction, the probability of actions whose rho is out of range after the steps; num_steps."""
-        input_N, advantage_NA, weight_N = batch.input_N, batch.advantage_NA.float(), batch.weight_N
-        old_NA = log_probs(network, input_N)
-        weight_N = weight_N / weight_N.mean()
+        old_NA, advantage_NA = log_probs(network, input_N), batch.advantage_NA.float()
+        weight_N = batch.weight_N / batch.weight_N.mean()
         if self.options.normalize_advantage:
             advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N)
         columns, policy_losses, norms = (input_N, old_NA, advantage_NA, weight_N), [], []

@@ -40,6 +40,11 @@ class Parts(NamedTuple):
     estimator: Estimator
     model_check: ModelCheck
 
+    @property
+    def model_calls(self) -> int:
+        """For how many (state, action) lookahead and critic have queried the model so far, in this process."""
+        return self.critic.model_calls + (self.search.model_calls if self.search is not None else 0)
+
 
 def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
     """Make all parts, from the environments to the model check; parts that are given as objects are used as they are.
@@ -76,7 +81,7 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
         look = PolicyLookahead(world, policy, critic, search, ranks)
         tolerance = options.search.filled("adaptive").tolerance
         depth_choice = DepthChoice(look, certificates, depths=depths, tolerance=tolerance, stop_at=stop_at)
-        estimator = LookaheadEstimator(look, depth_choice, update.state_weight)
+        estimator = LookaheadEstimator(depth_choice, update.state_weight)
     model_check = ModelCheck(
         world, mode=options.search.model_check, is_queried=search is not None, seed=seed, ranks=ranks
     )

@@ -12,7 +12,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pgts_torch.agent import saved, saving
-from pgts_torch.agent.acting import Actor
 from pgts_torch.agent.build import Description, make_device, plain
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.iteration import Iteration
@@ -38,11 +37,9 @@ class PGTS:
 
         pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d^pi(s) (T^m Q^pi)(s, .) ]        [PGTS Eq. (3)]
 
-    The lookahead is used in training only; `predict` evaluates the policy alone. All random numbers of iteration k are
-    from streams named by (seed, k), so that a loaded model continues exactly as the saved one would have.
-
-    Where torch.distributed has a default process group, its processes train one policy together (`agent.ranks`): each
-    computes its part of the episodes and of the lookahead. They must make the same calls, with the same arguments.
+    All random numbers of iteration k are from streams named by (seed, k), so that a loaded model continues exactly as
+    the saved one would have. Where torch.distributed has a default process group, its processes train one policy
+    together (`agent.ranks`); they must make the same calls, with the same arguments.
 
     Args:
         env: a Gymnasium id; a spec; an instance, from whose spec equal ones can be made; a function that makes one; or
@@ -101,46 +98,41 @@ class PGTS:
         given = {name: value for name, value in locals().items() if name != "self"}
         arguments = {name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()}
         self.seed, self.device, self.ranks = seed, make_device(device), present_ranks()
-        parts = make_parts(arguments, self.ranks)
+        parts = self._parts = make_parts(arguments, self.ranks)
         self.options, self.source, self.world, self.policy, self.critic, self.update = parts[:6]
         self.search, self.certificates, self.depth_choice, self.estimator, self.model_check = parts[6:]
         self.gamma, self.horizon = self.world.gamma, self.options.rollout.horizon
         self.num_iterations = self.num_env_steps = self.num_model_calls = 0
         self._arguments = arguments | {"env": self.source.description, "device": str(self.device)}
-        generator = stream(seed, "predict", device=self.device)
-        self._act = Actor(self.world, self.policy, self.source.own_actions(self.world.env), generator)
+        self._own_actions = self.source.own_actions(self.world.env)
+        self._generator = stream(seed, "predict", device=self.device)
 
     @torch.inference_mode(False)
     @torch.enable_grad()
     def iterate(self) -> Iteration:
         """Run one iteration: visit states, estimate Q^pi, look m steps ahead, update pi.        [PGTS Alg. 1]"""
         draws = self.ranks.draws(self.seed, self.num_iterations, self.device)
-        calls_before = self.estimator.model_calls
+        calls_before = self._parts.model_calls
 
-        # Visit states with pi_k.
+        # Visit states with pi_k: those where the estimate d(s) of d^{pi_k}(s) is positive.
         experience = visit(self.world, self.policy, self.horizon, draws, self.ranks)
 
-        # Sampled advantages use the critic before it is fitted to the same episodes.
-        batch = self.estimator(experience, draws) if self.estimator.comes_first else None
+        # Line 2: estimate Q^{pi_k}.
+        losses = self.estimator.evaluate(experience, draws)
 
-        # Evaluate pi_k: estimate Q^{pi_k} (line 2).
-        fitting = draws.own if self.critic.samples_when_queried else draws.common
-        losses = self.critic.fit(self.policy, experience, generator=fitting)
-
-        # Look m steps ahead from the states with d(s) > 0.
-        batch = batch or self.estimator(experience, draws)
+        # Look m steps ahead from the visited states: (T^m Q^{pi_k})(s, .).
+        batch = self.estimator(experience, draws)
 
         # Check the episodes against the model, before pi is updated.
         self.model_check(experience, self.num_iterations)
 
-        # Update: pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d(s) (T^m Q)(s, .) ] (line 3), unless pi_k is good enough.
+        # Line 3: pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta_k d(s) (T^m Q^{pi_k})(s, .) ], unless pi_k is good enough.
         if not batch.is_enough:
-            columns = batch.observation_N, batch.advantage_NA, batch.weight_N
-            losses |= self.update(self.policy, *columns, generator=draws.common, noise=batch.noise)
+            losses |= self.update(self.policy, batch, generator=draws.common)
 
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
-        model_calls = self.ranks.total(self.estimator.model_calls - calls_before, self.policy.state_dict)
+        model_calls = self.ranks.total(self._parts.model_calls - calls_before, self.policy.state_dict)
         self.num_model_calls += model_calls
         return Iteration(**vars(batch), experience=experience, losses=losses, model_calls=model_calls)
 
@@ -178,14 +170,13 @@ class PGTS:
         callbacks = [callback] if callable(callback) else callback
         if not isinstance(callbacks, Sequence) or not all(map(callable, callbacks)):
             raise PgtsError(f"callback is {callback!r}; it must be a function of (model, iteration), or a list of such")
-        hidden = not (progress and self.ranks.leads)
-        with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=hidden) as bar:
+        shown = progress and self.ranks.leads
+        with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=not shown) as bar:
             while self.num_env_steps < total_steps:
                 iteration = self.iterate()
                 bar.update(iteration.experience.num_steps)
-                answers = [call(self, iteration) for call in callbacks]
-                going = self.ranks.gather("whether to go on", lambda: False not in answers)  # noqa: B023
-                if not all(going) or iteration.is_enough:
+                goes_on = False not in [call(self, iteration) for call in callbacks]
+                if not all(self.ranks.gather("whether to go on", lambda: goes_on)) or iteration.is_enough:  # noqa: B023
                     break
         return self
 
@@ -199,7 +190,15 @@ class PGTS:
             deterministic: take the most probable action; else sample from pi.
             generator: for sampling; default: one with this model's seed, which continues from call to call.
         """
-        return self._act(observation, deterministic=deterministic, generator=generator)
+        observation_N = self.world.encode(observation)
+        shape = observation_N.shape[: observation_N.ndim - len(self.world.observation_space.shape or ())]
+        observation_N = observation_N.reshape(-1, *observation_N.shape[len(shape) :])
+        if deterministic:
+            action_N = self.policy.probs(observation_N).argmax(-1)
+        else:
+            action_N = self.policy.sample(observation_N, generator=generator or self._generator)
+        action = action_N.cpu().numpy().reshape(shape)
+        return action[()] if self._own_actions is None else self._own_actions[action]
 
     def save(self, path: str | Path) -> None:
         """Write arguments and state into one file with a checksum, without an environment that was given as an object.
@@ -241,9 +240,9 @@ class PGTS:
         return saved.load_training(path, cls, env=env, device=device, trust_imports=trust_imports)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the training (`saved.state_of`). If several processes train together all must call it."""
-        return saved.state_of(self)
+        """Return the states of all parts, and the counters. If several processes train together all must call it."""
+        return saved.state_of(self._parts, self.ranks) | {name: getattr(self, name) for name in saved.COUNTERS}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load what `state_dict` returned; PgtsError, and nothing is loaded, if it is no state of such a model."""
-        saved.restore(self, state)
+        self.num_iterations, self.num_env_steps, self.num_model_calls = saved.restore(self._parts, self.ranks, state)

@@ -46,12 +46,12 @@ class PolicyLookahead:
             PgtsError, RankLost: as `Ranks.gather`.
         """
         if self._ranks.size == 1:
-            return self.search(state_N, depth=depth, generator=generator, **self._leaves)
+            return self(state_N, depth, generator)
         mine = self._ranks.part(state_N)
-        parts = self._ranks.gather(
+        looks = self._ranks.gather(
             "lookahead", lambda: _moved(self(mine, depth, generator), "cpu") if len(mine) else None
         )
-        return _moved(_joined([part for part in parts if part is not None]), state_N.device)
+        return _moved(_joined([look for look in looks if look is not None]), state_N.device)
 
     def restart(self) -> None:
         """Reset the search before an iteration in which states get new numbers."""
@@ -67,10 +67,9 @@ class PolicyLookahead:
 
 
 def _moved(look: Lookahead, device: torch.device | str) -> Lookahead:
-    moved: dict[str, Any] = {name: getattr(look, name) for name in _VALUES}
-    for name, value_BA in moved.items():
-        moved[name] = None if value_BA is None else value_BA.to(device)
-    return replace(look, **moved)
+    values: dict[str, Any] = {name: getattr(look, name) for name in _VALUES}
+    values = {name: None if value is None else value.to(device) for name, value in values.items()}
+    return replace(look, **values)
 
 
 def _joined(parts: Sequence[Lookahead]) -> Lookahead:

@@ -2,19 +2,19 @@
 
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from pgts_torch.agent.episodes import Episodes
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.world import ModelWorld, World
-from pgts_torch.errors import PgtsError, failure
+from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, Horizon
@@ -40,6 +40,10 @@ def check_end(horizon: Horizon, num_alive: int) -> None:
         raise PgtsError(
             f"an episode is longer than max_length = {horizon.max_length} of the geometric horizon; is gamma 1?"
         )
+
+
+COLUMNS = ("action_TB", "reward_TB", "discount_TB", "alive_TB", "weight_TB", "survival_TB")
+"""The fields of `Rollout` with a row for each step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +174,10 @@ def rollout(
     Warns:
         UserWarning: an environment uses the generators of the whole process, once for each world.
     """
-    if world.draws_its_own:
-        return _episodes(world, policy, horizon, seed=seed, names=names, generator=generator)
-    with SharedGenerators(seed, *names) as shared:
-        made = _episodes(world, policy, horizon, seed=seed, names=names, generator=generator)
+    seeds = seed_sequence(seed, *names, "env").generate_state(world.env.num_envs).tolist()
+    shared = SharedGenerators(seed, *names)
+    with nullcontext() if world.draws_its_own else shared:
+        made = _episodes(world, policy, horizon, seeds, generator)
     if shared.used and not world.warned:
         world.warned = True
         warnings.warn(
@@ -184,64 +188,38 @@ def rollout(
     return made
 
 
-def _episodes(
-    world: World,
-    policy: Policy,
-    horizon: Horizon,
-    *,
-    seed: int,
-    names: tuple[str | int, ...],
-    generator: torch.Generator,
-) -> Rollout:
-    env, model_world = world.env, world if isinstance(world, ModelWorld) else None
-    words = seed_sequence(seed, *names, "env").generate_state(env.num_envs)
-    try:
-        episodes = Episodes(env, gamma=world.gamma, seeds=words.tolist())
-    except BaseException as error:
-        raise _failure(env, "at the start", words.tolist(), error) from error
-    try:
-        observations = [world.encode(episodes.observation)]
-        reads = [model_world.read(episodes.observation, observations[-1])] if model_world else []
-    except BaseException as error:
-        raise _failure(env, "at the start", *episodes.blame(error)) from error
+def _episodes(world: World, policy: Policy, horizon: Horizon, seeds: list[int], generator: torch.Generator) -> Rollout:
+    num_envs, model_world = world.env.num_envs, world if isinstance(world, ModelWorld) else None
+    episodes = Episodes(world.env, gamma=world.gamma, seeds=seeds)
+    observations: list[Tensor] = []
+    reads: list[Tensor] = []
+
+    def observe() -> None:
+        observations.append(world.encode(episodes.observation))
+        if model_world:
+            reads.append(model_world.read(episodes.observation, observations[-1]))
+
+    with episodes.named("at the start"):
+        episodes.reset()
+        observe()
     # numpy until the end, because operations on a few numbers cost several times more in torch
-    alive_B, weight_B = np.ones(env.num_envs, dtype=bool), np.ones(env.num_envs)
+    alive_B, weight_B = np.ones(num_envs, dtype=bool), np.ones(num_envs)
     rows: list[tuple[np.ndarray, ...]] = []
     while len(rows) < horizon.limit and alive_B.any():
         action_B = policy.sample(observations[-1], generator=generator).cpu().numpy()
-        try:
+        with episodes.named(f"in step {len(rows)}"):
             reward_B, discount_B, truncated_B = episodes.step(action_B, alive_B)
             if world.reward_range is not None:
                 world.reward_range.check(reward_B[alive_B])
-            observations.append(world.encode(episodes.observation))
-            if model_world:
-                reads.append(model_world.read(episodes.observation, observations[-1]))
-        except BaseException as error:
-            raise _failure(env, f"in step {len(rows)}", *episodes.blame(error)) from error
+            observe()
         survival_B = survival(horizon, torch.from_numpy(discount_B), generator).numpy()
         rows.append((action_B, reward_B, discount_B, alive_B, weight_B * alive_B, survival_B))
         weight_B = weight_B * survival_B
         alive_B = alive_B & (survival_B > 0) & ~truncated_B
     check_end(horizon, int(alive_B.sum()))
+    columns = (torch.from_numpy(np.array(column)).to(world.device) for column in zip(*rows, strict=True))
     state_UB = model_world.numbers(torch.cat(reads)).view(len(reads), -1) if model_world else None
-    action_TB, reward_TB, discount_TB, alive_TB, weight_TB, survival_TB = (
-        torch.from_numpy(np.array(column)).to(world.device) for column in zip(*rows, strict=True)
-    )
-    return Rollout(
-        torch.stack(observations),
-        action_TB,
-        reward_TB,
-        discount_TB,
-        alive_TB,
-        weight_TB,
-        survival_TB,
-        state_UB,
-    )
-
-
-def _failure(env: VectorEnv, when: str, seeds: list[int], error: BaseException) -> PgtsError:
-    episodes = f"the episode with the seed {seeds[0]}" if len(seeds) == 1 else f"the episodes with the seeds {seeds}"
-    return failure(f"{env_name(env)} failed {when} of {episodes}", error)
+    return Rollout(torch.stack(observations), **dict(zip(COLUMNS, columns, strict=True)), state_UB=state_UB)
 
 
 def simulated_returns(

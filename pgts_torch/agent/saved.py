@@ -8,100 +8,80 @@ from typing import Any, Protocol, TypeVar
 import torch
 
 from pgts_torch.agent import saving
-from pgts_torch.agent.certificate import Certificates
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.model_check import ModelCheck
+from pgts_torch.agent.parts import Parts
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.ranks import Ranks
-from pgts_torch.agent.states import NO_STATE, check_keys, take_over
+from pgts_torch.agent.states import NO_STATE, check_keys, load_checked
 from pgts_torch.agent.updates import Update
-from pgts_torch.agent.world import ModelWorld, World
+from pgts_torch.agent.world import ModelWorld
 from pgts_torch.errors import PgtsError, check_count
-from pgts_torch.search.engine import Search
 from pgts_torch.trust import check_imports
 
 COUNTERS = ("num_iterations", "num_env_steps", "num_model_calls")
 
 
-class Training(Protocol):
-    """The parts of a training that have a state, and its counters."""
+class Loadable(Protocol):
+    """A model that can load what its `state_dict` returned."""
 
-    policy: Policy
-    critic: Critic
-    update: Update
-    world: World
-    search: Search | None
-    certificates: Certificates | None
-    model_check: ModelCheck
-    ranks: Ranks
-    num_iterations: int
-    num_env_steps: int
-    num_model_calls: int
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """PgtsError, and nothing is loaded, unless it fits."""
 
 
-T = TypeVar("T", bound=Training)
+T = TypeVar("T", bound=Loadable)
 
 
-def state_of(training: Training) -> dict[str, Any]:
-    """Return the states of policy, critic, update and of each rank's search, and the counters: tensors on the CPU and
-    plain values. If several processes train together all must call it."""
-    searches = training.ranks.gather("searches", lambda: _search_state(training))
-    return {
-        "searches": dict(enumerate(searches)),
-        "policy": training.policy.state_dict(),
-        "critic": training.critic.state_dict(),
-        "update": training.update.state_dict(),
-        **{name: getattr(training, name) for name in COUNTERS},
-        "model_check": training.model_check.state_dict(),
-    }
+def state_of(parts: Parts, ranks: Ranks) -> dict[str, Any]:
+    """Return the states of the parts of a training: tensors on the CPU and plain values."""
+    searches = ranks.gather("searches", lambda: _search_state(parts))
+    learned = {name: part.state_dict() for name, part in _learned(parts).items()}
+    return {**learned, "searches": dict(enumerate(searches)), "model_check": parts.model_check.state_dict()}
 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def restore(training: Training, state: dict[str, Any]) -> None:
-    """Load what `state_of` returned; nothing is loaded if it is no state of such a training.
+def restore(parts: Parts, ranks: Ranks, state: dict[str, Any]) -> tuple[int, int, int]:
+    """Load what `state_of` returned, and return the counters; nothing is loaded if it is no state of such a training.
 
     Raises:
         PgtsError: the part of it that does not fit is named.
     """
-    parts: dict[str, Policy | Critic | Update] = {
-        "policy": training.policy,
-        "critic": training.critic,
-        "update": training.update,
-    }
-    check_keys("the saved state", state, {"searches", "model_check", *parts, *COUNTERS})
+    learned, check = _learned(parts), parts.model_check
+    check_keys("the saved state", state, {*learned, "searches", "model_check", *COUNTERS})
     for name in COUNTERS:
         check_count(name, state[name], least=0)
-    before = {name: part.state_dict() for name, part in parts.items()}
+    before = {name: part.state_dict() for name, part in learned.items()}
     try:
-        for name, part in parts.items():
-            take_over(name, state[name], part.load_state_dict, part.state_dict)
-        training.update.check(training.policy)
-        _restore_search(training, state["searches"])
-        check = training.model_check
-        take_over("model_check", state["model_check"], check.load_state_dict, check.state_dict, is_all=False)
+        for name, part in learned.items():
+            load_checked(name, state[name], part.load_state_dict, part.state_dict)
+        parts.update.check(parts.policy)
+        _restore_search(parts, ranks, state["searches"])
+        load_checked("model_check", state["model_check"], check.load_state_dict, check.state_dict, is_all=False)
     except PgtsError:
-        for name, part in parts.items():
+        for name, part in learned.items():
             part.load_state_dict(before[name])
         raise
-    for name in COUNTERS:
-        setattr(training, name, state[name])
+    return state["num_iterations"], state["num_env_steps"], state["num_model_calls"]
 
 
-def _search_state(training: Training) -> dict[str, Any]:
+def _learned(parts: Parts) -> dict[str, Policy | Critic | Update]:
+    return {"policy": parts.policy, "critic": parts.critic, "update": parts.update}
+
+
+def _search_state(parts: Parts) -> dict[str, Any]:
     """The state of this rank's search, and its upper bounds."""
-    if training.search is None or training.certificates is None:
+    if parts.search is None or parts.certificates is None:
         return {}
-    with_states = isinstance(training.world, ModelWorld) and training.world.keeps_numbers
-    upper = training.certificates.state_dict(with_states=with_states)
-    return {**training.search.state_dict(with_states=with_states), "upper": upper}
+    with_states = isinstance(parts.world, ModelWorld) and parts.world.keeps_numbers
+    upper = parts.certificates.state_dict(with_states=with_states)
+    return {**parts.search.state_dict(with_states=with_states), "upper": upper}
 
 
-def _restore_search(training: Training, searches: Any) -> None:
+def _restore_search(parts: Parts, ranks: Ranks, searches: Any) -> None:
     """Load the state of this rank's search."""
     if not isinstance(searches, Mapping) or set(searches) != set(range(len(searches))) or not searches:
         raise PgtsError("the saved state of searches is not one of each rank")
-    rank, search, certificates = training.ranks.rank % len(searches), training.search, training.certificates
+    rank, search, certificates = ranks.rank % len(searches), parts.search, parts.certificates
     if search is None or certificates is None:
         return
 
@@ -109,23 +89,13 @@ def _restore_search(training: Training, searches: Any) -> None:
         search.load_state_dict(state)
         certificates.load_state_dict(state["upper"])
 
-    take_over(f"searches.{rank}", searches[rank], load, lambda: _search_state(training), has_bounds=True)
+    load_checked(f"searches.{rank}", searches[rank], load, lambda: _search_state(parts), has_bounds=True)
 
 
 def load_training(
     path: str | Path, make: type[T], *, env: Any, device: torch.device | str | None, trust_imports: bool
 ) -> T:
-    """The training in a file that holds its arguments and its state.
-
-    Args:
-        make: its class.
-        env: the environment, where it was given to the saved training as an object; else None.
-        device: where to load it; None: the device it was saved from.
-        trust_imports: whether the module that the id of its environment may name is imported.
-
-    Raises:
-        PgtsError: as `PGTS.load`.
-    """
+    """Return the model in a file that holds its arguments and its state, as `PGTS.load`; `make` is its class."""
     content = saving.read(path)
     if content.keys() - {"notes"} != {"arguments", "state"}:
         raise PgtsError(f"{path} holds {sorted(map(str, content))}, not a model")
@@ -142,13 +112,13 @@ def load_training(
         check_imports(path, saved_env, arguments.get("env_kwargs"))
     arguments |= {"env": saved_env if env is None else env} | ({} if device is None else {"device": str(device)})
     try:
-        training = make(**arguments)
+        model = make(**arguments)
     except NO_STATE as error:
         if isinstance(error, PgtsError):
             raise
         raise PgtsError(f"{path}: its arguments make no model: {type(error).__name__}: {error}") from error
     try:
-        restore(training, content["state"])
+        model.load_state_dict(content["state"])
     except PgtsError as error:
         raise PgtsError(f"{path}: {error}") from error
-    return training
+    return model

@@ -15,7 +15,7 @@ from pgts_torch.errors import PgtsError
 
 _NAME = b"pgts_torch "
 _HEADER = re.compile(re.escape(_NAME) + rb"(\d{1,9})\n")
-_FORMAT, _FORMAT_0_1 = 5, 3
+_FORMAT, _FORMAT_0_1 = 6, 3
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -72,22 +72,22 @@ def sealed(payload: bytes, number: int = _FORMAT) -> bytes:
 
 
 def _seal(number: int, payload: bytes) -> bytes:
-    """The SHA-256 of a file: of its format too, except before format 5."""
-    start = _NAME + b"%d\n" % number if number >= _FORMAT else b""
+    """The SHA-256 of a file: of its format too, but not in version 0.1."""
+    start = b"" if number == _FORMAT_0_1 else _NAME + b"%d\n" % number
     seal = hashlib.sha256(start)
     seal.update(payload)
     return seal.digest()
 
 
 def _upgrade(content: dict[str, Any]) -> None:
-    """What version 0.1 did not save, as in a model that has not seen anything yet."""
+    """Add what version 0.1 did not save, as in a model that has not seen anything yet, and rename what it did."""
     state = content.get("state")
     if isinstance(state, dict):
-        state["model_check"] = {"contradictions": 0, "model_calls": 0, "said": [], "frequencies": {}}
+        state["model_check"] = {"contradictions": 0, "model_calls": 0, "warned": [], "frequencies": {}}
         searches = state.get("searches")
         for search in searches.values() if isinstance(searches, dict) else ():
-            if isinstance(search, dict) and "choices" in search:
-                search["upper"] = {}
+            if isinstance(search, dict) and {"choices", "asked", "lists"} <= search.keys():
+                search |= {"upper": {}, "queried": search.pop("asked"), "enumerates": search.pop("lists")}
 
 
 def _parse(payload: bytes, path: str | Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ NO_STATE = (KeyError, TypeError, ValueError, AttributeError, IndexError, Runtime
 """The errors that code raises on plain values of an unexpected form."""
 
 
-def take_over(
+def load_checked(
     name: str,
     state: Any,
     load: Callable[[Any], object],

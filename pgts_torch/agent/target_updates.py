@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
-from pgts_torch.agent.neural_updates import Batch, Move, NetworkUpdate, divergence, log_probs, mean, passes
+from pgts_torch.agent.neural_updates import Move, NetworkUpdate, divergence, log_probs, mean, passes
 from pgts_torch.options.updates import CMPO, Mirror
 
 
@@ -27,21 +28,21 @@ class TargetUpdate(NetworkUpdate):
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
         """Return step(s, a)."""
 
-    def move(self, network: Network, batch: Batch, generator: torch.Generator) -> Move:
+    def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
         """Losses: policy, mean_s w(s) KL(target || pi) after the steps; grad_norm, mean over the steps, unclipped.
 
         Where step(s, a) is 0 everywhere no gradient step is taken, because Adam would turn rounding errors into one.
         """
-        old_NA, exponent_NA = log_probs(network, batch.input_N), self.exponent(batch)
+        old_NA, exponent_NA = log_probs(network, input_N), self.exponent(batch)
         if not bool(exponent_NA.any()):
             return Move(old_NA, old_NA, {"policy": 0.0, "grad_norm": 0.0})
         target_NA = (old_NA + exponent_NA).log_softmax(-1)
         weight_N = batch.weight_N / batch.weight_N.mean()
-        columns, norms = (batch.input_N, target_NA, weight_N), []
+        columns, norms = (input_N, target_NA, weight_N), []
         made = passes(network, columns, self.options.num_epochs, self.options.minibatch_size, generator)
         for log_NA, (_, part_NA, part_N) in made:
             norms.append(self.step(network, mean(part_N, divergence(part_NA, log_NA))))
-        new_NA = log_probs(network, batch.input_N)
+        new_NA = log_probs(network, input_N)
         after = float(mean(weight_N, divergence(target_NA, new_NA)))
         return Move(old_NA, new_NA, {"policy": after, "grad_norm": sum(norms) / len(norms)})
 

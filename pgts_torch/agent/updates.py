@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy
 from pgts_torch.errors import PgtsError
 from pgts_torch.options.fields import limit
@@ -29,24 +30,8 @@ class Update(ABC):
     policies: ClassVar[tuple[type[Policy], ...]]
 
     @abstractmethod
-    def __call__(
-        self,
-        policy: Policy,
-        observation_N: Tensor,
-        advantage_NA: Float[Tensor, "N A"],
-        weight_N: Float[Tensor, "N"],
-        *,
-        generator: torch.Generator,
-        noise: float = 0.0,
-    ) -> dict[str, float]:
-        """Change pi(.|o) along the advantages of all actions, in place. Return losses and diagnostics, by name.
-
-        Args:
-            observation_N: the observations in N visited states.
-            advantage_NA: (T^m Q)(s, a) - <pi, T^m Q>(s) (`ascent.centred`), or sampled ones.
-            weight_N: w(s).
-            noise: the standard error of the advantages, in reward units; normalised steps divide by at least this.
-        """
+    def __call__(self, policy: Policy, batch: Batch, *, generator: torch.Generator) -> dict[str, float]:
+        """Change pi(.|o) along the advantages of all actions, in place. Return losses and diagnostics, by name."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the optimiser, as tensors on the CPU and plain values; empty where there is none."""
@@ -75,35 +60,19 @@ class TabularUpdate(Update):
 
     step_size: float
 
-    def __call__(
-        self,
-        policy: Policy,
-        observation_N: Tensor,
-        advantage_NA: Float[Tensor, "N A"],
-        weight_N: Float[Tensor, "N"],
-        *,
-        generator: torch.Generator,
-        noise: float = 0.0,
-    ) -> dict[str, float]:
+    def __call__(self, policy: Policy, batch: Batch, *, generator: torch.Generator) -> dict[str, float]:
         """Take the step. It uses no random numbers and has no losses.
 
         Raises:
             NotFinite: step_size w(s) adv(s, a) is not finite for the best action of a state, or the next policy is not.
         """
-        step_NA = self.step_size * weight_N[:, None] * advantage_NA
-        check_finite("advantage", "the step along the advantages", step_NA, observation_N)
-        self.step(policy, observation_N, advantage_NA, weight_N, noise)
+        step_NA = self.step_size * batch.weight_N[:, None] * batch.advantage_NA
+        check_finite("advantage", "the step along the advantages", step_NA, batch.observation_N)
+        self.step(policy, batch.observation_N, batch.advantage_NA, batch.weight_N, batch.noise)
         return {}
 
     @abstractmethod
-    def step(
-        self,
-        policy: Policy,
-        state_N: Int[Tensor, "N"],
-        q_NA: Float[Tensor, "N A"],
-        weight_N: Float[Tensor, "N"],
-        noise: float = 0.0,
-    ) -> None:
+    def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         """Change pi(.|s) in N distinct states along q(s, .), which may have any constant added in each state."""
 
 

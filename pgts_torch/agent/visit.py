@@ -4,15 +4,12 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.ranks import Draws, Ranks
-from pgts_torch.agent.rollout import Horizon, Rollout, rollout
+from pgts_torch.agent.rollout import COLUMNS, Horizon, Rollout, rollout
 from pgts_torch.agent.world import ModelWorld, World
-
-_COLUMNS = ("action_TB", "reward_TB", "discount_TB", "alive_TB", "weight_TB", "survival_TB")
 
 
 def visit(world: World, policy: Policy, horizon: Horizon, draws: Draws, ranks: Ranks) -> Rollout:
@@ -32,28 +29,22 @@ def visit(world: World, policy: Policy, horizon: Horizon, draws: Draws, ranks: R
         return make()
     parts = ranks.gather("episodes", lambda: _sent(world, make()))
     length = max(len(part["alive_TB"]) for part in parts)
-    columns = {
-        name: torch.cat([_padded(part[name], length) for part in parts], 1).to(world.device) for name in _COLUMNS
-    }
+    columns = {name: torch.cat([_padded(part[name], length) for part in parts], 1).to(world.device) for name in COLUMNS}
     observation_UB = torch.cat([_extended(part["observations"], length) for part in parts], 1).to(world.device)
     state_UB = None
     if isinstance(world, ModelWorld):
         world.reset_numbers()  # this rank's own numbers are replaced by those that all ranks have in common
-        state_UB = torch.cat([_extended(_adopted(world, part), length) for part in parts], 1)
+        numbered = (world.adopt(part["states"]).view(len(part["alive_TB"]) + 1, -1) for part in parts)
+        state_UB = torch.cat([_extended(part_UB, length) for part_UB in numbered], 1)
     return Rollout(observation_UB, **columns, state_UB=state_UB)
 
 
 def _sent(world: World, made: Rollout) -> dict[str, Any]:
     """The episodes of this rank as a dict that pickles, with states in a form that another rank can number."""
-    columns = {name: getattr(made, name).cpu() for name in _COLUMNS}
+    columns = {name: getattr(made, name).cpu() for name in COLUMNS}
     if isinstance(world, ModelWorld) and made.state_UB is not None:
         columns["states"] = world.export(made.state_UB.flatten())
     return {"observations": made.observation_UB.cpu(), **columns}
-
-
-def _adopted(world: ModelWorld, part: dict[str, Any]) -> Int[Tensor, "U B"]:
-    """The states of another rank's episodes, as numbered in this process."""
-    return world.adopt(part["states"]).view(len(part["alive_TB"]) + 1, -1)
 
 
 def _extended(x_UB: Tensor, length: int) -> Tensor:

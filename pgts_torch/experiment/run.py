@@ -20,7 +20,7 @@ from pgts_torch.agent.evaluate import Score, evaluate
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.ranks import joined_ranks
-from pgts_torch.agent.states import check_keys, take_over
+from pgts_torch.agent.states import check_keys, load_checked
 from pgts_torch.config import Config
 from pgts_torch.config.sections import EvalConfig
 from pgts_torch.errors import Failed, ModelMismatch, NotFinite, PgtsError, Stopped, check_count, failure
@@ -244,7 +244,7 @@ class _Recorder:
         notes, progress = start.notes, start.notes.progress
         check_keys("progress", progress, {"ended_by", "depth", "certificate", "seconds", "evaluations", "movement"})
         plain = {name: value for name, value in progress.items() if name != "movement"}
-        take_over("progress", plain, self._take, lambda: plain)
+        load_checked("progress", plain, self._take, lambda: plain)
         self.movement.load_state_dict(progress["movement"])
         self._saved_at = notes.env_steps
         if start.lost_best:
@@ -264,7 +264,7 @@ class _Recorder:
         for kind, evaluation in self._evaluations.items():
             if kind in evaluations:
                 state = evaluations[kind]
-                take_over(f"evaluations.{kind}", state, evaluation.load_state_dict, evaluation.state_dict)
+                load_checked(f"evaluations.{kind}", state, evaluation.load_state_dict, evaluation.state_dict)
 
     def _scores(self, kind: str, step: int) -> Iterator[tuple[str, float]]:
         """The tags of the evaluation made at this step, if there was one."""

@@ -88,8 +88,8 @@ class Search(ABC):
         queried = self.topology.queried.cpu() if with_states and self.topology is not None else torch.empty(0).long()
         return {
             "choices": {name: getattr(self, name) for name in self.choices},
-            "lists": self.topology is not None,
-            "asked": queried,
+            "enumerates": self.topology is not None,
+            "queried": queried,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -100,14 +100,14 @@ class Search(ABC):
             PgtsError: it is that of another search.
         """
         self.check_choices(state["choices"])
-        if state["asked"].dtype != torch.int64 or state["asked"].ndim != 1:
-            raise PgtsError("asked is no list of states")
+        if state["queried"].dtype != torch.int64 or state["queried"].ndim != 1:
+            raise PgtsError("queried is no list of states")
         for name in self.choices:
             setattr(self, name, state["choices"][name])
-        if not state["lists"]:
+        if not state["enumerates"]:
             self.topology = None
         elif self.topology is not None:
-            self.topology.preload(state["asked"].to(self.model.device))
+            self.topology.preload(state["queried"].to(self.model.device))
 
     def check_choices(self, choices: Mapping[str, Any]) -> None:
         """PgtsError unless earlier searches can have chosen this."""

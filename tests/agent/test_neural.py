@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pgts_torch.agent import saving
 from pgts_torch.agent.advantages import gae, score_function
+from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate
 from pgts_torch.agent.policies import SimplexPolicy
@@ -290,9 +291,9 @@ def test_a_policy_and_a_critic_can_share_a_trunk():
         # 49 places a picture: the first 8 visits are seen at once by whoever comes first, later ones by the policy.
         assert float(encoder.norm.count) == 49 * (8 + 3 * k)
         assert float(alone.network.trunk.encoder.norm.count) == 49 * 8 * (k + 1)
-        update(policy, images_S[states], torch.zeros(3, 2), torch.ones(3), generator=generator)
+        update(policy, Batch(images_S[states], torch.zeros(3, 2), torch.ones(3)), generator=generator)
     before_S = alone.v(images_S)
-    update(policy, images_S[states], torch.eye(3)[:, :2], torch.ones(3), generator=generator)
+    update(policy, Batch(images_S[states], torch.eye(3)[:, :2], torch.ones(3)), generator=generator)
     assert torch.equal(alone.v(images_S), before_S)
 
 

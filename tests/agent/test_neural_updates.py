@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pgts_torch.agent import saving
 from pgts_torch.agent.advantages import gae, score_function
+from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
 from pgts_torch.agent.optimisers import Optimiser
@@ -75,7 +76,7 @@ def sampled(policy: NetworkPolicy, count: int, seed: int = 0) -> tuple[Tensor, T
 def moved(policy: NetworkPolicy, update: NetworkUpdate, *args: Tensor, seed: int = 0) -> dict[str, Tensor]:
     """By how much each parameter moves."""
     before = policy.state_dict()
-    update(policy, *args, generator=stream(seed, "update"))
+    update(policy, Batch(*args), generator=stream(seed, "update"))
     return {name: value - before[name] for name, value in policy.state_dict().items()}
 
 
@@ -95,7 +96,7 @@ def test_one_gradient_step_of_a_one_hot_network_is_the_tabular_softmax_update():
         weight_N,
     )
     before_SA = table.logits_SA.clone()
-    SoftmaxUpdate(SoftmaxGradient(step_size=0.3))(table, states, q_NA - v_N1, weight_N, generator=generator)
+    SoftmaxUpdate(SoftmaxGradient(step_size=0.3))(table, Batch(states, q_NA - v_N1, weight_N), generator=generator)
     torch.testing.assert_close(step["head.weight"].T, (table.logits_SA - before_SA).float(), atol=1e-6, rtol=1e-4)
     assert step["head.weight"].abs().max() > 0.01
     assert not step["head.weight"].T[[1, 2, 4]].any()
@@ -106,10 +107,10 @@ def test_many_mirror_steps_of_a_one_hot_network_approach_the_tabular_mirror_upda
     states, generator = torch.arange(6), stream(0, "update")
     before_SA = table.table()
     in_reward_units = MirrorUpdate(Mirror(step_size=1 / 0.7, normalize="none", floor="never"))
-    in_reward_units(table, states, q_NA, torch.ones(6, dtype=torch.float64), generator=generator)
+    in_reward_units(table, Batch(states, q_NA, torch.ones(6, dtype=torch.float64)), generator=generator)
     update = NetworkMirrorUpdate(Mirror(temperature=0.7, learning_rate=0.05, num_epochs=600, max_grad_norm="never"))
     # The weights say which states matter when a network cannot have them all; this one can.
-    losses = update(network, states, q_NA, weight_N, generator=generator)
+    losses = update(network, Batch(states, q_NA, weight_N), generator=generator)
     assert losses["policy"] < 1e-6
     torch.testing.assert_close(network.probs(states).double(), table.table(), atol=1e-3, rtol=0)
     assert (table.table() - before_SA).abs().max() > 0.1
@@ -152,7 +153,7 @@ def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo():
 
     update = PPOUpdate(PPO(num_epochs=2, minibatch_size=4, clip_range=0.2, normalize_advantage=False))
     update._optimiser = Step()
-    losses = update(policy, states, advantage_NA, torch.full((4,), 0.25), generator=stream(0, "update"))
+    losses = update(policy, Batch(states, advantage_NA, torch.full((4,), 0.25)), generator=stream(0, "update"))
     assert seen[0][0] == pytest.approx(-(1 + 2 - 1 - 3) / 4)
     assert seen[1][0] == pytest.approx(-(1.2 + 1.2 - 1.4 - 2.4) / 4)
     # Only unclipped terms push: d(rho A) = rho A (onehot - pi), for A = 2 at action 1 and A = -1 at action 0.
@@ -183,7 +184,7 @@ def test_the_clip_fraction_is_the_share_of_actions_whose_ratio_is_out_of_range_b
     update._optimiser = Step()
     advantage_NA = torch.tensor([[1.0, -1.0, -1.0], [1.0, 0.0, -2.0]], dtype=torch.float64)
     weight_N = torch.tensor([1.0, 3.0], dtype=torch.float64)
-    losses = update(policy, torch.arange(2), advantage_NA, weight_N, generator=stream(0, "update"))
+    losses = update(policy, Batch(torch.arange(2), advantage_NA, weight_N), generator=stream(0, "update"))
     assert losses["clip_fraction"] == pytest.approx((1 * 1.0 + 3 * 0.25) / 4)
 
 
@@ -225,7 +226,7 @@ def test_ppo_takes_as_many_steps_as_its_minibatches_and_stops_when_the_policy_ha
         policy = NetworkPolicy(VECTORS, 4, seed=1)
         observation_ND, _, _ = sampled(policy, 70)
         update = PPOUpdate(PPO(learning_rate=0.01, num_epochs=4, minibatch_size=32, target_kl=target_kl))
-        losses = update(policy, observation_ND, *question(70), generator=stream(0, "update"))
+        losses = update(policy, Batch(observation_ND, *question(70)), generator=stream(0, "update"))
         counts.append(losses["num_steps"])
         divergences.append(losses["kl"])
     assert counts[0] == 4 * 3
@@ -252,10 +253,10 @@ def test_an_entropy_bonus_alone_makes_a_policy_uniform(update):
     states, nothing = torch.arange(6), torch.zeros(6, 4, dtype=torch.float64)
     bonus = update(learning_rate=0.1, entropy_coef=0.1)
     for _ in range(150):
-        losses = bonus(policy, states, nothing, torch.ones(6), generator=stream(0, "update"))
+        losses = bonus(policy, Batch(states, nothing, torch.ones(6)), generator=stream(0, "update"))
     assert losses["entropy"] == pytest.approx(math.log(4), abs=1e-3)
     before = policy.state_dict()
-    update(learning_rate=0.1)(policy, states, nothing, torch.ones(6), generator=stream(0, "update"))
+    update(learning_rate=0.1)(policy, Batch(states, nothing, torch.ones(6)), generator=stream(0, "update"))
     torch.testing.assert_close(policy.state_dict(), before, atol=1e-6, rtol=0)
 
 
@@ -265,7 +266,7 @@ def test_an_update_moves_toward_the_better_action(update):
     observation_ND = torch.randn(1, 3, generator=stream(0, "x"))
     before_NA = policy.probs(observation_ND)
     advantage_NA = torch.tensor([[-0.5, 1.0, -0.5]], dtype=torch.float64)
-    losses = update()(policy, observation_ND, advantage_NA, torch.ones(1), generator=stream(0, "update"))
+    losses = update()(policy, Batch(observation_ND, advantage_NA, torch.ones(1)), generator=stream(0, "update"))
     assert policy.probs(observation_ND)[0, 1] > before_NA[0, 1]
     assert losses["kl"] > 0
     assert all(isinstance(value, float | int) for value in losses.values())
@@ -277,7 +278,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_order_others(update):
         policy, each = NetworkPolicy(VECTORS, 4, seed=1), update(learning_rate=0.01)
         for k in range(3):
             observation_ND, _, _ = sampled(policy, 100, seed=k)
-            each(policy, observation_ND, *question(100, seed=k), generator=stream(seed, "update"))
+            each(policy, Batch(observation_ND, *question(100, seed=k)), generator=stream(seed, "update"))
         return policy.state_dict()
 
     first, second, other = trained(0), trained(0), trained(1)
@@ -291,7 +292,7 @@ def test_a_saved_update_goes_on_as_the_first_would_have(update, tmp_path):
     observation_ND, _, _ = sampled(policy, 50)
     first, second, forgetful = update(), update(), update()
     second.load_state_dict(first.state_dict())
-    first(policy, observation_ND, *question(50), generator=stream(0, "update"))
+    first(policy, Batch(observation_ND, *question(50)), generator=stream(0, "update"))
     saving.write(tmp_path / "state", {"policy": policy.state_dict(), "update": first.state_dict()})
     state = saving.read(tmp_path / "state")
     second.load_state_dict(state["update"])
@@ -307,7 +308,7 @@ def test_a_saved_update_goes_on_as_the_first_would_have(update, tmp_path):
 def test_a_state_that_does_not_fit_an_optimiser_is_refused():
     policy, update = NetworkPolicy(VECTORS, 4), GradientUpdate()
     observation_ND, _, _ = sampled(policy, 5)
-    update(policy, observation_ND, *question(5), generator=stream(0, "update"))
+    update(policy, Batch(observation_ND, *question(5)), generator=stream(0, "update"))
     state = update.state_dict()
     for wrong in [{"first_D": state["first_D"]}, state | {"num_steps": 0}, state | {"second_D": torch.zeros(3)}]:
         with pytest.raises(PgtsError, match=r"cannot load|second_D is torch.float32 of shape \(3,\)"):
@@ -316,7 +317,7 @@ def test_a_state_that_does_not_fit_an_optimiser_is_refused():
         GradientUpdate(Gradient(optimizer="sgd")).load_state_dict(state)
     update.load_state_dict({"num_steps": 1, "first_D": torch.zeros(3), "second_D": torch.zeros(3)})
     with pytest.raises(PgtsError, match="has moments of 3 parameters"):
-        update(policy, observation_ND, *question(5), generator=stream(0, "update"))
+        update(policy, Batch(observation_ND, *question(5)), generator=stream(0, "update"))
 
 
 @pytest.mark.parametrize("update", UPDATES)
@@ -329,14 +330,14 @@ def test_what_is_not_finite_moves_nothing_and_is_named(update, value):
     wrong_NA, wrong_N, wrong_ND = advantage_NA.clone(), weight_N.clone(), observation_ND.clone()
     wrong_NA[3, 1] = wrong_N[2] = wrong_ND[1, 1] = value
     with pytest.raises(PgtsError, match=rf"advantage_NA\[3, 1\] is {value}"):
-        update()(policy, observation_ND, wrong_NA, weight_N, generator=generator)
+        update()(policy, Batch(observation_ND, wrong_NA, weight_N), generator=generator)
     with pytest.raises(PgtsError, match=rf"weight_N\[2\] is {value}"):
-        update()(policy, observation_ND, advantage_NA, wrong_N, generator=generator)
+        update()(policy, Batch(observation_ND, advantage_NA, wrong_N), generator=generator)
     with pytest.raises(PgtsError, match="one must be positive"):
-        update()(policy, observation_ND, advantage_NA, 0 * weight_N, generator=generator)
+        update()(policy, Batch(observation_ND, advantage_NA, 0 * weight_N), generator=generator)
     if math.isnan(value):
         with pytest.raises(PgtsError, match="the policy loss is nan"):
-            update()(policy, wrong_ND, advantage_NA, weight_N, generator=generator)
+            update()(policy, Batch(wrong_ND, advantage_NA, weight_N), generator=generator)
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
 
 
@@ -370,7 +371,7 @@ def test_observations_are_seen_after_the_steps_but_for_the_first_batch():
     observation_ND, _, _ = sampled(policy, 50)
     encoder, update = policy.network.trunk.encoder, GradientUpdate(Gradient(learning_rate=1e-12))
     for k, (count, divergence) in enumerate([(50, False), (100, True)]):
-        losses = update(policy, observation_ND * 10**k, *question(50), generator=stream(0, "update"))
+        losses = update(policy, Batch(observation_ND * 10**k, *question(50)), generator=stream(0, "update"))
         assert float(encoder.norm.count) == count
         assert losses["kl"] == pytest.approx(0, abs=1e-6), divergence
 
@@ -395,7 +396,7 @@ def test_a_policy_and_a_critic_learn_from_sampled_actions_alone(update):
         states_V, actions_V = made.state_TB[made.alive_TB], made.action_TB[made.alive_TB]
         advantage_VA = score_function(actions_V, advantage_V, policy.probs(states_V))
         critic.fit(policy, made, generator=generator)
-        update(policy, states_V, advantage_VA, made.visit_weight("visits"), generator=generator)
+        update(policy, Batch(states_V, advantage_VA, made.visit_weight("visits")), generator=generator)
     missing = exact.optimal(mdp).J - returns[0]
     assert returns[-1] - returns[0] > 0.9 * missing > 0.4
 

@@ -11,6 +11,7 @@ from gymnasium.vector import SyncVectorEnv
 from torch import Tensor
 
 from pgts_torch import PGTS
+from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate
 from pgts_torch.agent.optimisers import Optimiser
@@ -222,9 +223,9 @@ def test_a_tabular_step_that_overflows_leaves_the_table_as_it_is(policy, update)
     with pytest.raises(
         NotFinite, match=r"the step along the advantages of state 2 is \[inf, -inf\]; it must be finite"
     ):
-        update(policy, states, advantage_NA, weight_N, generator=stream(0, "update"))
+        update(policy, Batch(states, advantage_NA, weight_N), generator=stream(0, "update"))
     assert torch.equal(policy.table(), before)
-    update(policy, states[:1], advantage_NA[:1] / 1e308, weight_N[:1], generator=stream(0, "update"))
+    update(policy, Batch(states[:1], advantage_NA[:1] / 1e308, weight_N[:1]), generator=stream(0, "update"))
     assert not torch.equal(policy.table(), before)
 
 
@@ -235,7 +236,7 @@ def test_a_direction_that_overflows_leaves_the_table_as_it_is():
     advantage_NA = torch.tensor([[1.7e308, -1.7e308]], dtype=torch.float64)
     with pytest.raises(NotFinite, match=r"the next policy of state 1 is \[inf, .*\]; it must be finite"):
         SoftmaxUpdate(SoftmaxGradient(step_size=0.1))(
-            policy, torch.tensor([1]), advantage_NA, weight_N, generator=stream(0, "update")
+            policy, Batch(torch.tensor([1]), advantage_NA, weight_N), generator=stream(0, "update")
         )
     assert torch.equal(policy.table(), before)
 
@@ -246,7 +247,7 @@ def test_an_action_that_is_not_allowed_may_be_worth_minus_infinity(make, options
     policy, states, weight_N = make(4, 3), torch.tensor([1, 2]), torch.ones(2, dtype=torch.float64)
     advantage_NA = torch.tensor([[0.0, -math.inf, -math.inf], [1.0, -1.0, -math.inf]], dtype=torch.float64)
     MirrorUpdate(Mirror(step_size=1.0, **options))(
-        policy, states, advantage_NA, weight_N, generator=stream(0, "update")
+        policy, Batch(states, advantage_NA, weight_N), generator=stream(0, "update")
     )
     assert policy.table()[1].tolist() == [1.0, 0.0, 0.0]
     # State 2: pi is (1/2, 1/2) on what is allowed. The mean over both states of sum_a pi A^2, pi = 1/3, is 1/3.
@@ -256,7 +257,7 @@ def test_an_action_that_is_not_allowed_may_be_worth_minus_infinity(make, options
     assert torch.equal(policy.table()[[0, 3]], make(4, 3).table()[[0, 3]])
     with pytest.raises(NotFinite, match=r"the step along the advantages of state 1 is \[-inf, -inf, -inf\]"):
         MirrorUpdate(Mirror(step_size=1.0))(
-            policy, states, advantage_NA.fill_(-math.inf), weight_N, generator=stream(0, "update")
+            policy, Batch(states, advantage_NA.fill_(-math.inf), weight_N), generator=stream(0, "update")
         )
 
 
@@ -265,7 +266,7 @@ def test_the_softmax_gradient_leaves_an_action_that_is_not_allowed_and_never_tak
     policy.logits_SA[1] = torch.tensor([0.0, 0.0, -math.inf])
     advantage_NA = torch.tensor([[1.0, -1.0, -math.inf]], dtype=torch.float64)
     SoftmaxUpdate(SoftmaxGradient(step_size=0.5))(
-        policy, torch.tensor([1]), advantage_NA, weight_N, generator=stream(0, "update")
+        policy, Batch(torch.tensor([1]), advantage_NA, weight_N), generator=stream(0, "update")
     )
     # pi = (1/2, 1/2, 0), so the direction is pi A = (1/2, -1/2, 0).
     assert policy.logits_SA[1].tolist() == [0.25, -0.25, -math.inf]
@@ -315,6 +316,6 @@ def test_steps_of_a_network_that_overflow_are_taken_back(learning_rate, what):
     before = policy.state_dict()
     question = torch.ones(2, 3), torch.tensor([[1.0, -1.0], [2.0, -2.0]]), torch.ones(2)
     with pytest.raises(NotFinite) as caught:
-        update(policy, *question, generator=stream(0, "update"))
+        update(policy, Batch(*question), generator=stream(0, "update"))
     assert caught.value.what == what
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())

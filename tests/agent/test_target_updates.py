@@ -6,6 +6,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
+from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.target_updates import CMPOUpdate, advantage_scale
 from pgts_torch.errors import PgtsError
@@ -30,7 +31,7 @@ def question(num_states: int = 4, num_actions: int = 3) -> tuple[torch.Tensor, t
 def after(advantage_NA: torch.Tensor, weight_N: torch.Tensor, noise: float = 0.0, **options) -> torch.Tensor:
     """The probabilities after one update."""
     made, states = policy(), torch.arange(4)
-    CMPOUpdate(CMPO(**options))(made, states, advantage_NA, weight_N, generator=stream(0, "update"), noise=noise)
+    CMPOUpdate(CMPO(**options))(made, Batch(states, advantage_NA, weight_N, noise), generator=stream(0, "update"))
     return made.probs(states)
 
 

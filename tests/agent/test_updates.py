@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate
 from pgts_torch.errors import PgtsError
@@ -62,7 +63,7 @@ def test_an_update_is_the_exact_formula_at_the_visited_states(update, kind, step
 def test_an_update_is_one_step_and_draws_nothing(update, kind, step):
     called, stepped = random_policy(kind), random_policy(kind)
     generator = stream(0, "untouched")
-    assert update()(called, STATES, *question(), generator=generator) == {}
+    assert update()(called, Batch(STATES, *question()), generator=generator) == {}
     update().step(stepped, STATES, *question())
     assert torch.equal(called.table(), stepped.table())
     assert torch.equal(generator.get_state(), stream(0, "untouched").get_state())
@@ -150,7 +151,7 @@ def moved(update: MirrorUpdate, advantage: list[list[float]], logits: list[list[
     policy.load_state_dict({"logits_SA": torch.tensor(logits, dtype=torch.float64)})
     before_SA = policy.logits_SA.clone()
     advantage_NA = torch.tensor(advantage, dtype=torch.float64)
-    update(policy, torch.arange(len(logits)), advantage_NA, torch.ones(len(logits)), generator=None, noise=noise)
+    update(policy, Batch(torch.arange(len(logits)), advantage_NA, torch.ones(len(logits)), noise), generator=None)
     change_SA = policy.logits_SA - before_SA
     return (change_SA - change_SA[:, :1])[:, 1:].tolist()
 
@@ -187,7 +188,7 @@ def test_an_action_that_is_not_allowed_stays_so():
     policy = SimplexPolicy(1, 3)
     policy.load_state_dict({"probs_SA": torch.tensor([[0.5, 0.5, 0.0]], dtype=torch.float64)})
     advantage_NA = torch.tensor([[1.0, -1.0, -math.inf]], dtype=torch.float64)
-    MirrorUpdate()(policy, torch.arange(1), advantage_NA, torch.ones(1), generator=None)
+    MirrorUpdate()(policy, Batch(torch.arange(1), advantage_NA, torch.ones(1)), generator=None)
     assert policy.probs_SA[0, 2] == 0
     assert policy.probs_SA[0, 0] > policy.probs_SA[0, 1] > 0
 

@@ -138,7 +138,7 @@ def test_a_pickle_is_not_executed_even_where_the_checksum_is_right(tmp_path):
 def test_another_format_is_named(tmp_path):
     [path] = written(tmp_path, 10)
     path.write_bytes(saving.sealed(b"what a later version writes", 7))
-    with pytest.raises(PgtsError, match="has the format 7; this version of pgts_torch reads 5") as raised:
+    with pytest.raises(PgtsError, match="has the format 7; this version of pgts_torch reads 6") as raised:
         checkpoint.read(path)
     assert not isinstance(raised.value, Damaged)
 

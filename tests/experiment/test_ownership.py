@@ -136,6 +136,10 @@ def age(folder: Path) -> None:
         content, earlier = saving.read(path), path.with_suffix("")
         notes = content.pop("notes")
         notes["metrics_bytes"] = notes.pop("files")["metrics.jsonl"][0]
+        del content["state"]["model_check"]
+        for search in content["state"]["searches"].values():
+            del search["upper"]
+            search |= {"asked": search.pop("queried"), "lists": search.pop("enumerates")}
         raw = saving.sealed(dumped(content), 3)
         path.unlink()
         earlier.mkdir()
