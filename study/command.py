@@ -25,7 +25,7 @@ DOTS_PER_INCH = 110
 WIDTH = 79
 
 CURVES = {one.FIGURE.name: one.FIGURE for one in (ladder, random_mdp, tightrope, grid)}
-_PICTURES = {"depth": ("depth", "mirage")}
+PICTURES = {"depth": ("depth", "mirage")}
 """By part, where they are not named as the part is."""
 OTHERS = {"stationary": sets.compute, "depth": depth.compute}
 
@@ -44,7 +44,7 @@ def run(*, only: str | None, effort: Effort, out: Path) -> dict[str, Any]:
     before = stored(folder)  # what cannot be read is better known now than after all the work
     page = files.target(out / "reproduction.md", is_document, "a document of python -m study")
     for name in PARTS if only is None else (only,):
-        for picture in _PICTURES.get(name, (name,)):
+        for picture in PICTURES.get(name, (name,)):
             files.target(folder / f"{picture}.png", lambda _: name in before, f"a picture of figures/{name}.json")  # noqa: B023
     started = time.perf_counter()
 

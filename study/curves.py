@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Self
 
 import torch
 from jaxtyping import Float
@@ -18,6 +19,9 @@ from study.batch import Batch, Cells, Iterate, Step
 
 ARRIVED = 0.99
 """A return has arrived when it has made this share of the way from J^{pi_0} to J*."""
+
+STARTS: dict[str, int | None] = {"s0": 0, "uniform": None}
+"""The start distributions of the figures, as the functions of the zoo take them."""
 
 Watch = Callable[[Iterate], Mapping[str, Tensor]]
 """Numbers, one for each of the B settings, that are to be remembered of an iterate."""
@@ -40,6 +44,35 @@ class Trace:
     def arrival(self) -> int | None:
         """The first iteration with ARRIVED of the way made."""
         return first(self.progress_K >= ARRIVED)
+
+    def arrives_before(self, other: Self) -> bool:
+        """Whether this one arrives, and sooner than the other, which may not arrive at all."""
+        return self.arrival is not None and (other.arrival is None or self.arrival < other.arrival)
+
+    @property
+    def rounding(self) -> float:
+        """What float64 may lose in a return."""
+        return 1e-9 * max(1.0, float(self.J_K.abs().max()), abs(self.J_optimal))
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether the return never moves: by nothing but rounding."""
+        return bool((self.J_K - self.J_K[0]).abs().max() <= self.rounding)
+
+    @property
+    def dips(self) -> bool:
+        """Whether the return is at some time below that of the initial policy."""
+        return bool(self.J_K.min() < self.J_K[0] - self.rounding)
+
+    @property
+    def largest_fall(self) -> float:
+        """The largest fall of the return in one iteration, at least 0."""
+        return max(0.0, -float(self.J_K.diff().min()))
+
+    @property
+    def is_monotone(self) -> bool:
+        """Whether the return never falls by more than rounding."""
+        return bool(self.J_K.diff().min() >= -self.rounding)
 
 
 def first(mask_K: Tensor) -> int | None:
@@ -112,5 +145,4 @@ def cells(settings: Sequence[tuple[int, float]], pi_SA: Float[Tensor, "S A"]) ->
 
 def initial_policy(mdp: TabularMDP, init: Description) -> Float[Tensor, "S A"]:
     """The policy that a description like {"type": "biased", "action": 0, "probability": 1.0} names."""
-
     return SimplexPolicy(mdp.num_states, mdp.num_actions, Simplex.model_validate({"init": init})).table()

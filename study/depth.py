@@ -11,8 +11,8 @@ import torch
 from pgts_torch.agent.build import Description
 from pgts_torch.tabular import TabularMDP, exact, grid, ladder, mirage, random_mdp, tightrope
 from study.claims import Claim, Finding, judge
-from study.curves import ARRIVED, arrivals, first, initial_policy, trace
-from study.figure import STARTS, Effort, Parameter, Report
+from study.curves import ARRIVED, STARTS, arrivals, first, initial_policy, trace
+from study.figure import Effort, Parameter, Report
 from study.ladder import ALWAYS_LEFT
 from study.random_mdp import UNIFORM
 
@@ -77,7 +77,6 @@ class Map:
     steps: Sequence[float]
     iterations: list[list[float | None]]
     limit: int
-    drawn: int
 
     def against_pg(self) -> tuple[int, int, int]:
         """In how many cells with m >= 1 that depth is faster than, as fast as, and slower than m = 0."""
@@ -117,11 +116,11 @@ def _map(family: Family, start: str, scale: Scale) -> Map:
         pi_SA = initial_policy(mdp, family.init)
         if exact.optimal(mdp).J - exact.evaluate(mdp, pi_SA).J > 1e-9:  # else there is nowhere to go
             found.append(arrivals(mdp, pi_SA, depths=family.depths, steps=scale.steps, limit=limit))
-    iterations = [[_median([one[m, step] for one in found]) for step in scale.steps] for m in family.depths]
-    return Map(family.name, start, family.depths, scale.steps, iterations, limit, len(found))
+    iterations = [[median([one[m, step] for one in found]) for step in scale.steps] for m in family.depths]
+    return Map(family.name, start, family.depths, scale.steps, iterations, limit)
 
 
-def _median(arrived: Sequence[int | None]) -> float | None:
+def median(arrived: Sequence[int | None]) -> float | None:
     """The median; None if that run did not arrive."""
     middle = statistics.median(map(_or_infinite, arrived))
     return None if middle == float("inf") else middle
@@ -163,19 +162,19 @@ def _advantage(mdp: TabularMDP, q_SA: torch.Tensor, m: int) -> float:
 
 def _claims(maps: Sequence[Map], mirage_data: Mapping[str, Any]) -> list[Claim]:
     return [
-        judge("Depth m >= 1 converges in fewer iterations than PG", "Sec. 1; Sec. 4, question 2", map(_faster, maps)),
-        judge("More depth never takes more iterations", "Sec. 4, question 2", [_never_slower(mirage_data)]),
-        judge("With infinite depth and step size, S iterations suffice", "Sec. 4, question 2", _in_S_iterations()),
+        judge("Depth m >= 1 converges in fewer iterations than PG", "Sec. 1; Sec. 4, question 2", map(faster, maps)),
+        judge("More depth never takes more iterations", "Sec. 4, question 2", [never_slower(mirage_data)]),
+        judge("With infinite depth and step size, S iterations suffice", "Sec. 4, question 2", in_S_iterations()),
     ]
 
 
-def _faster(one: Map) -> Finding:
+def faster(one: Map) -> Finding:
     faster, equal, slower = one.against_pg()
     text = f"{one.mdp} from {one.start}: faster in {faster}, equal in {equal}, slower in {slower} cells"
     return Finding({"MDP": one.mdp, "start": one.start}, text, faster > 0 and slower == 0)
 
 
-def _never_slower(data: Mapping[str, Any]) -> Finding:
+def never_slower(data: Mapping[str, Any]) -> Finding:
     arrived = {m: _or_infinite(k) for m, k in data["arrival"].items()}
     text = "on the mirage MDP, arrival (iteration): " + ", ".join(
         f"{k} for m = {m}" for m, k in arrived.items() if m in ("0", "5", "50")
@@ -184,7 +183,7 @@ def _never_slower(data: Mapping[str, Any]) -> Finding:
     return Finding({}, text, all(late <= early for early, late in itertools.pairwise(times)))
 
 
-def _in_S_iterations() -> list[Finding]:
+def in_S_iterations() -> list[Finding]:
     found = []
     for family in FAMILIES:
         if family.random:

@@ -200,6 +200,6 @@ def mean_interval(values: Sequence[float], *names: str | int) -> tuple[float, fl
         names: of the stream that resamples.
     """
     given = np.asarray(values, dtype=float)
-    draws = numpy_stream(0, "mean_interval", *names).integers(0, len(given), size=(1000, len(given)))
-    low, high = np.quantile(given[draws].mean(1), [0.025, 0.975])
+    resampled = numpy_stream(0, "mean_interval", *names).integers(0, len(given), size=(1000, len(given)))
+    low, high = np.quantile(given[resampled].mean(1), [0.025, 0.975])
     return float(given.mean()), float(low), float(high)

@@ -12,7 +12,7 @@ from pgts_torch.tabular import TabularMDP, random_mdp, stationary_sets
 
 @dataclass(frozen=True)
 class FamilyRow:
-    """One random MDP: how it was drawn, how it is connected, and what its stationary policies are like.
+    """One random MDP: how it was sampled, how it is connected, and what its stationary policies are like.
 
     diameter: the largest finite shortest path between two states, in steps.
     sufficient_depth: the smallest M with Pi^M = Pi^inf.

@@ -1,4 +1,4 @@
-"""One figure of the paper: what it shows, computed exactly and from samples, and the readings it can be held to."""
+"""One figure of the paper: what it shows, computed exactly and from samples."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -12,11 +12,10 @@ from pgts_torch.agent.build import Description
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.ascent import projected_step, softmax_step
 from pgts_torch.tabular.mdp import TabularMDP
-from study.claims import Claim, Finding, Reading
-from study.curves import Trace, Watch, initial_policy, trace
+from study.claims import Claim
+from study.curves import STARTS, initial_policy, trace
 from study.sampled import Job, band, returns
 
-STARTS: dict[str, int | None] = {"s0": 0, "uniform": None}
 STEPS = {"projected": projected_step, "softmax": softmax_step}
 
 Report = Callable[[str], None]
@@ -89,7 +88,7 @@ def finish(figure: Figure, effort: Effort, pending: Pending, report: Report) -> 
     """The plain data of a figure: curves, parameters and checked statements."""
     report(f"{figure.name}: exact curves and statements")
     claims = figure.claims(effort.quick)
-    panels = [_panel(figure, update, start) for update in figure.moves for start in STARTS]
+    panels = [panel(figure, update, start) for update in figure.moves for start in STARTS]
     results = []
     for done, (_, future) in enumerate(pending, 1):
         results.append(future.result())
@@ -107,7 +106,7 @@ def finish(figure: Figure, effort: Effort, pending: Pending, report: Report) -> 
     }
 
 
-def _panel(figure: Figure, update: str, start: str) -> dict[str, Any]:
+def panel(figure: Figure, update: str, start: str) -> dict[str, Any]:
     mdp, move = figure.make(start=STARTS[start]), figure.moves[update]
     traces = trace(
         mdp,
@@ -167,109 +166,3 @@ def _add_bands(panels: list[dict[str, Any]], keys: list[tuple[str, str, int]], r
 def _rounded(values: list[float]) -> list[float]:
     """Six digits: the data are read by people and kept in version control."""
     return [float(f"{value:.6g}") for value in values]
-
-
-# Readings
-
-
-@dataclass(frozen=True)
-class Run:
-    """Algorithm 1 at several depths under one reading of what the paper leaves unsaid, from one start."""
-
-    reading: Reading
-    start: str
-    mdp: TabularMDP
-    traces: Mapping[int, Trace]
-
-
-def study(
-    make: Callable[..., TabularMDP],
-    variants: Sequence[tuple[Reading, Mapping[str, Any]]],
-    *,
-    init: Description,
-    depths: Sequence[int],
-    steps: Sequence[float],
-    iterations: int,
-    watch: Watch | None = None,
-    starts: Sequence[str] = tuple(STARTS),
-) -> list[Run]:
-    """Exact runs for every variant of the MDP, start distribution and step size; those of the figure first.
-
-    Args:
-        variants: each a reading and the arguments of `make` that go with it.
-    """
-    runs = []
-    for reading, kwargs in variants:
-        for start in starts:
-            mdp = make(start=STARTS[start], **kwargs)
-            pi_SA = initial_policy(mdp, init)
-            found = trace(mdp, pi_SA, depths=depths, steps=steps, iterations=iterations, watch=watch)
-            for step in steps:
-                traces = {depth: found[depth, step] for depth in depths}
-                runs.append(Run({**reading, "step size": step}, start, mdp, traces))
-    return runs
-
-
-def arrivals_text(traces: Mapping[int, Trace]) -> str:
-    """`arrival (iteration): 53 for m = 0, never for m = 1`."""
-    times = (f"{'never' if run.arrival is None else run.arrival} for m = {depth}" for depth, run in traces.items())
-    return "arrival (iteration): " + ", ".join(times)
-
-
-def arrives_before(early: Trace, late: Trace) -> bool:
-    """Whether `early` arrives, and sooner than `late`, which may not arrive at all."""
-    return early.arrival is not None and (late.arrival is None or early.arrival < late.arrival)
-
-
-def stuck(run: Trace) -> bool:
-    """Whether the return never moves: by nothing but rounding."""
-    return bool((run.J_K - run.J_K[0]).abs().max() <= rounding(run))
-
-
-def monotone(run: Trace) -> bool:
-    """Whether the return never falls by more than rounding."""
-    return bool(run.J_K.diff().min() >= -rounding(run))
-
-
-def dips(run: Trace) -> bool:
-    """Whether the return is at some time below that of the initial policy."""
-    return bool(run.J_K.min() < run.J_K[0] - rounding(run))
-
-
-def rounding(run: Trace) -> float:
-    """What float64 may lose in a return."""
-    return 1e-9 * max(1.0, float(run.J_K.abs().max()), abs(run.J_optimal))
-
-
-SIMILAR = 0.1
-"""Similar are curves that no iteration sets apart by more than this share of the way from J^{pi_0} to J*, or, by the
-other reading, arrivals that differ by no more than this share, or by one iteration."""
-
-
-def similar(reading: Reading, traces: Mapping[int, Trace]) -> list[Finding]:
-    """Whether m = 0 and the other depths perform similarly, by both readings of the word."""
-    gap = largest_gap(traces)
-    curves = f"curves differ from PG's by up to {gap:.1%} of the way to J*"
-    arrivals = [run.arrival for run in traces.values()]
-    alike = all(_near(arrival, arrivals[0]) for arrival in arrivals)
-    return [
-        Finding({**reading, "comparison": "of curves"}, f"{curves}; {arrivals_text(traces)}", gap <= SIMILAR),
-        Finding({**reading, "comparison": "of arrivals"}, arrivals_text(traces), alike),
-    ]
-
-
-def largest_gap(traces: Mapping[int, Trace]) -> float:
-    """The largest distance at any iteration between m = 0 and another depth, as a share of J* - J^{pi_0}."""
-    gaps = [float((run.progress_K - traces[0].progress_K).abs().max()) for m, run in traces.items() if m > 0]
-    return max(gaps)
-
-
-def _near(arrival: int | None, other: int | None) -> bool:
-    if arrival is None or other is None:
-        return arrival == other
-    return abs(arrival - other) <= max(1, SIMILAR * other)
-
-
-def fell_by(run: Trace) -> float:
-    """The largest fall of the return in one iteration, at least 0."""
-    return max(0.0, -float(run.J_K.diff().min()))

@@ -1,7 +1,7 @@
 """Figure 4 of the paper: the Grid MDP."""
 
-import itertools
 from collections.abc import Mapping, Sequence
+from itertools import chain, product, starmap
 from typing import Any
 
 from torch import Tensor
@@ -10,16 +10,9 @@ from pgts_torch.tabular import exact, grid, stationary
 from study.batch import Batch, Iterate
 from study.claims import Claim, Finding, Reading, judge
 from study.curves import Trace, arrivals, cells, first, initial_policy
-from study.figure import (
-    Figure,
-    Move,
-    Parameter,
-    Run,
-    arrivals_text,
-    similar,
-    study,
-)
+from study.figure import Figure, Move, Parameter
 from study.random_mdp import UNIFORM
+from study.readings import Run, Variants, arrivals_text, deeper, exact_runs, from_start, similar
 
 DEPTHS = (0, 1, 2, 3, 4, 5, 8, 18)
 CHECKED = (0, 1, 4, 18)
@@ -51,28 +44,27 @@ ITERATIONS = {False: 200, True: 1000}
 
 def claims(quick: bool) -> list[Claim]:
     """What the paper says of this figure, held to exact runs."""
-    runs = list(itertools.chain.from_iterable(map(_runs, _variants(quick))))
-    from_s0 = [run for run in runs if run.start == "s0"]
-    spread = [run for run in runs if run.start == "uniform"]
+    runs = list(chain.from_iterable(map(_runs, _variants(quick))))
+    from_s0, spread = from_start(runs, "s0"), from_start(runs, "uniform")
     larger = _runs(_variants(quick)[0], steps=LARGER_STEPS, starts=("s0",))
     return [
-        judge("Uniform start: PG and PGTS perform similarly", "Sec. 3", _all_similar(spread)),
-        judge("From s0, PG first learns to avoid the traps", "Sec. 3", map(_pg_avoids_traps, from_s0)),
-        judge("From s0, PG ends up staying at s0", "Sec. 3", [_pg_stays(run) for run in from_s0 + larger]),
-        judge("From s0, PG stays at s0 for good", "Sec. 3", [_for_good()]),
-        judge("Where PG stays is a local optimum", "Sec. 3", [_local_optimum(from_s0[0])]),
-        judge("From s0, PGTS with m >= 1 reaches the goal", "Sec. 3", [_reaches(run, m) for run, m in _deep(from_s0)]),
+        judge("Uniform start: PG and PGTS perform similarly", "Sec. 3", all_similar(spread)),
+        judge("From s0, PG first learns to avoid the traps", "Sec. 3", map(pg_avoids_traps, from_s0)),
+        judge("From s0, PG ends up staying at s0", "Sec. 3", [pg_stays(run) for run in from_s0 + larger]),
+        judge("From s0, PG stays at s0 for good", "Sec. 3", [for_good()]),
+        judge("Where PG stays is a local optimum", "Sec. 3", [local_optimum(from_s0[0])]),
+        judge("From s0, PGTS with m >= 1 reaches the goal", "Sec. 3", starmap(reaches, deeper(from_s0))),
         judge(
             "From s0, PGTS avoids the traps first, then finds the goal",
             "Sec. 3",
-            [_order(run, m) for run, m in _deep(from_s0)],
+            starmap(traps_before_goal, deeper(from_s0)),
         ),
     ]
 
 
-def _variants(quick: bool) -> list[tuple[Reading, Mapping[str, Any]]]:
+def _variants(quick: bool) -> Variants:
     """All readings of traps, goal and slip; the quick version tries one change at a time, and no absorbing goal."""
-    named = itertools.product(TRAPS.items(), ABSORBING.items(), SLIPS.items())
+    named = product(TRAPS.items(), ABSORBING.items(), SLIPS.items())
     variants: list[tuple[Reading, Mapping[str, Any]]] = []
     for (traps_name, traps), (absorbing_name, absorbing), (slip_name, slip) in named:
         reading = {"traps": traps_name, "goal and traps": absorbing_name, "slip to": slip_name}
@@ -96,7 +88,7 @@ def _runs(
         goal = iterate.d_BS.shape[1] - 1
         return {"start": iterate.d_BS[:, 0], "traps": iterate.d_BS[:, traps].sum(-1), "goal": iterate.d_BS[:, goal]}
 
-    return study(
+    return exact_runs(
         grid,
         [variant],
         init=UNIFORM,
@@ -108,31 +100,27 @@ def _runs(
     )
 
 
-def _deep(runs: list[Run]) -> list[tuple[Run, int]]:
-    return [(run, m) for run in runs for m in CHECKED if m > 0]
+def all_similar(runs: list[Run]) -> list[Finding]:
+    return [finding for run in runs for finding in similar(run.without("step size"), run.traces)]
 
 
-def _all_similar(runs: list[Run]) -> list[Finding]:
-    return [finding for run in runs for finding in similar(_named(run), run.traces)]
-
-
-def _pg_avoids_traps(run: Run) -> Finding:
+def pg_avoids_traps(run: Run) -> Finding:
     avoided, pg = _avoids(run.traces[0]), run.traces[0]
     assert avoided is not None, "PG avoids traps in every reading"
     text = (
         f"time in traps falls to {AVOIDS:.0%} in iteration {avoided}, J from {pg.J_K[0]:.3g} to {pg.J_K[avoided]:.3g}"
     )
-    return Finding(_named(run), text, bool(pg.J_K[avoided] > pg.J_K[0]))
+    return Finding(run.without("step size"), text, bool(pg.J_K[avoided] > pg.J_K[0]))
 
 
-def _pg_stays(run: Run) -> Finding:
+def pg_stays(run: Run) -> Finding:
     d_K = run.traces[0].watched["start"]
     share, last = float(d_K[-1]) * (1 - GAMMA), len(d_K) - 1  # occupancies sum to 1 / (1 - gamma)
     text = f"after {last} iterations it spends {share:.0%} of its time at s0, J = {float(run.traces[0].J_K[-1]):.3g}"
-    return Finding({"step size": run.reading["step size"], **_named(run)}, text, share > STAYS)
+    return Finding({"step size": run.reading["step size"], **run.without("step size")}, text, share > STAYS)
 
 
-def _for_good() -> Finding:
+def for_good() -> Finding:
     mdp = grid()
     arrival = arrivals(mdp, initial_policy(mdp, UNIFORM), depths=[0], steps=[STEP], limit=PATIENCE)[0, STEP]
     text = (
@@ -143,7 +131,7 @@ def _for_good() -> Finding:
     return Finding({}, text, arrival is None)
 
 
-def _local_optimum(run: Run) -> Finding:
+def local_optimum(run: Run) -> Finding:
     """By slips every state is visited, and there only optimal policies are stationary; here is the gap itself."""
     batch, after = Batch(run.mdp), cells([(0, STEP)], initial_policy(run.mdp, UNIFORM))
     for _ in range(len(run.traces[0].J_K) - 1):
@@ -153,25 +141,25 @@ def _local_optimum(run: Run) -> Finding:
     return Finding({}, text, gap <= stationary.TOLERANCE)
 
 
-def _reaches(run: Run, m: int) -> Finding:
-    return Finding({**_named(run), "m": m}, arrivals_text({m: run.traces[m]}), run.traces[m].arrival is not None)
+def reaches(run: Run, m: int) -> Finding:
+    return Finding(
+        {**run.without("step size"), "m": m}, arrivals_text({m: run.traces[m]}), run.traces[m].arrival is not None
+    )
 
 
-def _order(run: Run, m: int) -> Finding:
+def traps_before_goal(run: Run, m: int) -> Finding:
     avoided = _avoids(run.traces[m])
     d_K, optimum = run.traces[m].watched["goal"], exact.optimal(run.mdp)
     goal = first(d_K >= REACHES * exact.occupancy(run.mdp, optimum.pi_SA)[-1])
     text = f"traps avoided in iteration {avoided}, goal found in iteration {goal} (m = {m})"
-    return Finding({**_named(run), "m": m}, text, avoided is not None and goal is not None and avoided < goal)
+    return Finding(
+        {**run.without("step size"), "m": m}, text, avoided is not None and goal is not None and avoided < goal
+    )
 
 
 def _avoids(trace: Trace) -> int | None:
     d_K = trace.watched["traps"]
     return first(d_K <= AVOIDS * d_K[0])
-
-
-def _named(run: Run) -> dict[str, Any]:
-    return {name: value for name, value in run.reading.items() if name != "step size"}
 
 
 FIGURE = Figure(

@@ -12,8 +12,6 @@ from fractions import Fraction
 from typing import Literal
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.seeding import numpy_stream
@@ -25,9 +23,10 @@ LARGEST_DENOMINATOR = 10**6
 """Rewards, probabilities and discounts are read as the nearest fraction up to this: 0.9 is 9/10."""
 
 INTERIOR = tuple(map(Fraction, ("1/1000", "1/10", "1/2", "9/10", "999/1000")))
-"""Interior probabilities that are tried in all states at once; the mixed draws come on top."""
+"""Interior probabilities that are tried in all states at once, and mixed."""
 
-MIXED_DRAWS = 6
+MIXED = 6
+"""How many policies with probabilities that differ from state to state are tried."""
 
 BISECTIONS = 44
 """Narrow an interval to 6e-14, in which there is one fraction up to LARGEST_DENOMINATOR."""
@@ -65,16 +64,11 @@ def memberships(mdp: TabularMDP, pattern: str, depths: int) -> list[Membership]:
         PgtsError: the MDP has not two actions, or the pattern does not fit it.
     """
     exact = _Fractions.of(mdp)
-    _check(pattern, exact)
-    tried = _draws(pattern)
+    if len(pattern) != mdp.num_states or set(pattern) - {NEVER, SOMETIMES, ALWAYS}:
+        raise PgtsError(f"pattern is {pattern!r}; it must be {mdp.num_states} characters of 0, x and 1")
+    tried = _policies(pattern)
     verdicts = [exact.stationary_depths(right_S, depths) for right_S in tried]
     return [_membership(exact, pattern, tried, [row[m] for row in verdicts], m) for m in range(depths)]
-
-
-def policy(pattern: str, interior: float = 0.5) -> Float[Tensor, "S 2"]:
-    """The policy of a pattern with one probability in all its x."""
-    right_S = torch.tensor([{NEVER: 0.0, SOMETIMES: interior, ALWAYS: 1.0}[mark] for mark in pattern]).double()
-    return torch.stack([1 - right_S, right_S], -1)
 
 
 def _membership(
@@ -107,24 +101,18 @@ def _threshold(exact: "_Fractions", tried: list[tuple[Fraction, ...]], state: in
     return Membership("some", state, threshold, below)
 
 
-def _draws(pattern: str) -> list[tuple[Fraction, ...]]:
+def _policies(pattern: str) -> list[tuple[Fraction, ...]]:
     """Policies of the pattern: all x alike, then x mixed at random."""
     free = pattern.count(SOMETIMES)
     random = numpy_stream(0, "patterns", pattern)
-    mixed = [[INTERIOR[k] for k in random.integers(0, len(INTERIOR), size=free)] for _ in range(MIXED_DRAWS)]
-    alike = [[value] * free for value in INTERIOR]
-    fillings = dict.fromkeys(map(tuple, alike + mixed))
+    mixed = [[INTERIOR[k] for k in random.integers(0, len(INTERIOR), size=free)] for _ in range(MIXED)]
+    fillings = dict.fromkeys(map(tuple, [[value] * free for value in INTERIOR] + mixed))
     return [_filled(pattern, values) for values in fillings]
 
 
 def _filled(pattern: str, values: tuple[Fraction, ...]) -> tuple[Fraction, ...]:
     rest = iter(values)
     return tuple(next(rest) if mark == SOMETIMES else Fraction(mark) for mark in pattern)
-
-
-def _check(pattern: str, exact: "_Fractions") -> None:
-    if len(pattern) != len(exact.reward) or set(pattern) - {NEVER, SOMETIMES, ALWAYS}:
-        raise PgtsError(f"pattern is {pattern!r}; it must be {len(exact.reward)} characters of 0, x and 1")
 
 
 @dataclass(frozen=True)

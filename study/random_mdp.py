@@ -5,18 +5,9 @@ from typing import Any
 
 from pgts_torch.tabular import TabularMDP, grid, ladder, random_mdp, tightrope
 from study.claims import Claim, Finding, Reading, judge
-from study.figure import (
-    Figure,
-    Move,
-    Parameter,
-    Run,
-    fell_by,
-    largest_gap,
-    monotone,
-    similar,
-    study,
-)
+from study.figure import Figure, Move, Parameter
 from study.ladder import ALWAYS_LEFT
+from study.readings import Run, exact_runs, largest_gap, similar
 
 UNIFORM = {"type": "uniform"}
 DEPTHS = (0, 1, 2, 3, 4, 5)
@@ -41,7 +32,7 @@ def claims(quick: bool) -> list[Claim]:
     runs = [
         run
         for init, name in ((UNIFORM, "uniform"), (ALWAYS_LEFT, "always action 0"))
-        for run in study(
+        for run in exact_runs(
             random_mdp,
             [({"initial policy": name, "MDP seed": seed}, {"seed": seed}) for seed in seeds],
             init=init,
@@ -51,8 +42,8 @@ def claims(quick: bool) -> list[Claim]:
         )
     ]
     return [
-        judge("PG and PGTS of any depth perform similarly", "Fig. 2, caption", _similar(runs)),
-        judge("PG ends almost as high as PGTS of any depth", "Sec. 3", _ends_alike(runs)),
+        judge("PG and PGTS of any depth perform similarly", "Fig. 2, caption", all_similar(runs)),
+        judge("PG ends almost as high as PGTS of any depth", "Sec. 3", ends_alike(runs)),
         judge("Every state can follow every state under any action", "Sec. 3", _every_state_follows()),
         judge("PG's return is monotone for any step size, on each of the four MDPs", "Sec. 3", _pg_is_monotone(quick)),
         judge("For m >= 1 that is lost on some of the four MDPs", "Sec. 3", _depth_is_not_monotone(quick)),
@@ -60,7 +51,7 @@ def claims(quick: bool) -> list[Claim]:
 
 
 def _worst_over_seeds(runs: list[Run], measure: Callable[[Run], float]) -> dict[tuple[Any, ...], tuple[float, Run]]:
-    """The run with the largest measure among the MDPs that were drawn, for each of the other readings."""
+    """The run with the largest measure among the sampled MDPs, for each of the other readings."""
     worst: dict[tuple[Any, ...], tuple[float, Run]] = {}
     for run in runs:
         key = (run.start, run.reading["initial policy"], run.reading["step size"])
@@ -70,12 +61,12 @@ def _worst_over_seeds(runs: list[Run], measure: Callable[[Run], float]) -> dict[
     return worst
 
 
-def _similar(runs: list[Run]) -> list[Finding]:
+def all_similar(runs: list[Run]) -> list[Finding]:
     worst = _worst_over_seeds(runs, lambda run: largest_gap(run.traces)).values()
     return [finding for _, run in worst for finding in similar(_without_seed(run), run.traces)]
 
 
-def _ends_alike(runs: list[Run]) -> list[Finding]:
+def ends_alike(runs: list[Run]) -> list[Finding]:
     def shortfall(run: Run) -> float:
         last = {m: float(trace.progress_K[-1]) for m, trace in run.traces.items()}
         return max(last.values()) - last[0]
@@ -87,7 +78,7 @@ def _ends_alike(runs: list[Run]) -> list[Finding]:
 
 
 def _without_seed(run: Run) -> Reading:
-    return {"start": run.start, **{name: value for name, value in run.reading.items() if name != "MDP seed"}}
+    return {"start": run.start, **run.without("MDP seed")}
 
 
 def _every_state_follows() -> list[Finding]:
@@ -97,7 +88,7 @@ def _every_state_follows() -> list[Finding]:
         prob = mdp.outcomes.weight.to_dense()
         share = float((prob > 0).double().mean())
         text = f"P(s'|s, a) > 0 for {share:.0%} of all (s, a, s')"
-        found.append(Finding({"kernel drawn": name}, text, share == 1))
+        found.append(Finding({"kernel leading": name}, text, share == 1))
     return found
 
 
@@ -106,20 +97,17 @@ def _step_runs(depths: tuple[int, ...], quick: bool) -> list[tuple[str, Run]]:
     found = []
     for name, (make, init) in ZOO.items():
         iterations = 30 if name == "Grid" and quick else 100
-        runs = study(make, [({}, {})], init=init, depths=depths, steps=LARGE_STEPS, iterations=iterations)
+        runs = exact_runs(make, [({}, {})], init=init, depths=depths, steps=LARGE_STEPS, iterations=iterations)
         found += [(name, run) for run in runs]
     return found
 
 
 def _pg_is_monotone(quick: bool) -> list[Finding]:
-    return [
-        Finding(
-            {"MDP": name, "start": run.start, **run.reading},
-            f"{name}: largest fall in one iteration {fell_by(run.traces[0]):.2g}",
-            monotone(run.traces[0]),
-        )
-        for name, run in _step_runs((0,), quick)
-    ]
+    found = []
+    for name, run in _step_runs((0,), quick):
+        pg, reading = run.traces[0], {"MDP": name, "start": run.start, **run.reading}
+        found.append(Finding(reading, f"{name}: largest fall in one iteration {pg.largest_fall:.2g}", pg.is_monotone))
+    return found
 
 
 def _depth_is_not_monotone(quick: bool) -> list[Finding]:
@@ -127,7 +115,7 @@ def _depth_is_not_monotone(quick: bool) -> list[Finding]:
     depths = (1, 4)
     falls: dict[str, float] = {}
     for name, run in _step_runs(depths, quick):
-        worst = max(0.0 if monotone(one) else fell_by(one) for one in run.traces.values())
+        worst = max(0.0 if one.is_monotone else one.largest_fall for one in run.traces.values())
         falls[name] = max(falls.get(name, 0.0), worst)
     text = "largest fall in one iteration: " + ", ".join(f"{fall:.2g} ({name})" for name, fall in falls.items())
     return [Finding({}, text, any(falls.values()))]

@@ -24,7 +24,7 @@ RESAMPLES = 2000
 class Job:
     """One training run: `iterations` updates of PGTS with these arguments, from the stream of its own name.
 
-    stream: names the run; runs of different names draw independently.
+    stream: names the run; runs of different names are independent.
     """
 
     stream: tuple[str | int, ...]
@@ -77,8 +77,8 @@ def band(J_NK: Float[np.ndarray, "N K"], *names: str | int) -> Band:
     Args:
         names: of the stream that resamples the seeds.
     """
-    draws_RN = numpy_stream(0, "bootstrap", *names).integers(0, len(J_NK), size=(RESAMPLES, len(J_NK)))
-    means_RK = interquartile_mean(J_NK[draws_RN], axis=1)
+    resampled_RN = numpy_stream(0, "bootstrap", *names).integers(0, len(J_NK), size=(RESAMPLES, len(J_NK)))
+    means_RK = interquartile_mean(J_NK[resampled_RN], axis=1)
     tail = (1 - CONFIDENCE) / 2
     low_K, high_K = np.quantile(means_RK, [tail, 1 - tail], axis=0)
     return Band(interquartile_mean(J_NK, axis=0).tolist(), low_K.tolist(), high_K.tolist())

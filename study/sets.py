@@ -67,9 +67,9 @@ def _claims(
             for name, one in tables.items()
         ),
         judge("A finite depth M suffices: Pi^M is all optimal", "Sec. 4, question 1", _finite(counted, rows)),
-        judge("M depends on the diameter", "Sec. 4, question 1", [_correlation(rows, "diameter")]),
-        judge("M depends on the connectivity (successors)", "Sec. 4, question 1", [_correlation(rows, "branching")]),
-        judge("M depends on how sparse rewards are", "Sec. 4, question 1", [_correlation(rows, "reward_share")]),
+        judge("M depends on the diameter", "Sec. 4, question 1", [correlation(rows, "diameter")]),
+        judge("M depends on the connectivity (successors)", "Sec. 4, question 1", [correlation(rows, "branching")]),
+        judge("M depends on how sparse rewards are", "Sec. 4, question 1", [correlation(rows, "reward_share")]),
     ]
 
 
@@ -116,7 +116,7 @@ def _finite(counted: Mapping[str, Counts], rows: Sequence[FamilyRow]) -> list[Fi
     return [Finding({}, text, all(one.depths[-1].lack == 0 for one in counted.values()))]
 
 
-def _correlation(rows: Sequence[FamilyRow], name: str) -> Finding:
+def correlation(rows: Sequence[FamilyRow], name: str) -> Finding:
     values = [getattr(row, name) for row in rows]
     answer = scipy.stats.spearmanr(values, [row.sufficient_depth for row in rows])
     means = {

@@ -1,29 +1,17 @@
 """Figure 3 of the paper: the Tightrope MDP."""
 
-from collections.abc import Mapping
-from typing import Any
+from itertools import starmap
 
 from torch import Tensor
 
 from pgts_torch.tabular import TabularMDP, exact, tightrope
-from pgts_torch.tabular.zoo import Start
+from pgts_torch.tabular.forms import Start
 from study.batch import Iterate
-from study.claims import Claim, Finding, Reading, judge
+from study.claims import Claim, Finding, judge
 from study.curves import first, initial_policy
-from study.figure import (
-    Figure,
-    Move,
-    Parameter,
-    Run,
-    arrivals_text,
-    arrives_before,
-    dips,
-    fell_by,
-    monotone,
-    stuck,
-    study,
-)
+from study.figure import Figure, Move, Parameter
 from study.ladder import ALWAYS_LEFT, NEARLY_ALWAYS_LEFT
+from study.readings import Run, Variants, arrivals_text, deeper, exact_runs, from_start
 
 DEPTHS = (0, 1, 2, 3, 4, 5)
 STEPS = (0.01, 0.1, 1.0)
@@ -31,7 +19,7 @@ RIGHT = 1
 LEDGE = 10 / 11
 """How often s1 must go right before going there is worth it: v(s1) > 0. It does not depend on gamma."""
 
-VARIANTS: list[tuple[Reading, Mapping[str, Any]]] = [
+VARIANTS: Variants = [
     ({"gamma": 0.9, "s2 and s3": "repeat their reward"}, {"gamma": 0.9}),
     ({"gamma": 0.99, "s2 and s3": "repeat their reward"}, {"gamma": 0.99}),
     ({"gamma": 0.9, "s2 and s3": "pay once and end"}, {"gamma": 0.9, "ends": True}),
@@ -53,7 +41,7 @@ def rope(*, gamma: float = 0.9, ends: bool = False, start: Start = 0) -> Tabular
 
 def claims(quick: bool) -> list[Claim]:
     """What the paper says of this figure, held to exact runs."""
-    runs = study(
+    runs = exact_runs(
         rope,
         VARIANTS,
         init=ALWAYS_LEFT,
@@ -62,21 +50,30 @@ def claims(quick: bool) -> list[Claim]:
         iterations=1500,
         watch=_watch,
     )
-    from_s0 = [run for run in runs if run.start == "s0"]
-    spread = [run for run in runs if run.start == "uniform"]
+    from_s0, spread = from_start(runs, "s0"), from_start(runs, "uniform")
     return [
-        judge("'Right' in every state is optimal", "Ex. 3", map(_right_is_optimal, _one_each(from_s0))),
-        judge("From s0, PG does not improve and stays left", "Sec. 3", map(_pg_is_stuck, from_s0)),
-        judge("From s0, PGTS (m >= 1) finds the optimum", "Sec. 3", _pgts_arrives(from_s0)),
-        judge("From s0, PGTS's return first falls, then recovers", "Sec. 3", _falls_and_recovers(from_s0)),
+        judge("'Right' in every state is optimal", "Ex. 3", map(right_is_optimal, one_each(from_s0))),
+        judge("From s0, PG does not improve and stays left", "Sec. 3", map(pg_is_stuck, from_s0)),
+        judge("From s0, PGTS (m >= 1) finds the optimum", "Sec. 3", starmap(pgts_arrives, deeper(from_s0))),
         judge(
-            "Uniform start: PG stays left at s0 until s1 goes right often enough", "Sec. 3", map(_waits_for_s1, spread)
+            "From s0, PGTS's return first falls, then recovers", "Sec. 3", starmap(falls_and_recovers, deeper(from_s0))
         ),
-        judge("Uniform start: a smaller step delays that", "Sec. 3", _smaller_is_later(spread)),
-        judge("Uniform start: PGTS moves s0 to the right from the first iteration", "Sec. 3", _moves_at_once(spread)),
-        judge("Uniform start: PGTS's return first falls, then recovers", "Sec. 3", _falls_and_recovers(spread)),
-        judge("Uniform start: PG's return is monotone", "Sec. 3", map(_pg_is_monotone, spread)),
-        judge("Uniform start: PGTS is optimal earlier than PG", "Sec. 3", _earlier_than_pg(spread)),
+        judge(
+            "Uniform start: PG stays left at s0 until s1 goes right often enough", "Sec. 3", map(waits_for_s1, spread)
+        ),
+        judge("Uniform start: a smaller step delays that", "Sec. 3", smaller_is_later(spread)),
+        judge(
+            "Uniform start: PGTS moves s0 to the right from the first iteration",
+            "Sec. 3",
+            starmap(moves_at_once, deeper(spread)),
+        ),
+        judge(
+            "Uniform start: PGTS's return first falls, then recovers",
+            "Sec. 3",
+            starmap(falls_and_recovers, deeper(spread)),
+        ),
+        judge("Uniform start: PG's return is monotone", "Sec. 3", map(pg_is_monotone, spread)),
+        judge("Uniform start: PGTS is optimal earlier than PG", "Sec. 3", starmap(earlier_than_pg, deeper(spread))),
     ]
 
 
@@ -84,48 +81,39 @@ def _watch(iterate: Iterate) -> dict[str, Tensor]:
     return {f"right at s{s}": iterate.pi_BSA[:, s, RIGHT] for s in (0, 1)}
 
 
-def _one_each(runs: list[Run]) -> list[Run]:
+def one_each(runs: list[Run]) -> list[Run]:
     """One run of each variant: for statements in which no step is taken."""
     step = runs[0].reading["step size"]
     return [run for run in runs if run.reading["step size"] == step]
 
 
-def _right_is_optimal(run: Run) -> Finding:
+def right_is_optimal(run: Run) -> Finding:
     J = exact.evaluate(run.mdp, initial_policy(run.mdp, ALWAYS_LEFT | {"action": RIGHT})).J
     J_optimal = run.traces[0].J_optimal
-    reading = {name: value for name, value in run.reading.items() if name != "step size"}
-    return Finding(reading, f"J = {J:.6g}, J* = {J_optimal:.6g}", abs(J - J_optimal) < 1e-9 * max(1, abs(J_optimal)))
+    return Finding(
+        run.without("step size"),
+        f"J = {J:.6g}, J* = {J_optimal:.6g}",
+        abs(J - J_optimal) < 1e-9 * max(1, abs(J_optimal)),
+    )
 
 
-def _pg_is_stuck(run: Run) -> Finding:
+def pg_is_stuck(run: Run) -> Finding:
     right = float(run.traces[0].watched["right at s0"].max())
     text = f"J stays {float(run.traces[0].J_K[0]):.3g}, 'right' at s0 has probability {right:.2g}"
-    return Finding(run.reading, text, stuck(run.traces[0]) and right == 0)
+    return Finding(run.reading, text, run.traces[0].is_stuck and right == 0)
 
 
-def _by_depth(run: Run, m: int) -> dict[str, Any]:
-    return {**run.reading, "m": m}
+def pgts_arrives(run: Run, m: int) -> Finding:
+    return Finding({**run.reading, "m": m}, arrivals_text({m: run.traces[m]}), run.traces[m].arrival is not None)
 
 
-def _pgts_arrives(runs: list[Run]) -> list[Finding]:
-    return [
-        Finding(_by_depth(run, m), arrivals_text({m: run.traces[m]}), run.traces[m].arrival is not None)
-        for run in runs
-        for m in DEPTHS[1:]
-    ]
+def falls_and_recovers(run: Run, m: int) -> Finding:
+    J_K = run.traces[m].J_K
+    text = f"J from {float(J_K[0]):.3g} down to {float(J_K.min()):.3g} and up to {float(J_K[-1]):.3g} (m = {m})"
+    return Finding({**run.reading, "m": m}, text, run.traces[m].dips and run.traces[m].arrival is not None)
 
 
-def _falls_and_recovers(runs: list[Run]) -> list[Finding]:
-    found = []
-    for run in runs:
-        for m in DEPTHS[1:]:
-            J_K = run.traces[m].J_K
-            text = f"J from {float(J_K[0]):.3g} down to {float(J_K.min()):.3g} and up to {float(J_K[-1]):.3g} (m = {m})"
-            found.append(Finding(_by_depth(run, m), text, dips(run.traces[m]) and run.traces[m].arrival is not None))
-    return found
-
-
-def _waits_for_s1(run: Run) -> Finding:
+def waits_for_s1(run: Run) -> Finding:
     watched = run.traces[0].watched
     ledge, moved = first(watched["right at s1"] > LEDGE), first(watched["right at s0"] > 0)
     text = f"s1 passes {LEDGE:.3g} in iteration {ledge}, s0 starts to move in iteration {moved}"
@@ -133,10 +121,10 @@ def _waits_for_s1(run: Run) -> Finding:
     return Finding(run.reading, text, ledge is not None and moved == ledge + 1)
 
 
-def _smaller_is_later(runs: list[Run]) -> list[Finding]:
+def smaller_is_later(runs: list[Run]) -> list[Finding]:
     found = []
-    for variant in _one_each(runs):
-        reading = {name: value for name, value in variant.reading.items() if name != "step size"}
+    for variant in one_each(runs):
+        reading = variant.without("step size")
         same = [run for run in runs if reading.items() <= run.reading.items()]
         by_step = sorted(same, key=lambda run: float(run.reading["step size"]))
         passed = {run.reading["step size"]: first(run.traces[0].watched["right at s1"] > LEDGE) for run in by_step}
@@ -147,29 +135,19 @@ def _smaller_is_later(runs: list[Run]) -> list[Finding]:
     return found
 
 
-def _moves_at_once(runs: list[Run]) -> list[Finding]:
-    found = []
-    for run in runs:
-        for m in DEPTHS[1:]:
-            right = float(run.traces[m].watched["right at s0"][1])
-            found.append(Finding(_by_depth(run, m), f"pi_1(right|s0) = {right:.3g} (m = {m})", right > 0))
-    return found
+def moves_at_once(run: Run, m: int) -> Finding:
+    right = float(run.traces[m].watched["right at s0"][1])
+    return Finding({**run.reading, "m": m}, f"pi_1(right|s0) = {right:.3g} (m = {m})", right > 0)
 
 
-def _pg_is_monotone(run: Run) -> Finding:
-    return Finding(run.reading, f"largest fall in one iteration {fell_by(run.traces[0]):.2g}", monotone(run.traces[0]))
+def pg_is_monotone(run: Run) -> Finding:
+    pg = run.traces[0]
+    return Finding(run.reading, f"largest fall in one iteration {pg.largest_fall:.2g}", pg.is_monotone)
 
 
-def _earlier_than_pg(runs: list[Run]) -> list[Finding]:
-    return [
-        Finding(
-            _by_depth(run, m),
-            arrivals_text({0: run.traces[0], m: run.traces[m]}),
-            arrives_before(run.traces[m], run.traces[0]),
-        )
-        for run in runs
-        for m in DEPTHS[1:]
-    ]
+def earlier_than_pg(run: Run, m: int) -> Finding:
+    pair = {0: run.traces[0], m: run.traces[m]}
+    return Finding({**run.reading, "m": m}, arrivals_text(pair), pair[m].arrives_before(pair[0]))
 
 
 FIGURE = Figure(

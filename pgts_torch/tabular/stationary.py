@@ -88,8 +88,10 @@ def reachable_bound(mdp: TabularMDP, depth: int) -> float:
 
     0 where every path has ended by then, also with gamma 1.
     """
-    first_S = _reached(mdp, check_count("depth", depth, least=0) + 1)
-    return _reward_bound(mdp, depth, _reached_within(mdp, first_S, mdp.num_states))
+    states_S = mdp.start_S > 0
+    for _ in range(check_count("depth", depth, least=0) + 1):
+        states_S = _followers(mdp, states_S)
+    return _reward_bound(mdp, depth, _reached_within(mdp, states_S, mdp.num_states))
 
 
 def worst_case_bound(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -> float:
@@ -216,16 +218,8 @@ def _followers(mdp: TabularMDP, from_S: Bool[Tensor, "S"]) -> Bool[Tensor, "S"]:
     return next_S
 
 
-def _reached(mdp: TabularMDP, steps: int) -> Bool[Tensor, "S"]:
-    """R_n: the states that some policy reaches in exactly n steps from the start."""
-    states_S = mdp.start_S > 0
-    for _ in range(steps):
-        states_S = _followers(mdp, states_S)
-    return states_S
-
-
 def _reached_within(mdp: TabularMDP, states_S: Bool[Tensor, "S"], steps: int) -> Bool[Tensor, "S"]:
-    """Some states and those that some policy reaches from them in at most n steps; n = S: all that follow."""
+    """These states and those that some policy reaches from them in at most so many steps; S steps: all that follow."""
     for _ in range(min(steps, mdp.num_states)):
         new_S = _followers(mdp, states_S) & ~states_S
         if not new_S.any():

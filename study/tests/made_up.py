@@ -8,7 +8,7 @@ import torch
 from study import figure
 from study.claims import Claim, Finding, judge
 from study.curves import Trace
-from study.figure import Run
+from study.readings import Run
 from tests.support import zoo
 
 

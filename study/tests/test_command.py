@@ -27,7 +27,7 @@ def small(monkeypatch: pytest.MonkeyPatch, ladder_members: table1.Found) -> None
     monkeypatch.setattr(command, "DOTS_PER_INCH", 20)
     monkeypatch.setattr(depth, "FAMILIES", (depth.FAMILIES[1], depth.FAMILIES[4]))
     monkeypatch.setattr(depth, "QUICK", depth.Scale((0.3, 1.0), 8, 8, 2))
-    monkeypatch.setattr(depth, "_in_S_iterations", lambda: [Finding({}, "made up", True)])
+    monkeypatch.setattr(depth, "in_S_iterations", lambda: [Finding({}, "made up", True)])
     monkeypatch.setattr(table1, "PAPER", {"ladder": table1.PAPER["ladder"]})
     monkeypatch.setattr(table1, "members", lambda column: ladder_members)
     monkeypatch.setattr(sets, "COUNTED", {"Ladder": ladder})
@@ -126,6 +126,6 @@ def test_the_document_and_the_names_of_the_pictures_are_what_the_stored_data_mak
     parts = command.stored(ROOT / "docs" / "figures")
     assert tuple(parts) == PARTS
     assert (ROOT / "docs" / "reproduction.md").read_text() == document(parts)
-    assert set(command._PICTURES) <= parts.keys()
+    assert set(command.PICTURES) <= parts.keys()
     for name, data in parts.items():
-        assert tuple(pictures(data)) == command._PICTURES.get(name, (name,))
+        assert tuple(pictures(data)) == command.PICTURES.get(name, (name,))

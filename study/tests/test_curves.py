@@ -71,7 +71,7 @@ def test_a_band_is_the_interquartile_mean_inside_its_interval():
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
-def test_runs_draw_independently_and_the_number_of_workers_changes_nothing():
+def test_runs_are_independent_and_the_number_of_workers_changes_nothing():
     given = figure.sampled_arguments(smallest(random_mdp.FIGURE), "projected", "uniform", 1)
     jobs = [sampled.Job(("test", seed), "pgts/Random-v0", 2, given) for seed in range(2)]
     with sampled.executor(0) as here, sampled.executor(1) as elsewhere:
@@ -84,7 +84,7 @@ def test_runs_draw_independently_and_the_number_of_workers_changes_nothing():
 
 def test_sampled_runs_use_the_initial_policy_of_the_exact_ones():
     for one in command.CURVES.values():
-        panel = figure._panel(one, "projected", "s0")
+        panel = figure.panel(one, "projected", "s0")
         mdp = one.make(start=0)
         J = exact.evaluate(mdp, initial_policy(mdp, one.moves["projected"].init)).J
         assert panel["exact"]["0"][0] == pytest.approx(J, rel=1e-5)

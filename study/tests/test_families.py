@@ -8,8 +8,8 @@ from study.families import diameter, family_study
 
 def test_a_family_has_a_row_for_each_mdp_and_the_rows_are_true():
     rows = family_study(branchings=(1, 3), reward_shares=(0.1, 1.0), gammas=(0.9,), sizes=(4,), seeds=(0, 5))
-    drawn = [(row.seed, row.branching, row.num_states, row.reward_share, row.gamma) for row in rows]
-    assert drawn == [
+    sampled = [(row.seed, row.branching, row.num_states, row.reward_share, row.gamma) for row in rows]
+    assert sampled == [
         (seed, branching, 4, share, 0.9) for seed in (0, 5) for branching in (1, 3) for share in (0.1, 1.0)
     ]
     for row in rows:

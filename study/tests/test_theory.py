@@ -138,8 +138,8 @@ def test_depth_0_suffices_where_every_policy_visits_every_state():
 def test_a_depth_that_reaches_a_reward_earns_something():
     nothing_before = 0
     for case in family():
-        rewarded_S = (case.mdp.outcomes.reward_NA > 0).any(-1)
-        reached = [bool((stationary._reached(case.mdp, n) & rewarded_S).any()) for n in DEPTHS]
+        rewarded_S = (case.mdp.outcomes.reward_NA > 0).any(-1).numpy()
+        reached = [bool((case.reached_S(n) & rewarded_S).any()) for n in DEPTHS]
         if any(reached):
             first = reached.index(True)
             assert all(case.sets.worst_return(depth) > 0 for depth in range(first, 8))

@@ -43,6 +43,15 @@ class Brute:
     def member_MP(self) -> np.ndarray:
         return self.gap_MP <= EXACT
 
+    @functools.cached_property
+    def follows_SS(self) -> np.ndarray:
+        """1 where an action leads from one state to the other."""
+        return (weights(self.mdp) > 0).any(1).astype(int)
+
+    def reached_S(self, steps: int) -> np.ndarray:
+        """The states that some policy reaches in exactly so many steps."""
+        return self.mdp.start_S.numpy() @ np.linalg.matrix_power(self.follows_SS, steps) > 0
+
     def pi_SA(self, p: int) -> torch.Tensor:
         return torch.eye(self.mdp.num_actions, dtype=torch.float64)[torch.from_numpy(self.action_PS[p])]
 

@@ -97,7 +97,7 @@ def test_no_stationary_policy_lacks_more_than_its_worst_case_bound():
         gamma = float(case.mdp.outcomes.discount_NAK.max())
         for depth, p in stationary_ones(case):
             bound = stationary.worst_case_bound(case.mdp, case.pi_SA(p), depth)
-            reached = stationary._reached(case.mdp, depth + 1).numpy()
+            reached = case.reached_S(depth + 1)
             simple = gamma ** (depth + 1) * np.max((v_optimal_S - case.v_PS[p])[reached], initial=0.0)
             q_lack = (exact.optimal(case.mdp).q_SA.numpy() - case.look_MPSA[0][p]).max()
             assert case.lack_P[p] <= bound + EXACT
@@ -246,7 +246,7 @@ def test_nothing_smaller_than_the_certificate_follows():
     for seed, case in enumerate(family()[2::3]):
         mdp, pi_SA = case.mdp, random_policy(case.mdp, seed)
         outcomes = mdp.outcomes
-        expanded_S = stationary._reached_within(mdp, mdp.start_S > 0, 1)
+        expanded_S = torch.from_numpy(case.reached_S(0) | case.reached_S(1))
         stays_SA1 = torch.arange(mdp.num_states)[:, None, None].expand(outcomes.child_NAK.shape)
         paradise = replace(
             outcomes,
