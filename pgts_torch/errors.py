@@ -72,12 +72,11 @@ def failure(where: str, error: BaseException) -> NotFinite | ModelMismatch | Fai
         raise error
     if not isinstance(error, PgtsError):
         return Failed(f"{where}: {text_of(error)}")
-    text = f"{where}: {error}"
     located: NotFinite | ModelMismatch | Failed
     if isinstance(error, NotFinite):
-        located = NotFinite(text, what=error.what)
+        located = NotFinite(f"{where}: {error}", what=error.what)
     else:
-        located = ModelMismatch(text) if isinstance(error, ModelMismatch) else Failed(text)
+        located = (ModelMismatch if isinstance(error, ModelMismatch) else Failed)(f"{where}: {error}")
     located.rank = error.rank
     return located
 

@@ -11,6 +11,7 @@ from pgts_torch.errors import PgtsError
 PARTIAL = ".partial"
 """The end of the name of a file, or a folder, that is being written."""
 
+_NO_WAITING = getattr(os, "O_NONBLOCK", 0)
 _STREAMS = ("/dev/fd/", "/dev/stdin", "/proc/self/fd/")
 _KINDS = {
     stat.S_IFREG: "file",
@@ -73,9 +74,6 @@ def read(path: str | Path, *, most: int | None = None, name: str | None = None) 
             if not (is_stream or stat.S_ISREG(mode)):
                 raise PgtsError(f"{name} is a {_KINDS.get(stat.S_IFMT(mode), 'special file')}; it must be a file")
             return file.read(-1 if most is None else most)
-
-
-_NO_WAITING = getattr(os, "O_NONBLOCK", 0)
 
 
 def replace(path: str | Path, raw: bytes) -> None:

@@ -57,7 +57,7 @@ def rewarded(mdp: TabularMDP, *, factor: float = 1.0, constant: float = 0.0) -> 
 
 
 def random_policy(mdp: TabularMDP, seed: int = 0) -> Tensor:
-    """Rows drawn uniformly from the simplex."""
+    """Rows sampled uniformly from the simplex."""
     random = numpy_stream(seed, "random_policy")
     return torch.from_numpy(random.dirichlet(np.ones(mdp.num_actions), size=mdp.num_states))
 

@@ -106,7 +106,7 @@ def test_the_weight_matrix_has_narrow_indices():
     assert weight.crow_indices().dtype == weight.col_indices().dtype == torch.int32
 
 
-def test_rows_are_the_asked_for_states_in_the_order_asked_for():
+def test_rows_are_the_given_states_in_the_given_order():
     outcomes, v_S = zoo("garnet").outcomes, torch.arange(30, dtype=torch.float64)
     row_N = torch.tensor([7, 3, 7, 0])
     picked = outcomes.rows(row_N)

@@ -1,4 +1,4 @@
-"""Named random streams, and keys of single draws."""
+"""Named random streams, and keys of single samples."""
 
 import itertools
 
@@ -35,9 +35,9 @@ def test_the_same_seed_and_names_give_the_same_numbers(numbers):
 @pytest.mark.parametrize("numbers", [torch_numbers, numpy_numbers])
 def test_other_names_and_neighbouring_seeds_share_no_number(numbers):
     # 21,000 numbers of 53 bits: two of them are equal by chance with probability 3e-8.
-    drawn = np.concatenate([numbers(*key) for key in KEYS])
-    assert len(np.unique(drawn)) == len(drawn)
-    assert len(np.unique(np.concatenate([drawn, numbers(*KEYS[0])]))) == len(drawn)
+    found = np.concatenate([numbers(*key) for key in KEYS])
+    assert len(np.unique(found)) == len(found)
+    assert len(np.unique(np.concatenate([found, numbers(*KEYS[0])]))) == len(found)
 
 
 def test_streams_of_neighbouring_seeds_are_uncorrelated():
@@ -47,7 +47,7 @@ def test_streams_of_neighbouring_seeds_are_uncorrelated():
     assert abs(np.corrcoef(x, x + y)[0, 1]) > 5 / np.sqrt(20_000)
 
 
-def test_drawing_from_one_stream_moves_no_other_and_no_global_generator():
+def test_numbers_of_one_stream_move_no_other_and_no_global_generator():
     kept, disturbed = stream(0, "rollout"), stream(0, "rollout")
     torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
     torch.rand(100, generator=stream(0, "diagnostic"))
@@ -80,7 +80,7 @@ def test_keys_are_mixed_as_the_published_generator_does_it():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_neighbouring_keys_draw_independent_uniform_numbers(dtype):
+def test_neighbouring_keys_give_independent_uniform_numbers(dtype):
     """Each of six p-values is below 1e-4 with probability 1e-4: false alarms in 6 of 10,000 seeds."""
     key = sample_keys(1, generator=stream(0, "keys"))
     u_N = uniform(mix(key, torch.arange(20_000)), dtype).double().numpy()

@@ -34,14 +34,16 @@ class OutcomeSampler:
     def outcomes(self, random: np.random.Generator, pair_B: Int[np.ndarray, "B"]) -> Int[np.ndarray, "B"]:
         """The position of one sampled outcome for each pair, by bisection: log2(K) rounds for all together.
 
-        Nothing is drawn from `random` where K is 1.
+        No number of `random` is used where K is 1.
         """
         outcome_B = pair_B * self.width
         if self.width == 1:
             return outcome_B
         uniform_B = random.random(len(pair_B))
         half = self.width // 2
-        while half:
+        while (
+            half
+        ):  # the outcome is among the 2 * half from outcome_B on: it moves up if the first half ends at or below u
             outcome_B += half * (self.cumulative_SAK.take(outcome_B + (half - 1)) <= uniform_B)
             half //= 2
         return outcome_B

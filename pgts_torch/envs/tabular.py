@@ -72,7 +72,7 @@ class TabularEnv(gymnasium.Env):
         return self._state, {}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
-        """Draw one outcome of the state and the action."""
+        """Sample one outcome of the state and the action."""
         if self._state is None:
             raise ResetNeeded("Cannot call env.step() before calling env.reset()")
         if self._ended:

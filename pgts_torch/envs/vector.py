@@ -22,6 +22,10 @@ from pgts_torch.tabular.mdp import TabularMDP
 MAX_FRAMES = 64
 """Most environments that can be rendered: a frame is up to 0.75 MB."""
 
+States = Int[np.ndarray, "B"]
+Rewards = Float[np.ndarray, "B"]
+Flags = Bool[np.ndarray, "B"]
+
 
 @final
 class TabularVectorEnv(gymnasium.vector.VectorEnv):
@@ -88,7 +92,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Int[np.ndarray, "B"], dict[str, Any]]:
+    ) -> tuple[States, dict[str, Any]]:
         """Start new episodes in all environments, or in some.
 
         Args:
@@ -105,18 +109,16 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         self._was_reset = True
         return self._state_B.copy(), {}
 
-    def step(
-        self, actions: ArrayLike
-    ) -> tuple[
-        Int[np.ndarray, "B"],
-        Float[np.ndarray, "B"],
-        Bool[np.ndarray, "B"],
-        Bool[np.ndarray, "B"],
-        dict[str, Any],
-    ]:
+    def step(self, actions: ArrayLike) -> tuple[States, Rewards, Flags, Flags, dict[str, Any]]:
         """Sample one outcome for every environment: states, rewards, terminated, truncated, info, each of shape [B]."""
         action_B = self._check_actions(actions)
-        self._check_ready()
+        if not self._was_reset:
+            raise ResetNeeded("Cannot call env.step() before calling env.reset()")
+        if self.autoreset_mode == AutoresetMode.DISABLED and self._over_B.any():
+            raise ResetNeeded(
+                f"the episode of environment {int(self._over_B.argmax())} is over; "
+                f"reset it with env.reset(options={{'reset_mask': mask}}) before the next env.step()"
+            )
         pair_B = self._state_B * self.mdp.num_actions + action_B
         outcome_B = self._sampler.outcomes(self.np_random, pair_B)
         self._state_B = self._sampler.child_SAK.take(outcome_B)
@@ -124,7 +126,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         reward_B = self._sampler.reward_SAK.take(outcome_B)
         discount_B = self._sampler.discount_SAK.take(outcome_B)
         stepped_B = ~self._over_B
-        if self._over_B.any():
+        if self._over_B.any():  # NEXT_STEP: these were stepped with the others, and now begin a new episode
             reward_B[self._over_B] = discount_B[self._over_B] = 0.0
             self._start_episodes(self._over_B)
         terminated_B = (discount_B == 0) & stepped_B
@@ -148,13 +150,13 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
     def _drawing(self) -> Drawing:
         return Drawing(self.mdp)
 
-    def _start_episodes(self, mask_B: Bool[np.ndarray, "B"], state_B: Int[np.ndarray, "B"] | None = None) -> None:
+    def _start_episodes(self, mask_B: Flags, state_B: States | None = None) -> None:
         count = int(np.count_nonzero(mask_B))
         self._state_B[mask_B] = self._sampler.starts(self.np_random, count) if state_B is None else state_B[mask_B]
         self._elapsed_B[mask_B] = 0
         self._over_B = self._over_B & ~mask_B
 
-    def _final(self, discount_B: Float[np.ndarray, "B"]) -> dict[str, Any]:
+    def _final(self, discount_B: Rewards) -> dict[str, Any]:
         """How the episodes ended that are over, in the form that Gymnasium's `SyncVectorEnv` gives it."""
         over_B = self._over_B
         final_B = np.full(self.num_envs, None, dtype=object)
@@ -174,16 +176,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
             raise PgtsError(f"seed is {seed}; it must be an integer or {self.num_envs} integers of at least 0")
         self.np_random = np.random.default_rng(np.random.SeedSequence(seed))
 
-    def _check_ready(self) -> None:
-        if not self._was_reset:
-            raise ResetNeeded("Cannot call env.step() before calling env.reset()")
-        if self.autoreset_mode == AutoresetMode.DISABLED and self._over_B.any():
-            raise ResetNeeded(
-                f"the episode of environment {int(self._over_B.argmax())} is over; "
-                f"reset it with env.reset(options={{'reset_mask': mask}}) before the next env.step()"
-            )
-
-    def _check_actions(self, actions: ArrayLike) -> Int[np.ndarray, "B"]:
+    def _check_actions(self, actions: ArrayLike) -> States:
         action_B = np.asarray(actions)
         if action_B.shape != (self.num_envs,) or not np.issubdtype(action_B.dtype, np.integer):
             raise PgtsError(
@@ -195,7 +188,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
             raise PgtsError(f"action {action_B[index]} of environment {index} does not exist; actions are 0 to {last}")
         return action_B
 
-    def _check_mask(self, mask: Any) -> Bool[np.ndarray, "B"]:
+    def _check_mask(self, mask: Any) -> Flags:
         if mask is None:
             return np.ones(self.num_envs, dtype=np.bool_)
         mask_B = np.asarray(mask)
@@ -208,7 +201,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
             raise ResetNeeded("Cannot reset some environments before env.reset() has started all of them")
         return mask_B
 
-    def _check_states(self, states: Any) -> Int[np.ndarray, "B"] | None:
+    def _check_states(self, states: Any) -> States | None:
         if states is None:
             return None
         state_B = np.asarray(states)

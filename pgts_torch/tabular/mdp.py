@@ -180,7 +180,7 @@ class TabularMDP:
 
         target = files.target(path, is_mdp, "an MDP that load_npz reads", most=1)
         arrays: dict[str, ArrayLike] = {"P": P_SAS, "R": outcomes.reward_NA, "gamma": gamma, "start": self.start_S}
-        npz.write_arrays(target, arrays)
+        npz.write(target, arrays)
 
     @classmethod
     def load_npz(cls, path: str | Path) -> Self:
@@ -196,11 +196,9 @@ class TabularMDP:
                 take more than 2 GiB of memory, or the arrays make no MDP; the message names the file, the array, the
                 index and the value.
         """
-        arrays = npz.read_arrays(path)
+        P, R, gamma, start = npz.read(path)
         try:
-            gamma = npz.single_number("gamma", arrays["gamma"])
-            start = npz.state_or_distribution(arrays.get("start"))
-            return cls.from_dense(arrays["P"], arrays["R"], gamma, start=start, order="SAS")
+            return cls.from_dense(P, R, gamma, start=start, order="SAS")
         except PgtsError as error:
             raise PgtsError(f"{path}: {npz.in_words_of_the_file(str(error))}") from error
 

@@ -34,16 +34,16 @@ _UNREADABLE = (
 )
 
 
-def write_arrays(path: str | Path, arrays: dict[str, Any]) -> None:
+def write(path: str | Path, arrays: dict[str, Any]) -> None:
     """PgtsError if the file cannot be written."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     files.replace(path, buffer.getvalue())
 
 
-def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    """The arrays of an MDP in a file; anything but plain numbers under the known names is refused, and so is what
-    would take more than `MOST_BYTES`, before any of it is unpacked."""
+def read(path: str | Path) -> tuple[np.ndarray, np.ndarray, float, int | np.ndarray | None]:
+    """P, R, gamma and start. Anything but plain numbers under the known names is refused, and so is what would take
+    more than `MOST_BYTES`, before any of it is unpacked."""
     if (found := files.kind(path, follow=True)) not in (None, "file", "folder"):
         raise PgtsError(f"{path}: is a {found}; it must be a file")
     try:
@@ -54,13 +54,21 @@ def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
                 _check_names(path, archive.files)
                 assert archive.zip is not None
                 _check_size(path, archive.zip)
-                return {name: _read_array(path, archive, name) for name in archive.files}
+                arrays = {name: _read_array(path, archive, name) for name in archive.files}
     except PgtsError:
         raise
     except OSError as error:
         raise PgtsError(f"{path}: cannot be read: {error.strerror or error}") from error
     except _UNREADABLE as error:
         raise PgtsError(f"{path}: is damaged: {_first_line(error)}") from error
+    gamma, start = arrays["gamma"], arrays.get("start")
+    if gamma.ndim != 0:
+        raise PgtsError(f"{path}: gamma has shape {gamma.shape}; it must be a single number")
+    if start is None or start.ndim:
+        return arrays["P"], arrays["R"], float(gamma), start
+    if start.dtype.kind not in "iu":
+        raise PgtsError(f"{path}: start is {start}; a single state must be a whole number")
+    return arrays["P"], arrays["R"], float(gamma), int(start)
 
 
 def _check_names(path: str | Path, names: Sequence[str]) -> None:
@@ -122,22 +130,6 @@ def _read_array(path: str | Path, archive: Mapping[str, np.ndarray], name: str) 
 
 def _first_line(error: BaseException) -> str:
     return (str(error) or type(error).__name__).splitlines()[0]
-
-
-def single_number(name: str, array: np.ndarray) -> float:
-    """PgtsError unless it is one."""
-    if array.ndim != 0:
-        raise PgtsError(f"{name} has shape {array.shape}; it must be a single number")
-    return float(array)
-
-
-def state_or_distribution(array: np.ndarray | None) -> int | np.ndarray | None:
-    """A start as `start_distribution` takes it; PgtsError if it is a single number that is not whole."""
-    if array is None or array.ndim > 0:
-        return array
-    if array.dtype.kind not in "iu":
-        raise PgtsError(f"start is {array}; a single state must be a whole number")
-    return int(array)
 
 
 def in_words_of_the_file(message: str) -> str:

@@ -134,7 +134,7 @@ def test_every_environment_renders_in_its_modes(id):
     assert len(env.render()) == 2
 
 
-def test_many_copies_render_as_one_picture_each():
+def test_many_environments_render_as_one_picture_each():
     envs = TabularVectorEnv(ladder(n=4), 3, render_mode="rgb_array")
     envs.reset(options={"state": [0, 2, 2]})
     frames = envs.render()

@@ -36,7 +36,7 @@ def one_row_mdp(prob, start=0):
     return TabularMDP(outcomes, start_S)
 
 
-def drawn_child(prob, uniform):
+def sampled_child(prob, uniform):
     sampler = OutcomeSampler(one_row_mdp(prob))
     return int(sampler.child_SAK.take(sampler.outcomes(FixedUniform(uniform), np.array([0])))[0])
 
@@ -59,7 +59,7 @@ def drawn_child(prob, uniform):
     ],
 )
 def test_the_outcome_is_the_interval_that_the_uniform_number_falls_into(prob, uniform, child):
-    assert drawn_child(prob, uniform) == child
+    assert sampled_child(prob, uniform) == child
 
 
 @pytest.mark.parametrize("K", [1, 2, 3, 4, 5, 7, 8, 9, 16, 17])
@@ -75,7 +75,7 @@ def test_bisection_equals_a_linear_search(K):
 
 
 @pytest.mark.parametrize("uniform", [0.0, 0.5, LARGEST_UNIFORM])
-def test_no_outcome_of_probability_0_is_ever_drawn(uniform):
+def test_no_outcome_of_probability_0_is_ever_sampled(uniform):
     mdp = grid(size=4, slip=0.0, traps=())  # each row keeps one possible outcome among padding and zeros
     sampler = OutcomeSampler(mdp)
     pair = np.arange(mdp.num_states * mdp.num_actions)
@@ -87,22 +87,22 @@ def test_no_outcome_of_probability_0_is_ever_drawn(uniform):
 
 
 @pytest.mark.parametrize(("uniform", "state"), [(0.0, 1), (0.3, 2), (LARGEST_UNIFORM, 2)])
-def test_no_start_of_probability_0_is_ever_drawn(uniform, state):
+def test_no_start_of_probability_0_is_ever_sampled(uniform, state):
     sampler = OutcomeSampler(ladder(n=4, start=[0.0, 0.3, 0.7, 0.0]))
     assert sampler.starts(FixedUniform(uniform), 3).tolist() == [state] * 3
 
 
-def numbers_drawn(mdp, count):
+def numbers_used(mdp, count):
     """How many uniform numbers `count` outcomes take, read off the generator's position."""
     sampler, random = OutcomeSampler(mdp), np.random.default_rng(0)
     sampler.outcomes(random, np.zeros(count, dtype=int))
-    for drawn in (0, count):
+    for used in (0, count):
         bits = np.random.PCG64(0)
-        if np.random.Generator(bits.advance(drawn)).bit_generator.state["state"] == random.bit_generator.state["state"]:
-            return drawn
+        if np.random.Generator(bits.advance(used)).bit_generator.state["state"] == random.bit_generator.state["state"]:
+            return used
     return None
 
 
 def test_an_outcome_costs_one_uniform_number_and_a_certain_one_none():
-    assert numbers_drawn(random_mdp(), 1000) == 1000
-    assert numbers_drawn(ladder(), 1000) == 0
+    assert numbers_used(random_mdp(), 1000) == 1000
+    assert numbers_used(ladder(), 1000) == 0

@@ -44,7 +44,7 @@ def test_a_second_import_neither_warns_nor_changes_the_registry():
     assert {id: gymnasium.spec(id) for id in IDS} == before
 
 
-def test_public_names_are_loaded_when_asked_for():
+def test_public_names_are_loaded_on_first_use():
     assert pgts_torch.tabular is tabular
     assert pgts_torch.envs.TabularEnv is TabularEnv
     assert pgts_torch.__version__ == importlib.metadata.version("pgts_torch")
@@ -115,7 +115,7 @@ def test_make_vec_picks_the_fast_form_with_the_registered_time_limit(id):
 
 
 @pytest.mark.parametrize(("given", "length"), [(3, 3), (None, 100), (-1, None)])
-def test_a_time_limit_means_the_same_to_one_copy_and_to_many(given, length):
+def test_a_time_limit_means_the_same_to_one_environment_and_to_many(given, length):
     def first_truncation(envs):
         envs.reset(seed=0)
         for step in range(1, 111):

@@ -1,4 +1,4 @@
-"""One copy: what a step returns, where an episode starts, and what is refused."""
+"""One environment: what a step returns, where an episode starts, and what is refused."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def test_a_walk_on_the_ladder_written_out_by_hand():
     assert (env.state, env.last_action, env.num_steps) == (0, None, 0)
 
 
-def test_a_step_terminates_exactly_when_the_drawn_outcome_has_discount_0():
+def test_a_step_terminates_exactly_when_the_sampled_outcome_has_discount_0():
     env = TabularEnv(deep_sea(n=2, gamma=0.99, move_cost=0.0))
     env.reset()
     assert env.step(1) == (3, 0.0, False, False, {"discount": 0.99})

@@ -1,4 +1,4 @@
-"""Many copies together are as many single environments; and the three ways of starting over."""
+"""Many environments of one MDP are as many single ones; and the three autoreset modes."""
 
 import gymnasium
 import numpy as np
@@ -51,7 +51,7 @@ def assert_same_step(fast_step, slow_step):
         ("pgts/DeepSea-v0", {"n": 4, "max_episode_steps": 3}),
     ],
 )
-def test_deterministic_copies_equal_gymnasiums_loop_over_single_ones_step_by_step(id, kwargs, mode):
+def test_deterministic_environments_equal_gymnasiums_loop_over_single_ones_step_by_step(id, kwargs, mode):
     fast, slow = make_both(id, mode, **kwargs)
     assert fast.observation_space == slow.observation_space
     assert fast.action_space == slow.action_space
@@ -65,7 +65,7 @@ def test_deterministic_copies_equal_gymnasiums_loop_over_single_ones_step_by_ste
         assert_same_step(fast_step, slow_step)
         over = fast_step[2] | fast_step[3]
         ends += over.sum()
-        if step == 1:  # from here on the copies end at different times
+        if step == 1:  # from here on the environments end at different times
             over = over | np.array([True, False, True, False])
         if over.any() and (mode == AutoresetMode.DISABLED or step == 1):
             np.testing.assert_array_equal(*(envs.reset(options={"reset_mask": over})[0] for envs in (fast, slow)))
@@ -73,7 +73,7 @@ def test_deterministic_copies_equal_gymnasiums_loop_over_single_ones_step_by_ste
 
 
 @pytest.mark.parametrize("mdp", [random_mdp(start=None), grid(slip=0.5, start=None), deep_sea(stochastic=True)])
-def test_one_copy_is_the_single_environment_bit_by_bit_under_random_dynamics(mdp):
+def test_a_vector_of_one_is_the_single_environment_bit_by_bit_under_random_dynamics(mdp):
     single, vector = TabularEnv(mdp), TabularVectorEnv(mdp, 1, autoreset_mode=AutoresetMode.SAME_STEP)
     assert single.reset(seed=5)[0] == vector.reset(seed=5)[0][0]
     for action in np.random.default_rng(0).integers(mdp.num_actions, size=200):
@@ -85,8 +85,8 @@ def test_one_copy_is_the_single_environment_bit_by_bit_under_random_dynamics(mdp
         assert info["discount"] == infos["discount"][0]
 
 
-def p_value_of_copies(env_mdp, true_mdp, steps=4, num_envs=20_000):
-    """Pearson's test of where the copies are after some steps of a fixed random policy, against mu (P^pi)^t."""
+def p_value_of_states(env_mdp, true_mdp, steps=4, num_envs=20_000):
+    """Pearson's test of the states after some steps of a fixed random policy, against mu (P^pi)^t."""
     A, S = true_mdp.num_actions, true_mdp.num_states
     pi_A = 8.0 ** np.arange(A) / (8.0 ** np.arange(A)).sum()  # far from uniform, which would hide how a grid slips
     envs = TabularVectorEnv(env_mdp, num_envs)
@@ -118,14 +118,14 @@ def p_value_of_copies(env_mdp, true_mdp, steps=4, num_envs=20_000):
         (grid(size=5, slip=0.3, traps=(12,), start=None), grid(size=5, slip=0.3, traps=(12,), start=12)),
     ],
 )
-def test_copies_are_distributed_as_the_exact_chain_says_and_a_wrong_chain_is_noticed(mdp, wrong):
+def test_states_are_distributed_as_in_the_exact_chain_and_a_wrong_chain_is_noticed(mdp, wrong):
     # A right sampler fails by chance with probability 1e-4 in each case, over the choice of the seed; it is fixed.
-    assert p_value_of_copies(mdp, mdp) > 1e-4
-    assert p_value_of_copies(wrong, mdp) < 1e-12
+    assert p_value_of_states(mdp, mdp) > 1e-4
+    assert p_value_of_states(wrong, mdp) < 1e-12
 
 
-def two_copies(mode, **kwargs):
-    """DeepSea-2 (states 0 1 / 2 3): copy 0 starts at the top left, copy 1 a step before its end."""
+def two_environments(mode, **kwargs):
+    """DeepSea-2 (states 0 1 / 2 3): environment 0 starts at the top left, 1 a step before its end."""
     envs = TabularVectorEnv(deep_sea(n=2, gamma=0.9, move_cost=0.0), 2, autoreset_mode=mode, **kwargs)
     states, info = envs.reset(seed=0, options={"state": [0, 2]})
     assert states.tolist() == [0, 2]
@@ -140,7 +140,7 @@ def plain(value):
 
 
 def test_same_step_by_hand():
-    envs = two_copies(AutoresetMode.SAME_STEP)
+    envs = two_environments(AutoresetMode.SAME_STEP)
     state, reward, terminated, truncated, info = envs.step([1, 0])
     assert (plain(state), plain(reward)) == ([3, 0], [0.0, 0.0])
     assert (plain(terminated), plain(truncated)) == ([False, True], [False, False])
@@ -158,7 +158,7 @@ def test_same_step_by_hand():
 
 
 def test_next_step_by_hand():
-    envs = two_copies(AutoresetMode.NEXT_STEP)
+    envs = two_environments(AutoresetMode.NEXT_STEP)
     state, _, terminated, _, info = envs.step([1, 0])
     assert (plain(state), plain(terminated)) == ([3, 2], [False, True])
     assert plain(info) == {"discount": [0.9, 0.0], "_discount": [True, True]}
@@ -171,7 +171,7 @@ def test_next_step_by_hand():
 
 
 def test_disabled_by_hand():
-    envs = two_copies(AutoresetMode.DISABLED)
+    envs = two_environments(AutoresetMode.DISABLED)
     state, _, terminated, _, info = envs.step([1, 0])
     assert (plain(state), plain(terminated)) == ([3, 2], [False, True])
     assert plain(info) == {"discount": [0.9, 0.0], "_discount": [True, True]}
@@ -183,7 +183,7 @@ def test_disabled_by_hand():
     assert (plain(state), plain(reward), plain(terminated)) == ([3, 3], [1.0, 0.0], [True, False])
 
 
-def test_a_truncated_copy_keeps_its_discount_and_starts_a_fresh_clock():
+def test_a_truncated_environment_keeps_its_discount_and_starts_a_fresh_clock():
     envs = TabularVectorEnv(ladder(n=3), 2, max_episode_steps=2, autoreset_mode="SameStep")
     envs.reset()
     envs.step([1, 1])
@@ -226,7 +226,7 @@ def test_the_same_seed_gives_the_same_bits_and_other_seeds_others():
     assert all(a != b for i, a in enumerate(different) for b in different[:i])
 
 
-def test_copies_of_one_seed_differ_from_each_other():
+def test_environments_of_one_seed_differ_from_each_other():
     columns = np.array(states_seen(TabularVectorEnv(random_mdp(50, start=None), 8), 0)).T.tolist()
     assert len({tuple(column) for column in columns}) == 8
 
@@ -239,8 +239,8 @@ def test_what_a_step_returns_is_not_changed_by_later_steps():
         kept += [*arrays, info["discount"], info["_discount"]]
     before = [array.copy() for array in kept]
     envs.step([0, 1, 0, 1])
-    for array, copy in zip(kept, before, strict=True):
-        np.testing.assert_array_equal(array, copy)
+    for array, expected in zip(kept, before, strict=True):
+        np.testing.assert_array_equal(array, expected)
 
 
 def test_writing_into_what_was_returned_changes_no_episode():
@@ -253,7 +253,7 @@ def test_writing_into_what_was_returned_changes_no_episode():
             array[:] = 0
 
 
-def test_resetting_one_finished_copy_leaves_the_other_finished():
+def test_resetting_one_finished_environment_leaves_the_other_finished():
     envs = TabularVectorEnv(ladder(), 2, max_episode_steps=1, autoreset_mode=AutoresetMode.DISABLED)
     envs.reset()
     envs.step([1, 1])
@@ -328,7 +328,7 @@ def test_a_wrong_list_of_seeds_is_named(seed):
         TabularVectorEnv(ladder(), 3).reset(seed=seed)
 
 
-def test_some_copies_cannot_be_reset_before_all_were():
+def test_some_environments_cannot_be_reset_before_all_were():
     with pytest.raises(
         ResetNeeded, match=r"Cannot reset some environments before env.reset\(\) has started all of them"
     ):

@@ -1,6 +1,5 @@
 """The exact theory: closed forms, second routes, theorems."""
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -10,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import PgtsError
 from pgts_torch.seeding import numpy_stream, stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, ladder, random_mdp, tightrope
@@ -20,6 +18,7 @@ from tests.support import (
     mdps,
     mdps_with_policy,
     random_policy,
+    rewarded,
     tree_lookahead,
     uniform_policy,
     weights,
@@ -139,29 +138,22 @@ def test_the_occupancy_lies_in_the_confidence_region_of_simulated_visits(name):
 def test_the_sparse_solver_agrees_with_the_dense_one_both_ways(name, monkeypatch):
     mdp = zoo(name)
     pi_SA = random_policy(mdp)
-    dense = exact.evaluate(mdp, pi_SA)
+    dense, optimum = exact.evaluate(mdp, pi_SA), exact.optimal(mdp)
     monkeypatch.setattr(exact, "DENSE_LIMIT", 0)
     sparse = exact.evaluate(mdp, pi_SA)
     assert_close(sparse.v_S, dense.v_S, 1e-9)
     assert_close(sparse.d_S, dense.d_S, 1e-9)
+    assert_close(exact.optimal(mdp).J, optimum.J, 1e-9)
     assert torch.equal(sparse.d_S == 0, dense.d_S == 0)
     assert differs(sparse.d_S, exact.occupancy(mdp, uniform_policy(mdp)))
 
 
-def test_the_sparse_solver_is_the_one_that_large_mdps_use(monkeypatch):
+def test_the_sparse_solver_is_the_one_that_large_mdps_use_and_reports_that_it_did_not_converge(monkeypatch):
     mdp = zoo("garnet")
-    monkeypatch.setattr(exact, "DENSE_LIMIT", mdp.num_states - 1)
-    monkeypatch.setattr(exact, "_solve_dense", None)
-    exact.evaluate(mdp, random_policy(mdp))
-    monkeypatch.setattr(exact, "DENSE_LIMIT", mdp.num_states)
-    with pytest.raises(TypeError):
-        exact.evaluate(mdp, random_policy(mdp))
-
-
-def test_the_sparse_solver_reports_that_it_did_not_converge(monkeypatch):
-    mdp = zoo("garnet")
-    monkeypatch.setattr(exact, "DENSE_LIMIT", 0)
     monkeypatch.setattr(exact, "SOLVE_TOLERANCE", 0.0)
+    monkeypatch.setattr(exact, "DENSE_LIMIT", mdp.num_states)
+    exact.evaluate(mdp, random_policy(mdp))
+    monkeypatch.setattr(exact, "DENSE_LIMIT", mdp.num_states - 1)
     with pytest.raises(PgtsError, match="the iterative solve of 30 states stopped at a residual"):
         exact.evaluate(mdp, random_policy(mdp))
 
@@ -230,13 +222,6 @@ def test_the_optimum_is_the_fixed_point_of_t_and_its_policy_attains_it(name):
     assert attained.J == pytest.approx(optimum.J)
     assert exact.evaluate(mdp, random_policy(mdp)).J < optimum.J
     assert optimum.pi_SA.sum(-1).tolist() == [1] * mdp.num_states
-
-
-def test_the_optimum_of_many_states_by_the_sparse_solver_is_the_dense_one(monkeypatch):
-    mdp = zoo("garnet")
-    dense = exact.optimal(mdp)
-    monkeypatch.setattr(exact, "DENSE_LIMIT", 0)
-    assert_close(exact.optimal(mdp).v_S, dense.v_S, 1e-9)
 
 
 # Lookahead
@@ -332,11 +317,6 @@ def test_lookahead_above_any_q_does_not_grow_with_depth():
     assert torch.any(exact.bellman(mdp, q_SA) < q_SA)
 
 
-def with_rewards(mdp: TabularMDP, reward_SA: Tensor) -> TabularMDP:
-    old = mdp.outcomes
-    return TabularMDP(Outcomes(reward_SA, old.prob_NAK, old.discount_NAK, old.child_NAK, mdp.num_states), mdp.start_S)
-
-
 garnets = st.builds(
     random_mdp, st.integers(1, 8), st.integers(1, 3), seed=st.integers(0, 1000), gamma=st.sampled_from([0.0, 0.5, 0.9])
 )
@@ -346,7 +326,7 @@ garnets = st.builds(
 def test_a_constant_above_all_rewards_adds_the_discounted_sum_of_it(mdp, c, depth):
     # T^m Q gains c + gamma c + ... + gamma^(m-1) c;   Q^pi, a fixed point, gains c / (1 - gamma) at every depth.
     gamma, q_SA, pi_SA = float(mdp.outcomes.discount_NAK[0, 0, 0]), some_q(mdp), random_policy(mdp)
-    richer = with_rewards(mdp, mdp.outcomes.reward_NA + c)
+    richer = rewarded(mdp, constant=c)
     gain_SA = exact.lookahead(richer, q_SA, depth) - exact.lookahead(mdp, q_SA, depth)
     assert_close(gain_SA, torch.full_like(q_SA, c * sum(gamma**k for k in range(depth))))
     old, new = exact.evaluate(mdp, pi_SA), exact.evaluate(richer, pi_SA)
@@ -364,13 +344,13 @@ def test_a_constant_above_the_leaves_is_discounted_once_a_level(mdp, c, depth):
 @given(mdps(), st.floats(0, 10), st.integers(0, 5))
 def test_lookahead_scales_with_rewards_and_leaves(mdp, factor, depth):
     q_SA = some_q(mdp)
-    scaled = with_rewards(mdp, factor * mdp.outcomes.reward_NA)
+    scaled = rewarded(mdp, factor=factor)
     assert_close(exact.lookahead(scaled, factor * q_SA, depth), factor * exact.lookahead(mdp, q_SA, depth))
 
 
 def test_lookahead_does_not_scale_with_a_negative_factor():
     mdp = zoo("garnet")
-    scaled, q_SA = with_rewards(mdp, -mdp.outcomes.reward_NA), some_q(mdp)
+    scaled, q_SA = rewarded(mdp, factor=-1), some_q(mdp)
     assert differs(exact.lookahead(scaled, -q_SA, 1), -exact.lookahead(mdp, q_SA, 1))
 
 
@@ -466,6 +446,4 @@ def test_a_float32_policy_is_evaluated_to_float32_accuracy_and_carries_no_gradie
 
 @pytest.mark.parametrize("unit", [1e-12, 1e12])
 def test_the_optimum_does_not_depend_on_the_unit_of_reward(unit):
-    mdp = ladder(5)
-    scaled = TabularMDP(dataclasses.replace(mdp.outcomes, reward_NA=unit * mdp.outcomes.reward_NA), mdp.start_S)
-    assert exact.optimal(scaled).J == pytest.approx(6.561 * unit, rel=1e-12)
+    assert exact.optimal(rewarded(ladder(5), factor=unit)).J == pytest.approx(6.561 * unit, rel=1e-12)

@@ -13,7 +13,7 @@ from pgts_torch.bellman import sweep
 from pgts_torch.errors import PgtsError
 from pgts_torch.seeding import numpy_stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, ladder, random_mdp, stationary, stationary_sets
-from tests.support import always, mdps, mdps_with_policy, random_policy
+from tests.support import always, mdps, mdps_with_policy, random_policy, rewarded
 from tests.tabular.brute import DEPTHS, EXACT, family, stationary_ones, with_ends
 
 fast = pytest.mark.usefixtures("unchecked_shapes")
@@ -59,8 +59,7 @@ def test_the_enumeration_does_not_depend_on_how_much_is_worked_on_at_once(entrie
 @fast
 def test_rewards_in_other_units_change_no_stationary_set(scale):
     for case in family()[:40]:
-        scaled = replace(case.mdp.outcomes, reward_NA=scale * case.mdp.outcomes.reward_NA)
-        sets = stationary_sets.enumerate_sets(replace(case.mdp, outcomes=scaled))
+        sets = stationary_sets.enumerate_sets(rewarded(case.mdp, factor=scale))
         assert torch.equal(sets.escape_P, case.sets.escape_P)
 
 
@@ -176,7 +175,7 @@ def test_the_depth_for_exactly_what_a_depth_allows_is_that_depth(gamma, depth):
     assert stationary.depth_for(mdp, eps * (1 - 1e-9)) == depth + 1
 
 
-def test_with_gamma_1_or_0_the_closed_form_says_what_it_can():
+def test_the_closed_form_is_infinite_at_gamma_1_and_needs_no_depth_at_gamma_0():
     undiscounted = deep_sea(4, gamma=1.0)
     assert stationary.closed_form_bound(undiscounted, 9) == math.inf
     assert [stationary.reachable_bound(undiscounted, depth) for depth in (2, 3)] == [math.inf, 0]
@@ -215,7 +214,7 @@ def test_the_certificate_is_never_below_the_truth_and_never_grows_with_depth(mdp
 
 
 @fast
-def test_the_certificate_is_never_below_the_truth_on_sparse_mdps_and_values_in_place_of_hope_would_be():
+def test_the_certificate_is_never_below_the_truth_on_sparse_mdps_and_one_from_values_would_be():
     wrong = 0
     for seed, case in enumerate(family()[::4]):
         pi_SA = random_policy(case.mdp, seed)
@@ -241,21 +240,21 @@ def test_the_certificate_is_exact_where_the_expanded_states_are_closed():
 
 
 @fast
-def test_nothing_smaller_than_the_certificate_follows():
+def test_an_mdp_that_looks_the_same_to_the_lookahead_attains_the_certificate():
     hidden = 0
     for seed, case in enumerate(family()[2::3]):
         mdp, pi_SA = case.mdp, random_policy(case.mdp, seed)
         outcomes = mdp.outcomes
         expanded_S = torch.from_numpy(case.reached_S(0) | case.reached_S(1))
         stays_SA1 = torch.arange(mdp.num_states)[:, None, None].expand(outcomes.child_NAK.shape)
-        paradise = replace(
+        best = replace(
             outcomes,
             reward_NA=torch.where(expanded_S[:, None], outcomes.reward_NA, outcomes.reward_NA.max()),
             child_NAK=torch.where(expanded_S[:, None, None], outcomes.child_NAK, stays_SA1),
         )
-        other = exact.optimal(replace(mdp, outcomes=paradise))
-        promised = stationary.certificate(mdp, pi_SA, 1) + exact.evaluate(mdp, pi_SA).J
-        assert promised == pytest.approx(other.J, abs=EXACT)
+        other = exact.optimal(replace(mdp, outcomes=best))
+        attained = stationary.certificate(mdp, pi_SA, 1) + exact.evaluate(mdp, pi_SA).J
+        assert attained == pytest.approx(other.J, abs=EXACT)
         hidden += not bool(expanded_S.all())
     assert hidden > 10
 
@@ -284,9 +283,9 @@ def test_a_certificate_at_gamma_1_is_infinite_until_the_paths_have_ended():
 
 
 @pytest.mark.parametrize("gamma", [0.9, 1.0])
-def test_where_everything_costs_hope_is_to_pay_once_and_end(gamma):
+def test_where_every_reward_is_negative_the_best_that_may_follow_is_one_more_and_an_end(gamma):
     mdp = with_ends(random_mdp(6, 2, branching=2, seed=3, gamma=0.9), 3)
-    costs = replace(mdp, outcomes=replace(mdp.outcomes, reward_NA=-1 - mdp.outcomes.reward_NA))
+    costs = rewarded(mdp, factor=-1, constant=-1)
     pi_SA = random_policy(costs)
     lack = exact.optimal(costs).J - exact.evaluate(costs, pi_SA).J
     first = stationary.certificate(costs, pi_SA, 0)

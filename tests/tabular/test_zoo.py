@@ -153,8 +153,8 @@ def test_a_move_into_the_wall_of_the_grid_stays():
 def test_goal_and_traps_of_the_grid_pay_every_action():
     expected = {(99, a): 10.0 for a in range(4)} | {(s, a): -10.0 for s in (12, 32) for a in range(4)}
     assert rewards(grid()) == pytest.approx(expected, rel=1e-15)
-    drawn = grid(traps=(11, 32), goal=98, goal_reward=1.0, trap_reward=-2.0)
-    assert {s: r for (s, _), r in rewards(drawn).items()} == pytest.approx({98: 1.0, 11: -2.0, 32: -2.0}, rel=1e-15)
+    other = grid(traps=(11, 32), goal=98, goal_reward=1.0, trap_reward=-2.0)
+    assert {s: r for (s, _), r in rewards(other).items()} == pytest.approx({98: 1.0, 11: -2.0, 32: -2.0}, rel=1e-15)
 
 
 def test_the_plain_grid_goes_on_after_goal_and_traps():
@@ -235,7 +235,7 @@ def test_the_treasure_of_deep_sea_is_worth_its_discount_minus_the_way():
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
-def test_the_mapping_seed_of_deep_sea_draws_which_action_is_right():
+def test_the_mapping_seed_of_deep_sea_chooses_which_action_is_right():
     maps = [right_actions(deep_sea(10, mapping_seed=seed), 10) for seed in (0, 0, 1)]
     assert np.array_equal(maps[0], maps[1])
     assert not np.array_equal(maps[0], maps[2])
