@@ -83,6 +83,6 @@ class DepthChoice:
             gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
             bound = self._certificates.bound(starts, (state_N, v_N, occupancy_N), look, depth, draws.number + 1)
             is_enough = self.stop_at is not None and bound.certificate <= self.stop_at
-            if is_enough or float(gap_N @ occupancy_N) > self.tolerance * bound.visited:
+            if is_enough or float(gap_N.double() @ occupancy_N) > self.tolerance * bound.visited:
                 break
         return Chosen(depth, look, gap_N, bound.certificate, is_enough)
