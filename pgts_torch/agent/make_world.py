@@ -146,7 +146,7 @@ def _first_model(
     env, reasons = request.env, list[str]()
     if type(env) is TabularVectorEnv:
         _check_single(request.action_repeat, "in a table")
-        return TabularWorld(env, env.mdp, device=request.device), []
+        return TabularWorld(env, env.mdp, observation_key=request.observation_key, device=request.device), []
     if type(env) is not SyncVectorEnv:
         return None, [f"{request.name} is a VectorEnv of unknown kind; a simulator needs a SyncVectorEnv"]
     try:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from pgts_torch.agent.observations import Observations
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import Model, promise
-from pgts_torch.models.classic import ClassicModel
-from pgts_torch.models.environments import draws_its_own
+from pgts_torch.models.base import Model
+from pgts_torch.models.dynamics import DynamicsModel
+from pgts_torch.models.provenance import draws_its_own
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import each_of
@@ -64,11 +64,8 @@ class World:
         self.observation_space = self.observations.space
 
     def encode(self, observation: Any) -> Tensor:
-        """Return one observation of an environment, or rows of them, as the tensor that a policy takes.
-
-        Raises:
-            PgtsError: it is not in the observation space of this environment, or not finite.
-        """
+        """Return one observation of an environment, or rows of them, as the tensor that a policy takes; PgtsError
+        unless they are finite and in its observation space."""
         return self.observations.encode(observation)
 
     def of(self, env: VectorEnv) -> "World":
@@ -93,8 +90,10 @@ class World:
             happens_SAK = self.mdp.outcomes.prob_NAK > 0
             reward_range.check(self.mdp.outcome_reward_SAK[happens_SAK])
         self.reward_range = reward_range
-        if self.model is not None:
-            promise(self.model, reward_range, gamma=self.gamma)
+        if (model := self.model) is not None:
+            low, high = reward_range.values(self.gamma)
+            model.reward_range = reward_range
+            model.lowest_value, model.highest_value = max(model.lowest_value, low), min(model.highest_value, high)
 
     @cached_property
     def draws_its_own(self) -> bool:
@@ -148,20 +147,18 @@ class TabularWorld(ModelWorld):
     """Environments with a transition table: the observation is the state.
 
     Args:
-        env: the environments.
         mdp: the table.
         starts_known: whether the start distribution of the table is that of the environment; False: it was
             estimated from resets.
+        env, observation_key, device: as in `World`.
     """
 
     keeps_numbers = True
 
-    def __init__(
-        self, env: VectorEnv, mdp: TabularMDP, *, starts_known: bool = True, device: torch.device | str = "cpu"
-    ) -> None:
-        super().__init__(env, gamma=float(mdp.outcomes.discount_NAK.max()), device=device)
+    def __init__(self, env: VectorEnv, mdp: TabularMDP, *, starts_known: bool = True, **options: Any) -> None:
+        super().__init__(env, gamma=float(mdp.outcomes.discount_NAK.max()), **options)
         self.mdp, self.starts_known = mdp, starts_known
-        self.model: TabularModel = TabularModel(mdp, device=device)
+        self.model: TabularModel = TabularModel(mdp, device=self.device)
         self.start_S = mdp.start_S.to(self.device) if starts_known else None
 
     @property
@@ -170,23 +167,18 @@ class TabularWorld(ModelWorld):
         return self.model.num_states, self.num_actions
 
     def read(self, observation: Any, encoded_B: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
-        """The observations, because they are the states."""
         return encoded_B
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
-        """The observations, because they are the states."""
         return read_N
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """The states, because they are the observations."""
         return state_N
 
     def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """The states, on the CPU."""
         return state_N.cpu()
 
     def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
-        """The exported states; their numbers are the same in all processes."""
         return exported.to(self.device)
 
     def reset_numbers(self) -> None:
@@ -198,20 +190,12 @@ class SimulatedWorld(ModelWorld):
     """Environments that can be restored from snapshots. A state is the number of a snapshot.
 
     Args:
-        env: the environments, as single ones.
         model: a simulator of the same environment.
-        observation_key: the entry of dictionary observations that is used.
+        env, observation_key, device: as in `World`.
     """
 
-    def __init__(
-        self,
-        env: SyncVectorEnv,
-        model: SimulatorModel,
-        *,
-        observation_key: str | None = None,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        super().__init__(env, gamma=model.gamma, observation_key=observation_key, device=device)
+    def __init__(self, env: SyncVectorEnv, model: SimulatorModel, **options: Any) -> None:
+        super().__init__(env, gamma=model.gamma, **options)
         self.model: SimulatorModel = model
         self._envs = env.envs
 
@@ -220,7 +204,6 @@ class SimulatedWorld(ModelWorld):
         return self.model.roots(self._envs, iterate(self.env.observation_space, observation)).to(self.device)
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
-        """The numbers that `read` has returned."""
         return read_N
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
@@ -233,7 +216,6 @@ class SimulatedWorld(ModelWorld):
         return self.model.export(distinct), index_N.cpu()
 
     def adopt(self, exported: tuple[list[Any], Tensor]) -> Int[Tensor, "N"]:
-        """The numbers of the exported snapshots: new ones, or those of equal snapshots."""
         snapshots, index_N = exported
         return self.model.adopt(snapshots).to(self.device)[index_N.to(self.device)]
 
@@ -244,25 +226,21 @@ class SimulatedWorld(ModelWorld):
 
 @final
 class DynamicsWorld(ModelWorld):
-    """Environments whose dynamics are written in torch. A state is the number of a vector, read from the environment.
+    """Environments whose dynamics, `model`, are written in torch. A state is the number of a vector.
 
     Args:
-        env: the environments, as single ones.
-        model: their dynamics.
         observation_key: the entry of dictionary observations that is used, where a wrapper makes dictionaries.
     """
 
-    def __init__(self, env: SyncVectorEnv, model: ClassicModel, *, observation_key: str | None = None) -> None:
+    def __init__(self, env: SyncVectorEnv, model: DynamicsModel, *, observation_key: str | None = None) -> None:
         super().__init__(env, gamma=model.gamma, observation_key=observation_key, device=model.device)
-        self.model: ClassicModel = model
+        self.model: DynamicsModel = model
         self._envs = env.envs
 
     def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B D"]:
-        """The state vector of each environment."""
         return self.model.vectors(self._envs)
 
     def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
-        """The numbers of state vectors; equal vectors have the same number."""
         return self.model.number(read_N)
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
@@ -274,11 +252,9 @@ class DynamicsWorld(ModelWorld):
         return self.observations.encode_part(np.array(rows, self.observations.space.dtype))
 
     def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """The state vectors, on the CPU."""
         return self.model.states(state_N).cpu()
 
     def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
-        """The numbers of the exported vectors: new ones, or those of equal vectors."""
         return self.numbers(exported.to(self.device))
 
     def reset_numbers(self) -> None:

@@ -149,13 +149,6 @@ class LearningModel(Model):
         """Load what `state_dict` returned; PgtsError if it does not fit."""
 
 
-def promise(model: Model, reward_range: RewardRange, *, gamma: float) -> None:
-    """Give a model a range that its rewards must be in, and the bounds of its values that follow."""
-    low, high = reward_range.values(gamma)
-    model.reward_range = reward_range
-    model.lowest_value, model.highest_value = max(model.lowest_value, low), min(model.highest_value, high)
-
-
 class EnumeratingModel(Model):
     """A model that enumerates all outcomes of a state.
 
@@ -185,11 +178,5 @@ class SamplingModel(Model):
 
 def step_text(reward: float, discount: float, then: str) -> str:
     """A step in a message: its reward, and what came after it."""
-    return f"reward {_exactly(reward)}, " + (
-        "an end" if discount == 0 else f"discount {_exactly(discount)}, then {then}"
-    )
-
-
-def _exactly(x: float) -> str:
-    short = f"{x:g}"
-    return short if float(short) == x else repr(x)
+    reward_text, discount_text = (f"{x:g}" if float(f"{x:g}") == x else repr(x) for x in (reward, discount))
+    return f"reward {reward_text}, " + ("an end" if discount == 0 else f"discount {discount_text}, then {then}")

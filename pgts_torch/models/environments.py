@@ -5,7 +5,8 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Any, final
 
 import gymnasium
@@ -30,31 +31,27 @@ _Maker = Callable[..., gymnasium.Env]
 
 
 @final
+@dataclass(eq=False)
 class EnvSource:
     """What environments are made from. `EnvSource.of` reads what a user gives; everything else takes this.
 
-    Attributes:
-        name: what errors call it.
-        description: what a saved model says of it, its id; None where it was given as an object, which no file holds.
-        given: environments that were given as a VectorEnv, to train in; None: some are made for that, too.
-        time_limit: the most steps of an episode, as it is registered or by a TimeLimit around it; None: no limit.
+    name: what errors call it.
+    makers: each makes one environment; several take turns.
+    spec: as it is registered; None where that is unknown.
+    description: what a saved model says of it, its id; None where it was given as an object, which no file holds.
+    given: environments that were given as a VectorEnv, to train in; None: some are made for that, too.
+    make_together: makes `num_envs` that step together; None: `makers` do.
+    actions_per_dimension: as in `of`.
     """
 
-    def __init__(
-        self,
-        name: str,
-        makers: Sequence[_Maker],
-        *,
-        spec: EnvSpec | None = None,
-        description: str | None = None,
-        given: VectorEnv | None = None,
-        make_together: Callable[[int], VectorEnv] | None = None,
-        actions_per_dimension: int | None = None,
-    ) -> None:
-        self.name, self.description, self.given = name, description, given
-        self._makers, self._spec, self._make_together = makers, spec, make_together
-        self._actions_per_dimension = actions_per_dimension
-        self._known = weakref.WeakValueDictionary[int, gymnasium.Env]()
+    name: str
+    makers: Sequence[_Maker]
+    spec: EnvSpec | None = None
+    description: str | None = None
+    given: VectorEnv | None = None
+    make_together: Callable[..., VectorEnv] | None = None
+    actions_per_dimension: int | None = None
+    _known: weakref.WeakValueDictionary[int, gymnasium.Env] = field(default_factory=weakref.WeakValueDictionary)
 
     @classmethod
     def of(
@@ -85,19 +82,15 @@ class EnvSource:
         if kwargs:
             raise PgtsError(f"env_kwargs is {kwargs}; an environment that is given as an object takes none")
         if isinstance(env, VectorEnv):
-            if (count := actions_per_dimension) is not None:
-                raise PgtsError(
-                    f"actions_per_dimension is {count}; a VectorEnv takes its own actions, make them discrete"
-                )
+            if (n := actions_per_dimension) is not None:
+                raise PgtsError(f"actions_per_dimension is {n}; a VectorEnv takes its own actions, make them discrete")
             return cls._of_several(env)
         if isinstance(env, gymnasium.Env):
             env = _spec_like(env)
         if isinstance(env, EnvSpec):
-            make = _registered(env)
-            return cls(env.id, [make], spec=env, actions_per_dimension=actions_per_dimension)
+            return cls(env.id, [_registered(env)], spec=env, actions_per_dimension=actions_per_dimension)
         if callable(env):
-            function = env
-            name = getattr(function, "__name__", str(function))
+            name, function = getattr(env, "__name__", str(env)), env
             return cls(name, [lambda **_: function()], actions_per_dimension=actions_per_dimension)
         raise PgtsError(
             f"the environment is {env!r}; it must be a Gymnasium id, an environment, a function that makes one, or a "
@@ -108,16 +101,16 @@ class EnvSource:
     def _of_id(cls, env_id: str, kwargs: dict[str, Any], gamma: float | None, count: int | None) -> "EnvSource":
         _import(env_id)
         spec = gymnasium.registry.get(env_id.rpartition(":")[2])
-        if spec is None or spec.namespace != "pgts":
-            make = _registered(env_id, **kwargs)
-            return cls(env_id, [make], spec=spec, description=env_id, actions_per_dimension=count)
-        if count is not None:
+        ours = spec is not None and spec.namespace == "pgts"
+        if ours and count is not None:
             raise PgtsError(f"actions_per_dimension is {count}; {env_id} has discrete actions")
-        kwargs |= {} if gamma is None else {"gamma": gamma}
-        options: dict[str, Any] = {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.DISABLED}
-        options |= {"max_episode_steps": -1, **kwargs}
-        together: Callable[[int], VectorEnv] = lambda n: gymnasium.make_vec(env_id, num_envs=n, **options)  # noqa: E731
-        return cls(env_id, [_registered(env_id, **kwargs)], spec=spec, description=env_id, make_together=together)
+        kwargs |= {"gamma": gamma} if ours and gamma is not None else {}
+        make = _registered(env_id, **kwargs)
+        source = cls(env_id, [make], spec=spec, description=env_id, actions_per_dimension=count)
+        if ours:
+            modes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.DISABLED}
+            source.make_together = partial(gymnasium.make_vec, env_id, **modes, **{"max_episode_steps": -1} | kwargs)
+        return source
 
     @classmethod
     def _of_several(cls, env: VectorEnv) -> "EnvSource":
@@ -139,8 +132,8 @@ class EnvSource:
         """
         check_count("num_envs", num_envs)
         with _making(self.name):
-            if self._make_together is not None:
-                return self._make_together(num_envs)
+            if self.make_together is not None:
+                return self.make_together(num_envs=num_envs)
             makers = [lambda k=k: self.like(k) for k in range(num_envs)]
             made = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
         check_vector_env(made)
@@ -150,11 +143,25 @@ class EnvSource:
 
     def like(self, k: int = 0) -> gymnasium.Env:
         """A new environment, as environment k of those that `make` gives."""
-        return numbered(self._new(k, max_episode_steps=-1), per_dimension=self._actions_per_dimension)
+        return numbered(self.make_one(k, max_episode_steps=-1), per_dimension=self.actions_per_dimension)
 
-    def make_one(self) -> gymnasium.Env:
-        """A new environment as it is registered or given, with its own actions and time limit; PgtsError as `make`."""
-        return self._new()
+    def make_one(self, k: int = 0, **options: Any) -> gymnasium.Env:
+        """A new environment as it is registered or given, with its own actions and time limit; PgtsError as `make`.
+
+        Args:
+            k: which of several makers makes it.
+            options: for gymnasium.make, of an id or a spec.
+        """
+        if not self.makers:
+            raise PgtsError(
+                f"{self.name} was given as a VectorEnv of which no others can be made; give a SyncVectorEnv or an id"
+            )
+        with _making(self.name):
+            made = self.makers[k % len(self.makers)](**options)
+        if not isinstance(made, gymnasium.Env):
+            raise PgtsError(f"{self.name} gave {made!r}; it must be a Gymnasium environment")
+        self._check_new(made)
+        return made
 
     def own_actions(self, envs: VectorEnv) -> np.ndarray | None:
         """What the numbers of the actions stand for in environments that `make` gave, a row each; None: the numbers
@@ -165,25 +172,13 @@ class EnvSource:
     @cached_property
     def time_limit(self) -> int | None:
         """The most steps of an episode, as registered or by a TimeLimit around the environment; None: no limit."""
-        spec, limits = self._spec, list[int]()
-        if spec is None and self._makers:
+        spec, limits = self.spec, list[int]()
+        if spec is None and self.makers:
             env = self.make_one() if self.given is None else each_of(self.given)[0]
             spec = env.spec
             limits = [each._max_episode_steps for each in wrappers_of(env) if isinstance(each, TimeLimit)]
         limit = min(limits, default=None) if spec is None else spec.max_episode_steps
         return limit if limit is not None and limit > 0 else None
-
-    def _new(self, k: int = 0, **options: Any) -> gymnasium.Env:
-        if not self._makers:
-            raise PgtsError(
-                f"{self.name} was given as a VectorEnv of which no others can be made; give a SyncVectorEnv or an id"
-            )
-        with _making(self.name):
-            made = self._makers[k % len(self._makers)](**options)
-        if not isinstance(made, gymnasium.Env):
-            raise PgtsError(f"{self.name} gave {made!r}; it must be a Gymnasium environment")
-        self._check_new(made)
-        return made
 
     def _check_new(self, env: gymnasium.Env) -> None:
         """PgtsError if this environment was made before."""
@@ -291,32 +286,13 @@ _MODULES = {"MiniGrid-": ("minigrid", "envs"), "BabyAI-": ("minigrid", "envs"), 
 
 
 def _import(env_id: str) -> None:
-    """Import what registers an environment with Gymnasium: the module of `MODULE:ID`, or one that is known.
-
-    Raises:
-        PgtsError: it is not installed; the message names the extra, if there is one.
-    """
+    """Import what registers an environment with Gymnasium, the module of `MODULE:ID` or a known one; PgtsError if it is
+    not installed, which names the extra, if there is one."""
     own, colon, _ = env_id.rpartition(":")
-    if colon:
+    needed = [(own, "")] if colon else []
+    for module, extra in needed + [needs for start, needs in _MODULES.items() if env_id.startswith(start)]:
         try:
-            importlib.import_module(own)
+            importlib.import_module(module)
         except ModuleNotFoundError as error:
-            raise PgtsError(f"{env_id} cannot be made: {error}") from error
-    for start, (module, extra) in _MODULES.items():
-        if env_id.startswith(start):
-            try:
-                importlib.import_module(module)
-            except ModuleNotFoundError as error:
-                raise PgtsError(f"{env_id} needs {module}: pip install 'pgts_torch[{extra}]'") from error
-
-
-_OWN_GENERATORS = ("gymnasium.envs.toy_text.", "gymnasium.envs.classic_control.", "pgts_torch.envs.")
-_WITHOUT_GENERATORS = ("gymnasium.wrappers.common", Numbered.__module__)
-
-
-def draws_its_own(env: Any) -> bool:
-    """Whether an environment is known to draw from generators of its own alone, and never from those of a process."""
-    around, base = wrappers_of(env), env.unwrapped
-    known = all(type(wrapper).__module__ in _WITHOUT_GENERATORS for wrapper in around)
-    changed = any({"step", "reset"} & vars(each).keys() for each in (*around, base))
-    return known and not changed and type(base).__module__.startswith(_OWN_GENERATORS)
+            why = f"needs {module}: pip install 'pgts_torch[{extra}]'" if extra else f"cannot be made: {error}"
+            raise PgtsError(f"{env_id} {why}") from error

@@ -1,10 +1,12 @@
-"""Whether an environment runs the code that a model was written for: the `step` and `reset` of one class."""
+"""Whether an environment runs code that is known: the `step` and `reset` of one class, and its generators."""
 
 import dis
 import functools
 import inspect
 import types
 from typing import Any
+
+from pgts_torch.models.wrappers import wrappers_of
 
 _ALWAYS = ("__getattribute__", "__setattr__", "__getattr__")
 _NO_MATTER = frozenset({"render", "close", "render_mode", "metadata", "_np_random", "_np_random_seed"})
@@ -68,3 +70,15 @@ def _codes_of(value: Any) -> list[types.CodeType]:
         codes.append(waiting.pop())
         waiting += [inner for inner in codes[-1].co_consts if isinstance(inner, types.CodeType)]
     return codes
+
+
+_OWN_GENERATORS = ("gymnasium.envs.toy_text.", "gymnasium.envs.classic_control.", "pgts_torch.envs.")
+_WITHOUT_GENERATORS = ("gymnasium.wrappers.common", "pgts_torch.models.actions")
+
+
+def draws_its_own(env: Any) -> bool:
+    """Whether an environment is known to draw from generators of its own alone, and never from those of a process."""
+    around, base = wrappers_of(env), env.unwrapped
+    known = all(type(wrapper).__module__ in _WITHOUT_GENERATORS for wrapper in around)
+    changed = any({"step", "reset"} & vars(each).keys() for each in (*around, base))
+    return known and not changed and type(base).__module__.startswith(_OWN_GENERATORS)

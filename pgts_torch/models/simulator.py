@@ -9,13 +9,12 @@ from typing import Any, final
 import gymnasium
 import numpy as np
 import torch
-from gymnasium import spaces
 from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, failure
-from pgts_torch.models.answers import Answers, Step, copied
+from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, check_count, failure
+from pgts_torch.models.answers import Answers, Step
 from pgts_torch.models.base import (
     CONTRADICTED,
     NOT_QUERIED,
@@ -27,8 +26,10 @@ from pgts_torch.models.base import (
     Transitions,
     step_text,
 )
-from pgts_torch.models.environments import Given, draws_its_own
-from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
+from pgts_torch.models.environments import Given
+from pgts_torch.models.provenance import draws_its_own
+from pgts_torch.models.snapshot_model import SnapshotModel
+from pgts_torch.models.snapshots import SnapshotAdapter, env_name
 from pgts_torch.models.stepper import Stepper
 from pgts_torch.seeding import SharedGenerators
 
@@ -37,7 +38,7 @@ _KEY_OF_CERTAINTY = 0
 
 
 @final
-class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
+class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel):
     """An instance of a Gymnasium environment that is put into a state and stepped, to find what may follow an action.
 
     The instance is used by the model alone, so queries never touch the environment that an agent acts in. What its
@@ -69,9 +70,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
             1, or above 1 beside a highest value.
     """
 
-    kind, is_cheap = "simulator", False
-
-    num_outcomes = 1
+    kind, is_cheap, num_outcomes = "simulator", False, 1
 
     def __init__(
         self,
@@ -88,21 +87,18 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
     ) -> None:
         if not 0 <= gamma <= 1:
             raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
-        if action_repeat < 1:
-            raise PgtsError(f"action_repeat is {action_repeat}; it must be at least 1")
+        check_count("action_repeat", action_repeat)
         if action_repeat > 1 and highest_value < math.inf:
             raise PgtsError(f"highest_value is {highest_value}; under repeated actions no bound of v* stays one")
-        self.action_repeat = action_repeat
-        self._stepper = Stepper(env, gamma=gamma, actions=actions, adapter=adapter)
-        self.name, self.env, self.actions = self._stepper.name, self._stepper.env, self._stepper.actions
-        self.adapter, self.transforms = self._stepper.adapter, self._stepper.transforms
+        self._stepper = stepper = Stepper(env, gamma=gamma, actions=actions, adapter=adapter)
+        super().__init__(stepper.name, stepper.space, observe, device)
+        self.action_repeat, self.adapter, self.actions = action_repeat, stepper.adapter, stepper.actions
         self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value
-        self.device, self.dtype = torch.empty(0, device=device).device, dtype
-        self._observe = observe
-        self._draws_its_own = draws_its_own(self._stepper.made)
+        self.dtype = dtype
+        self._draws_its_own = draws_its_own(stepper.made)
         self._sure = Answers()
-        self.generation = -1
-        self.clear()
+        # The instances whose class, map and constants were compared with the model's own.
+        self._compared: list[Any] = []
 
     @property
     def simulator_steps(self) -> int:  # type: ignore[override]
@@ -111,14 +107,9 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
 
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
-        self.generation += 1
-        # By number: the snapshot of a state, and its observation, None where that is unknown. By snapshot: the number.
-        self.num_states = 0
-        self._snapshots: list[Snapshot] = []
-        self._observations: list[Any] = []
-        self._number: dict[tuple[bytes, bool], int] = {}
+        super().clear()
         self._sure.bound()
-        self._known_worlds: list[Any] = []
+        self._compared.clear()
 
     def root(self, env: gymnasium.Env, observation: Any = None) -> int:
         """The number of the state that another instance of this environment is in. Nothing of that instance changes.
@@ -130,82 +121,20 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         Raises:
             PgtsError: it is another environment, or has another map or other constants than the model's.
         """
-        # Each instance is compared with the model's own once.
         base: Any = env.unwrapped
-        if not any(base is known for known in self._known_worlds):
-            if not self.adapter.same_world(base, self.env):
+        if not any(base is known for known in self._compared):
+            if not self.adapter.same_world(base, self._stepper.env):
                 raise PgtsError(
                     f"{env_name(env)} is not the environment that the model was made from ({self.name}): its class, "
                     "map or constants differ; make both with the same arguments"
                 )
-            self._known_worlds.append(base)
+            self._compared.append(base)
         return self.number(self.adapter.get_state(base), observation)
 
     def roots(self, envs: Iterable[gymnasium.Env], observations: Iterable[Any] | None = None) -> Int[Tensor, "B"]:
         """`root` of each of several instances."""
         pairs = zip(envs, itertools.repeat(None) if observations is None else observations, strict=False)
         return torch.tensor([self.root(*pair) for pair in pairs], dtype=torch.int64, device=self.device)
-
-    def number(self, snapshot: Snapshot, observation: Any = None) -> int:
-        """The number of a state: a new one if no equal state was met before."""
-        number = self._known(snapshot, None)
-        if self._observations[number] is None and observation is not None:
-            self._see(number, observation)
-        return number
-
-    def _see(self, number: int, observation: Any) -> None:
-        seen = self._observe(observation) if self._observe else observation
-        # Copied, because an environment may write into the arrays that it has returned.
-        self._observations[number] = copied(seen)
-
-    def _known(self, snapshot: Snapshot, seen: Any) -> int:
-        """The number of a state with this observation (as `observe` has made it, or None)."""
-        number = self._number.setdefault(snapshot.name, self.num_states)
-        if number == self.num_states:
-            self.num_states += 1
-            self._snapshots.append(snapshot)
-            self._observations.append(seen)
-        elif self._observations[number] is None:
-            self._observations[number] = seen
-        return number
-
-    def export(self, state_N: Int[Tensor, "N"]) -> list[tuple[Snapshot, Any]]:
-        """The snapshot of each state and what `observe` made of its observation, for `adopt` in another process."""
-        return [(self.snapshot(state), self._observations[state]) for state in state_N.tolist()]
-
-    def adopt(self, exported: Iterable[tuple[Snapshot, Any]]) -> Int[Tensor, "N"]:
-        """The numbers of states that another model of the same environment has exported."""
-        return torch.tensor([self._known(*one) for one in exported], dtype=torch.int64, device=self.device)
-
-    def snapshot(self, state: int) -> Snapshot:
-        """The snapshot behind the number of a state."""
-        self._check("state", state, self.num_states)
-        return self._snapshots[state]
-
-    def observations(self, state_N: Int[Tensor, "N"]) -> np.ndarray:
-        """What `observe` made of the observation of each state, stacked: [N, ...].
-
-        Without `observe` that is [N, *shape] of a Box, [N] of a Discrete space, and `gymnasium.spaces.flatten` of any
-        other, in the dtype of the space.
-
-        Raises:
-            PgtsError: one of them is not known, because a root was given without it; or it cannot be flattened.
-        """
-        rows = []
-        for state in state_N.tolist():
-            self._check("state", state, self.num_states)
-            if self._observations[state] is None:
-                raise PgtsError(
-                    f"{self.name}: the observation of state {state} was not given, or `observe` made it None"
-                )
-            rows.append(self._observations[state])
-        space = self._stepper.space
-        if self._observe is None and not isinstance(space, spaces.Box | spaces.Discrete):
-            try:
-                rows = [spaces.flatten(space, row) for row in rows]
-            except NotImplementedError:
-                raise PgtsError(f"{self.name}: {space} cannot be flattened: give `observe`") from None
-        return np.asarray(rows)
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
         """The one outcome of each (state, action), in an environment that is not random there.
@@ -224,15 +153,10 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
                         "enumerated; search it by `sampled`, or make a TabularModel of it if it has a table P"
                     )
                 steps.append(step)
-        reward_N, discount_N, child_N = self._answer(steps)
-        shape = len(state_N), self.num_actions
-        return Outcomes(
-            reward_N.view(shape),
-            torch.ones(*shape, 1, dtype=self.dtype, device=self.device),
-            discount_N.view(*shape, 1),
-            child_N.view(*shape, 1),
-            self.num_states,
-        )
+        answer, shape = self._answer(steps), (len(state_N), self.num_actions, 1)
+        certain_NAK = torch.ones(shape, dtype=self.dtype, device=self.device)
+        reward_NA, discount_NAK = answer.reward_N.view(shape[:2]), answer.discount_N.view(shape)
+        return Outcomes(reward_NA, certain_NAK, discount_NAK, answer.next_state_N.view(shape), self.num_states)
 
     def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
         """One outcome of each (state, action): restore the state, seed the generator by the key, step.
@@ -243,7 +167,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         """
         queries = zip(state_N.tolist(), action_N.tolist(), key_N.tolist(), strict=True)
         with self._watched():
-            return Transitions(*self._answer([self._step(*one, repeat=self.action_repeat) for one in queries]))
+            return self._answer([self._step(*one, repeat=self.action_repeat) for one in queries])
 
     def is_random(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Whether chance decides what follows each (state, action), by a step of the simulator; raises as `sample`."""
@@ -272,12 +196,12 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
                 "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
             )
 
-    def _answer(self, steps: Sequence[Step]) -> tuple[Tensor, Tensor, Tensor]:
-        """Rewards, discounts and children."""
-        return (
+    def _answer(self, steps: Sequence[Step]) -> Transitions:
+        child = [self._number[step.child.name] for step in steps]
+        return Transitions(
             torch.tensor([step.reward for step in steps], dtype=self.dtype, device=self.device),
             torch.tensor([step.discount for step in steps], dtype=self.dtype, device=self.device),
-            torch.tensor([self._number[step.child.name] for step in steps], dtype=torch.int64, device=self.device),
+            torch.tensor(child, dtype=torch.int64, device=self.device),
         )
 
     def outcome_of(self, happened: Happened, *, query_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
@@ -302,12 +226,6 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         if step.reward != reward or step.discount != discount or (step.child.cut and follows):
             return CONTRADICTED
         return 0 if discount == 0 or self.adapter.same_state(step.child, self._snapshots[next_state]) else CONTRADICTED
-
-    def state_text(self, state: int) -> str:
-        """With its observation, or else its snapshot."""
-        seen = self._observations[state]
-        what = repr(self._snapshots[state].key) if seen is None else np.array2string(np.asarray(seen), threshold=20)
-        return f"state {state} ({what})"
 
     def outcomes_text(self, state: int, action: int) -> str:
         """The one outcome of a single step."""
@@ -334,8 +252,7 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
                 at.data, taken, key, repeat=repeat, rewards=self.reward_range
             )
             child = self._known(reached, None)
-            if self._observations[child] is None:
-                self._see(child, self._stepper.observation(total))
+            self._observe_once(child, lambda: self._stepper.observation(total))
         except BaseException as error:
             where = f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}"
             raise failure(where, error) from error
@@ -343,7 +260,3 @@ class SimulatorModel(EnumeratingModel, SamplingModel, ExactModel):
         if not random:
             self._sure.add(query, step)
         return step
-
-    def _check(self, what: str, number: int, count: int) -> None:
-        if not 0 <= number < count:
-            raise PgtsError(f"{self.name}: {what} {number} does not exist; there are {count}, from 0 on")

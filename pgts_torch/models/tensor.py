@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.models.base import CONTRADICTED, EnumeratingModel, Happened, SamplingModel, Transitions, step_text
 from pgts_torch.models.state_index import Merge, StateIndex
 
@@ -45,10 +45,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
         dtype: of rewards, discounts and values.
         device: where everything lies.
         merge: whether equal states get one number (`StateIndex`).
-        action_repeat: k, how often an action is taken in one outcome.
-
-    Raises:
-        PgtsError: action_repeat is below 1.
+        action_repeat: k, how often an action is taken in one outcome, at least 1.
     """
 
     num_outcomes = 1
@@ -64,8 +61,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
         merge: Merge = "auto",
         action_repeat: int = 1,
     ) -> None:
-        if action_repeat < 1:
-            raise PgtsError(f"action_repeat is {action_repeat}; it must be at least 1")
+        check_count("action_repeat", action_repeat)
         self._index = StateIndex(state_size, dtype=state_dtype, device=device, merge=merge)
         self.num_actions = num_actions
         self.device = self._index.device

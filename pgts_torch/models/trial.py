@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import CONTRADICTED, ExactModel, Happened, step_text
-from pgts_torch.models.classic import ClassicModel, dynamics_of
+from pgts_torch.models.classic import dynamics_of
+from pgts_torch.models.dynamics import DynamicsModel
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
 from pgts_torch.models.tabular import TabularModel, tabular_truth
 from pgts_torch.tabular.mdp import TabularMDP
@@ -54,7 +55,7 @@ def table_contradiction(
 
 
 def dynamics_contradiction(
-    model: ClassicModel, env: gymnasium.Env, generator: np.random.Generator, *, seconds: float = _SECONDS
+    model: DynamicsModel, env: gymnasium.Env, generator: np.random.Generator, *, seconds: float = _SECONDS
 ) -> tuple[str, int]:
     """The first step of a short random walk that dynamics in torch contradict (`TensorModel.outcome_of`), empty where
     there is none; and how many steps were compared.

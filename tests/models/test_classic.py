@@ -257,7 +257,7 @@ def test_another_environment_other_constants_and_wrappers_that_change_things_are
     env = make("CartPole-v1")
     env.reset(seed=0)
     model = CartPole(env, gamma=GAMMA)
-    assert model.read(env).tolist() == env.unwrapped.state.tolist()
+    assert model.vectors([env])[0].tolist() == env.unwrapped.state.tolist()
     other = changed("CartPole-v1", gravity=1.6)
     other.reset(seed=0)
     for wrong, message in [
@@ -266,14 +266,14 @@ def test_another_environment_other_constants_and_wrappers_that_change_things_are
         (make("CartPole-v1"), "CartPole-v1 was not reset"),
     ]:
         with pytest.raises(PgtsError, match=message):
-            model.read(wrong)
+            model.vectors([wrong])
     for make_it, message in [
         (lambda: MountainCar(env, gamma=GAMMA), "CartPole-v1 has no dynamics in torch: it is a CartPoleEnv"),
         (lambda: Pendulum(gymnasium.make("Pendulum-v1"), gamma=GAMMA), "make them discrete, as with_torques does"),
         (lambda: Acrobot(changed("Acrobot-v1", torque_noise_max=0.1), gamma=GAMMA), "torque_noise_max is 0.1"),
         (lambda: CartPole(wrappers.RepeatAction(env, 2), gamma=GAMMA), "is wrapped in RepeatAction, which may change"),
         (lambda: CartPole(env, gamma=1.01), "gamma is 1.01"),
-        (lambda: CartPole(env, gamma=GAMMA, action_repeat=0), "action_repeat is 0; it must be at least 1"),
+        (lambda: CartPole(env, gamma=GAMMA, action_repeat=0), "action_repeat is 0"),
     ]:
         with pytest.raises(PgtsError, match=message):
             make_it()

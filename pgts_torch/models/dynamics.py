@@ -1,0 +1,160 @@
+"""Dynamics of one class of environments written in torch, with the constants of an instance of it."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models.actions import base_actions
+from pgts_torch.models.base import ExactModel
+from pgts_torch.models.provenance import overridden
+from pgts_torch.models.rewards import value_range
+from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.state_index import Merge
+from pgts_torch.models.steps import number_of
+from pgts_torch.models.tensor import TensorModel
+from pgts_torch.models.wrappers import transforms_of
+
+
+class DynamicsModel(TensorModel, ExactModel):
+    """The dynamics of one environment of classic control, with the constants of an instance of it.
+
+    The state is the vector `env.unwrapped.state`. States, rewards and values are float64 by default.
+
+    Args:
+        env: an instance, wrapped or not; nothing of it changes. Its actions are discrete, by itself or by an action
+            wrapper (`with_torques`). Its wrappers' transforms of rewards are part of the outcomes (`transforms_of`).
+        gamma: discount in [0, 1] of a step that does not terminate.
+        action_repeat, device, merge: as in `TensorModel`.
+        dtype: of states, rewards and values.
+
+    Raises:
+        PgtsError: the environment is another one, or has something that these dynamics do not know; gamma is no
+            discount.
+    """
+
+    kind, is_cheap = "dynamics", True
+    env_class: type
+    size: int
+    constants: tuple[str, ...]
+    """All attributes of the environment that a step reads, beside its state."""
+    pays_ends_only: bool = True
+    """Whether every reward is the lowest or the highest."""
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        *,
+        gamma: float,
+        action_repeat: int = 1,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+        merge: Merge = "auto",
+    ) -> None:
+        if not 0 <= gamma <= 1:
+            raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
+        self.name, self.gamma = env_name(env), gamma
+        if why := self.obstacle(env):
+            raise PgtsError(f"{self.name} has no dynamics in torch: {why}")
+        actions, self.transforms = base_actions(env), transforms_of(env)
+        options: dict[str, Any] = {"state_dtype": dtype, "dtype": dtype, "device": device, "merge": merge}
+        super().__init__(self.size, len(actions), action_repeat=action_repeat, **options)
+        self._c = SimpleNamespace(**{name: getattr(env.unwrapped, name) for name in self.constants})
+        self._effect_AE = torch.tensor([self._effect(action) for action in actions], dtype=dtype, device=self.device)
+        if action_repeat == 1:  # an operator of repeated actions gives no upper bound of v*
+            self.lowest_value, self.highest_value = value_range(self._transformed_range(), gamma)
+        self._same: list[Any] = []
+
+    @classmethod
+    def obstacle(cls, env: gymnasium.Env) -> str:
+        """Why these dynamics are not those of `env`; empty where they are."""
+        if why := cls._another_class(env.unwrapped) or overridden(env.unwrapped, cls.env_class):
+            return why
+        try:
+            transforms_of(env)
+        except MissingModel as missing:
+            return str(missing)
+        if not isinstance(env.action_space, spaces.Discrete):
+            return f"its actions are {env.action_space}; make them discrete, as with_torques does"
+        return cls._unknown(env.unwrapped)
+
+    @classmethod
+    def _another_class(cls, base: Any) -> str:
+        return "" if type(base) is cls.env_class else f"it is a {type(base).__name__}, not a {cls.env_class.__name__}"
+
+    @classmethod
+    def _unknown(cls, base: Any) -> str:
+        """What of an instance is not supported."""
+        return ""
+
+    def roots(self, envs: Sequence[gymnasium.Env]) -> Int[Tensor, "B"]:
+        """The numbers of the states that several instances are in; raises as `vectors` does."""
+        return self.number(self.vectors(envs))
+
+    def vectors(self, envs: Sequence[gymnasium.Env]) -> Float[Tensor, "B D"]:
+        """The states that several instances are in, in the dtype of states and on the device of the model.
+
+        Raises:
+            PgtsError: one is another environment, has other constants than those read at first, or was not reset.
+        """
+        rows = np.array([self._state_of(env) for env in envs], dtype=np.float64)
+        return torch.from_numpy(rows).to(self.device, self.dtype)
+
+    def _state_of(self, env: gymnasium.Env) -> Any:
+        base: Any = env.unwrapped
+        if not any(base is known for known in self._same):
+            if why := self._another_class(base):
+                raise PgtsError(f"{env_name(env)} is not {self.name}: {why}")
+            for name, own in vars(self._c).items():
+                if (value := getattr(base, name)) != own:
+                    raise PgtsError(f"{env_name(env)} has {name} = {value}; the model's is {own}")
+            self._same.append(base)
+        if base.state is None:
+            raise PgtsError(f"{env_name(env)} was not reset: it is in no state")
+        return base.state
+
+    @final
+    def step(
+        self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
+        """Reward, discount (0 where the episode terminates) and next state."""
+        effect = self._effect_AE[action_N].unbind(-1)
+        reward_N, terminated_N, following = self._move(state_ND.unbind(-1), effect)
+        if self.transforms.rewards:
+            distinct, index_N = reward_N.unique(return_inverse=True)
+            paid = [number_of("reward", self.transforms.reward(reward)) for reward in distinct.tolist()]
+            reward_N = torch.tensor(paid, dtype=self.dtype, device=self.device)[index_N]
+        discount_N = torch.full_like(reward_N, self.gamma).masked_fill_(terminated_N, 0.0)
+        return reward_N, discount_N, torch.stack(list(following), -1)
+
+    @abstractmethod
+    def observe(self, state_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N O"]:
+        """What the environment shows in these states, float32."""
+
+    @abstractmethod
+    def _effect(self, action: Any) -> tuple[float, ...]:
+        """What the dynamics need to know of an action of the environment."""
+
+    @abstractmethod
+    def _reward_range(self) -> tuple[float, float]:
+        """No reward is lower or higher."""
+
+    @abstractmethod
+    def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
+        """Reward, whether the episode terminates, and the columns of the next state, from those of the states."""
+
+    def _transformed_range(self) -> tuple[float, float]:
+        """No reward is lower or higher once wrappers have transformed it."""
+        if self.transforms.rewards and not self.pays_ends_only:
+            return -math.inf, math.inf
+        ends = [number_of("reward", self.transforms.reward(end)) for end in self._reward_range()]
+        return min(ends), max(ends)
