@@ -98,8 +98,11 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
         source = EnvSource.of(
             arguments["env"], kwargs=arguments["env_kwargs"], **{name: arguments[name] for name in given}
         )
-        if num_envs < ranks.size and source.given is None:
-            raise PgtsError(f"num_envs is {num_envs}; {ranks.size} ranks need at least as many")
+        if source.given is None:
+            if num_envs < ranks.size:
+                raise PgtsError(f"num_envs is {num_envs}; {ranks.size} ranks need at least as many")
+        elif arguments["num_envs"] not in (None, (has := source.given.num_envs) * ranks.size):
+            raise PgtsError(f"num_envs is {num_envs}, and a VectorEnv of {has} was given: leave num_envs out")
         world = make_world(
             source,
             num_envs=ranks.count(num_envs),

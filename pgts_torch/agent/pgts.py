@@ -51,7 +51,8 @@ class PGTS:
         estimator: "lookahead", or SampledAdvantages() of actions taken, which needs depth 0, a network and no model.
         policy, critic, update, horizon: options of these parts (`pgts_torch.options`), their names, or the parts
             themselves. Default: tables where observations are numbered states, else networks.
-        num_envs: episodes in each iteration, of all processes together; a VectorEnv keeps its own number, for each.
+        num_envs: episodes in each iteration, of all processes together. Default: 16; or those of a VectorEnv, in each
+            process, beside which another number is an error.
         actions_per_dimension: the number of evenly spaced values, from the lowest to the highest, for each dimension of
             continuous actions; None: actions are discrete, or MultiDiscrete, whose combinations are numbered.
         action_repeat, model_check: of the model (`options.search.Depth`, `TensorModel`, `ModelCheck`).
@@ -84,7 +85,7 @@ class PGTS:
         critic: Description | Critic | None = None,
         update: Description | Update | None = None,
         horizon: Description = "fixed",
-        num_envs: int = 16,
+        num_envs: int | None = None,
         actions_per_dimension: int | None = None,
         action_repeat: int = 1,
         model_check: Mode = "error",

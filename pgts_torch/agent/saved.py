@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import torch
+from gymnasium.vector import VectorEnv
 
 from pgts_torch.agent import saving
 from pgts_torch.agent.critics import Critic
@@ -111,6 +112,7 @@ def load_training(
     if not trust_imports:
         check_imports(path, saved_env, arguments.get("env_kwargs"))
     arguments |= {"env": saved_env if env is None else env} | ({} if device is None else {"device": str(device)})
+    arguments |= {"num_envs": None} if isinstance(env, VectorEnv) else {}
     try:
         model = make(**arguments)
     except NO_STATE as error:

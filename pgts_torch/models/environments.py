@@ -108,8 +108,9 @@ class EnvSource:
         make = _registered(env_id, **kwargs)
         source = cls(env_id, [make], spec=spec, description=env_id, actions_per_dimension=count)
         if ours:
-            modes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.DISABLED}
-            source.make_together = partial(gymnasium.make_vec, env_id, **modes, **{"max_episode_steps": -1} | kwargs)
+            modes = {"vectorization_mode": "vector_entry_point", "max_episode_steps": -1}
+            options: dict[str, Any] = modes | {"autoreset_mode": AutoresetMode.DISABLED} | kwargs
+            source.make_together = partial(gymnasium.make_vec, env_id, **options)
         return source
 
     @classmethod

@@ -94,7 +94,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         super().__init__(stepper.name, stepper.space, observe, device)
         self.action_repeat, self.adapter, self.actions = action_repeat, stepper.adapter, stepper.actions
         self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value
-        self.dtype = dtype
+        self.env, self.dtype = stepper.env, dtype
         self._draws_its_own = draws_its_own(stepper.made)
         self._sure = Answers()
         # The instances whose class, map and constants were compared with the model's own.
@@ -123,7 +123,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         """
         base: Any = env.unwrapped
         if not any(base is known for known in self._compared):
-            if not self.adapter.same_world(base, self._stepper.env):
+            if not self.adapter.same_world(base, self.env):
                 raise PgtsError(
                     f"{env_name(env)} is not the environment that the model was made from ({self.name}): its class, "
                     "map or constants differ; make both with the same arguments"

@@ -25,13 +25,14 @@ def read(arguments: Mapping[str, Any]) -> Training:
     """Return the options in the arguments of `PGTS`.
 
     Parts may be given as options, names, plain mappings or objects that were made from options. None, and objects of
-    the caller's own classes, count as auto.
+    the caller's own classes, count as auto; num_envs None is the default.
 
     Raises:
         PgtsError: one line for each mistake.
     """
+    flat = {name: value for name, value in arguments.items() if name != "num_envs" or value is not None}
     data: dict[str, Any] = {
-        section: {name: arguments[name] for name in names if name in arguments} for section, names in _FLAT.items()
+        section: {name: flat[name] for name in names if name in flat} for section, names in _FLAT.items()
     }
     parts = {name: getattr(arguments[name], "options", arguments[name]) for name in _PARTS}
     data |= {name: value for name, value in parts.items() if value is not None}

@@ -191,6 +191,16 @@ def test_environments_that_were_made_take_their_own_actions():
         PGTS(envs, **SHORT, actions_per_dimension=3)
 
 
+def test_a_vector_environment_keeps_its_number_and_refuses_another(tmp_path):
+    short = {name: value for name, value in SHORT.items() if name != "num_envs"}
+    model = PGTS(EnvSource.of("CartPole-v1").make(3), **short)
+    assert model.iterate().experience.num_episodes == 3
+    with pytest.raises(PgtsError, match="num_envs is 16, and a VectorEnv of 3 was given: leave num_envs out"):
+        PGTS(EnvSource.of("CartPole-v1").make(3), **short, num_envs=16)
+    model.save(tmp_path / "m.pt")
+    assert PGTS.load(tmp_path / "m.pt", env=EnvSource.of("CartPole-v1").make(2)).world.env.num_envs == 2
+
+
 class Unbuilt(Field):
     """It cannot be made."""
 

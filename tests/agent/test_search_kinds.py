@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from pgts_torch import PGTS
+from pgts_torch.agent import make_world
+from pgts_torch.agent.world import TabularWorld
 from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.run import build
@@ -50,6 +52,20 @@ def trained(search, depth: int) -> float:
 def test_every_search_climbs_the_ladder_that_a_shallow_one_cannot(search):
     assert trained(search, 4) > 0.95
     assert trained(search, 2) < 0.05
+
+
+@pytest.mark.parametrize("critic", ["exact", "network"])
+@pytest.mark.parametrize("search", SEARCHES, ids=str)
+def test_a_model_in_float32_serves_every_search_and_a_critic_of_either_dtype(search, critic, monkeypatch):
+    class SingleWorld(TabularWorld):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            self.model = TabularModel(self.mdp, dtype=torch.float32)
+
+    monkeypatch.setattr(make_world, "TabularWorld", SingleWorld)
+    model = PGTS("pgts/Random-v0", depth=2, search=search, critic=critic, num_envs=4, seed=3)
+    assert model.iterate().look.q_BA.dtype == torch.float32
+    assert {"exact": torch.float64, "network": torch.float32}[critic] == model.critic.dtype
 
 
 @pytest.mark.parametrize("search", SEARCHES, ids=str)

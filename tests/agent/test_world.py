@@ -153,7 +153,7 @@ def test_an_update_sees_what_was_acted_on_and_not_what_the_model_makes_of_the_st
     monkeypatch.setattr(
         model.policy, "sample", lambda seen_B, **kwargs: acted.append(seen_B) or sample(seen_B, **kwargs)
     )
-    monkeypatch.setattr(model, "update", lambda _, seen_N, *rest, **kwargs: moved.append(seen_N) or {})
+    monkeypatch.setattr(model, "update", lambda _, batch, **kwargs: moved.append(batch.observation_N) or {})
     model.update.state_weight = update.state_weight
     experience = model.iterate().experience
     assert torch.equal(torch.stack(acted), experience.observation_UB[:-1])
@@ -199,6 +199,7 @@ def test_actions_are_those_of_the_copies_also_in_a_simulator():
         (lambda: world_of("CartPole-v1", plain=True, observation_key="x"), "they have no part 'x'"),
         (lambda: world_of(copies_of(Parts)), "the observations of Parts are dictionaries of .*: set observation_key"),
         (lambda: world_of(copies_of(Parts), observation_key="x"), "no part 'x'; they have"),
+        (lambda: world_of("pgts/Ladder-v0", observation_key="x"), "they have no part 'x'"),
         (lambda: world_of(3), "the environment is 3; it must be a Gymnasium id, an environment, a function"),
         (lambda: world_of(Cart()), "has no spec to make another instance from: give a function that makes one"),
         (lambda: world_of(SyncVectorEnv([Cart])), "the environment resets by"),
