@@ -9,8 +9,8 @@ A model that does not apply is refused with a reason; where none is left the rea
 
 import itertools
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,18 +23,17 @@ from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
-from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError
 from pgts_torch.models.actions import base_actions
 from pgts_torch.models.adapters import adapter_for
-from pgts_torch.models.attributes import attributes, different, own_to_each, unlike
+from pgts_torch.models.attributes import attributes, own_to_each, unlike
 from pgts_torch.models.classic import CLASSIC
 from pgts_torch.models.environments import EnvSource, kinds_of
-from pgts_torch.models.fidelity import why_not
 from pgts_torch.models.published import publishes_table, table_of
+from pgts_torch.models.restoring import Setup, check_snapshots
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import each_of, env_name
-from pgts_torch.models.trial import dynamics_contradiction
-from pgts_torch.models.walks import Setup
+from pgts_torch.models.trial import compare
 from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_of, wrappers_of
 from pgts_torch.seeding import SharedGenerators, numpy_stream
 from pgts_torch.tabular.mdp import check_gamma
@@ -119,24 +118,16 @@ class _Request:
         return self.source.like(k)
 
     @cached_property
-    def actions(self) -> list[int]:
-        return list(range(int(self.env.single_action_space.n)))  # type: ignore[attr-defined]  # checked before
-
-    @cached_property
     def new(self) -> gymnasium.Env:
         """A new environment whose attributes are read; it is never stepped."""
         return self.fresh()
 
     @cached_property
-    def others(self) -> list[set[str]]:
-        """For each environment, the attributes in which it differs from a new one."""
-        expected = attributes(self.new)
-        return [different(expected, attributes(env)) for env in self.envs.envs]
-
-    @cached_property
     def own_to_each(self) -> frozenset[str]:
-        """The attributes in which new environments differ from each other; computed only if `others` finds any."""
-        return frozenset(own_to_each(self.fresh)) if any(self.others) else frozenset()
+        """The attributes in which new environments differ from each other; empty if the given ones equal a new one."""
+        expected = attributes(self.new)
+        all_equal = all(attributes(env) == expected for env in self.envs.envs)
+        return frozenset() if all_equal else frozenset(own_to_each(self.fresh))
 
 
 def _first_model(
@@ -165,37 +156,23 @@ def _first_model(
 
 def _check_wrappers(request: _Request) -> None:
     """MissingModel unless the wrappers change nothing but single observations and rewards, without a memory."""
-    if transforms_of(request.envs.envs[0]) == Transforms():
-        return
-    with _environment_errors_ignored():
-        check_transforms(request.fresh(), request.actions, request.random)
+    if transforms_of(request.envs.envs[0]) != Transforms():
+        with suppress(Failed):  # what an environment raises in a trial is reported, with step and seed, in training
+            actions = range(request.env.single_action_space.n)  # type: ignore[attr-defined]  # checked before
+            check_transforms(request.fresh(), actions, request.random)
 
 
 def _check_alike(request: _Request) -> None:
     """MissingModel if an environment differs from a new one, of which a model would be made; its state may differ."""
-    if any(kinds_of(env) != kinds_of(request.new) for env in request.envs.envs):
+    envs, new, found = request.envs.envs, request.new, None
+    if any(kinds_of(env) != kinds_of(new) for env in envs):
         raise MissingModel(f"the environments of {request.name} are of different classes; a model needs all of one")
-    if not any(request.others):
-        return
-    envs, found = request.envs.envs, None
-    with _environment_errors_ignored():
-        new = itertools.repeat(request.new)
-        found = unlike(envs, new, request.fresh(), request.random, apart=request.own_to_each)
+    with suppress(Failed):
+        found = unlike(envs, itertools.repeat(new), request.fresh, request.random, apart=request.own_to_each)
     if found is not None:
         raise MissingModel(
             f"environment {found.number} of {request.name} has {found.what}; one model must fit all: make them alike"
         )
-
-
-@contextmanager
-def _environment_errors_ignored() -> Iterator[None]:
-    """Ignore errors that the environment raises in a trial, because training reports them with step and seed."""
-    try:
-        yield
-    except (MissingModel, KeyboardInterrupt):
-        raise
-    except BaseException:
-        return
 
 
 def _table(request: _Request) -> TabularWorld | None:
@@ -224,11 +201,15 @@ def _dynamics(request: _Request) -> DynamicsWorld | None:
     kind = next((kind for kind in CLASSIC if type(env.unwrapped) is kind.env_class), None)
     if kind is None:
         return None
+    unused = f"the dynamics in torch of {kind.env_class.__name__} are not used"
     if why := kind.obstacle(env) or _own(request, kind.constants):
-        raise MissingModel(f"the dynamics in torch of {kind.env_class.__name__} are not used: {why}")
+        raise MissingModel(f"{unused}: {why}")
     env = request.fresh()
-    if why := dynamics_contradiction(kind(env, gamma=request.gamma), env, request.random)[0]:
-        raise MissingModel(f"the dynamics in torch of {kind.env_class.__name__} are not used: {why}")
+    tried = kind(env, gamma=request.gamma)
+    try:
+        compare(tried, env, request.random, lambda _: int(tried.roots([env])), gamma=request.gamma)
+    except ModelMismatch as off:
+        raise MissingModel(f"{unused}: {off}") from off
     model = kind(env, gamma=request.gamma, action_repeat=request.action_repeat, device=request.device)
     return DynamicsWorld(request.envs, model, observation_key=request.observation_key)
 
@@ -239,17 +220,14 @@ def _simulator(request: _Request) -> SimulatedWorld:
     adapter = adapter_for(env)
     if adapter.restored is not None and (why := _own(request, request.own_to_each)):
         raise MissingModel(f"{request.name} cannot be restored: {why}, which is in no snapshot")
-    others = itertools.count()
-    setup = Setup(
-        request.name,
-        lambda: request.fresh(next(others)).unwrapped,
-        adapter,
-        base_actions(env),
-        request.random,
-        alike=not request.own_to_each,
-    )
-    if why := why_not(setup):
-        raise MissingModel(f"{request.name} cannot serve as a model: {why}")
+    numbers, alike = itertools.count(), not request.own_to_each
+    make: Callable[[], gymnasium.Env] = lambda: request.fresh(next(numbers)).unwrapped  # noqa: E731
+    try:
+        check_snapshots(Setup(request.name, make, adapter, base_actions(env), request.random, alike=alike))
+    except MissingModel as missing:
+        raise MissingModel(f"{request.name} cannot serve as a model: {missing}") from missing
+    except PgtsError:
+        pass  # an error of the environment is reported when it stops a training
     model = SimulatorModel(
         request.fresh,
         gamma=request.gamma,

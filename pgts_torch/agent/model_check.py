@@ -13,7 +13,7 @@ from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import DynamicsWorld, TabularWorld, World
 from pgts_torch.errors import ModelMismatch, PgtsError
-from pgts_torch.models.base import CONTRADICTED, RANDOM, ExactModel, Happened, step_text
+from pgts_torch.models.base import CONTRADICTED, RANDOM, ExactModel, Happened
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.seeding import numpy_stream
@@ -109,7 +109,11 @@ class ModelCheck:
         for each in results[:1] if self._model.is_cheap else results:
             self.model_calls += each.calls
             if each.samples_only:
-                self._warn("drawn", self._samples_only())
+                self._warn(
+                    "drawn",
+                    f"{self._name} has random steps whose outcomes its {self._kind} does not enumerate: whether these "
+                    "steps are possible, and with which probability, is not checked",
+                )
             if each.contradictions:
                 self._contradicted("steps", each.text, each.contradictions)
         if isinstance(self._world, DynamicsWorld) and not self._world.model.transforms.observations:
@@ -139,26 +143,8 @@ class ModelCheck:
         if agrees:
             return _Result(calls)
         wrong = np.flatnonzero(outcome_N == CONTRADICTED)
-        text = self._contradiction(happened.part(wrong[:1])) if len(wrong) else ""
+        text = model.contradiction(happened.part(wrong)) if len(wrong) else ""
         return _Result(calls, len(wrong), text, bool((outcome_N == RANDOM).any()))
-
-    def _contradiction(self, one: Happened) -> str:
-        """The message about a step that is none of the model's outcomes."""
-        model = self._model
-        assert model is not None
-        state, action, reward, discount, next_state, follows = (column.item() for column in vars(one).values())
-        happened = step_text(reward, discount, model.state_text(next_state))
-        happened += ", and the episode went on" * (follows and not model.is_cheap)
-        return (
-            f"{self._name} contradicts its {model.kind}: {model.state_text(state)} under action {action} "
-            f"gave {happened}; the {model.kind} says {model.outcomes_text(state, action)}. {_WAY_OUT}"
-        )
-
-    def _samples_only(self) -> str:
-        return (
-            f"{self._name} has random steps whose outcomes its {self._kind} does not enumerate: whether these steps "
-            "are possible, and with which probability, is not checked"
-        )
 
     def _check_observations(self, world: DynamicsWorld, experience: Rollout) -> None:
         """Check that critics see at the leaves of a lookahead what the environment shows in such states."""
@@ -167,11 +153,11 @@ class ModelCheck:
         wrong_V = ((seen_VO - told_VO).abs() > _OBSERVATION_TOLERANCE * (1 + told_VO.abs())).any(-1)
         if wrong_V.any():
             first = int(wrong_V.nonzero()[0, 0])
-            text = (
-                f"{self._name} contradicts its {self._kind}: {world.model.state_text(int(state_V[first]))} shows "
-                f"{seen_VO[first].tolist()}; the {self._kind} says {told_VO[first].tolist()}. {_WAY_OUT}"
+            what = (
+                f"{world.model.state_text(int(state_V[first]))} shows {seen_VO[first].tolist()}; the {self._kind} says "
+                f"{told_VO[first].tolist()}"
             )
-            self._contradicted("observations", text, int(wrong_V.sum()))
+            self._contradicted("observations", what, int(wrong_V.sum()))
 
     def _check_starts(self, start_B: np.ndarray) -> None:
         """Check that episodes begin in states of positive start probability."""
@@ -183,7 +169,7 @@ class ModelCheck:
         began = f"an episode began in state {start_B[~possible_B][0]}"
         if known is not None:
             rule = f"the start distribution of its {self._kind} has {self._is_start_S.sum()} states without it"
-            self._contradicted("starts", f"{self._name} contradicts its {self._kind}: {began}; {rule}. {_WAY_OUT}", 1)
+            self._contradicted("starts", f"{began}; {rule}", 1)
         else:
             self._warn(
                 "starts",
@@ -196,12 +182,12 @@ class ModelCheck:
         for what, frequencies in self._frequencies.items():
             kind, (beyond_margin, any_error) = f"frequencies of {what}", frequencies.log_evidence
             if beyond_margin >= ENOUGH and kind not in self._warned:
-                self._contradicted(kind, f"{self._unlikely(what)}. {_WAY_OUT}", 1)
+                self._contradicted(kind, self._unlikely(what), 1)
             elif any_error >= ENOUGH and beyond_margin < 0:  # bets on an error beyond the margin have lost
-                self._warn(kind, f"{self._unlikely(what)}; the probabilities are wrong, but by less than 0.02 so far")
+                self._warn(kind, f"{self._name}: {self._unlikely(what)}, which is off by less than 0.02 so far")
 
     def _unlikely(self, what: str) -> str:
-        """The message about the outcome whose frequency contradicts its probability most."""
+        """In words: the outcome whose frequency contradicts its probability most."""
         model = self._model
         assert isinstance(model, TabularModel)
         worst = self._frequencies[what].worst()
@@ -212,13 +198,14 @@ class ModelCheck:
             where = f"{model.state_text(state)} under action {action} gave"
             event = model.outcome_text(state, action, worst.outcome)
         return (
-            f"{self._name} contradicts the probabilities of its {self._kind}: {where} {event} in {worst.happened} of "
-            f"{worst.seen} cases ({worst.happened / worst.seen:.4g}); the {self._kind} says {worst.listed:.4g}"
+            f"{where} {event} in {worst.happened} of {worst.seen} cases ({worst.happened / worst.seen:.4g}); the "
+            f"{self._kind} says with probability {worst.listed:.4g}"
         )
 
-    def _contradicted(self, kind: str, text: str, count: int) -> None:
+    def _contradicted(self, kind: str, what: str, count: int) -> None:
         """Count contradictions, and raise or warn as `mode` says."""
         self.contradictions += count
+        text = f"{self._name} contradicts its {self._kind}: {what}. {_WAY_OUT}"
         if self.mode == "error":
             raise ModelMismatch(text)
         self._warn(kind, text)

@@ -10,7 +10,7 @@ import pickle
 import random
 import time
 import types
-from collections.abc import Callable, Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -18,8 +18,17 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
+from pgts_torch.errors import Failed
+from pgts_torch.models.trial import environment_code, random_walk, reset
+
+_NONE = frozenset[str]()
+
 _NOT_COMPARED = frozenset({"env", "spec", "_cached_spec", "_np_random", "_np_random_seed", "np_random"})
 """Attributes that differ between instances that are alike: the wrapped environment, its spec and its generator."""
+
+_PARTS = object()
+
+_COMPARED_BY_EQUALITY = (type, types.ModuleType, types.CodeType, enum.Enum)
 
 _GENERATORS = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random, torch.Generator)
 
@@ -32,9 +41,9 @@ _MOST_PARTS = 100_000
 _INSTANCES = 6
 """How many are compared: two may have drawn the same value by chance."""
 
-_EPISODES, _LOOKED_AFTER, _LONGEST, _SECONDS = 3, 5, 200, 0.2
-"""How `changing` looks for changes: in so many episodes, after each of the first steps and at the end. An episode is
-ended after so many steps, and after one step once these seconds are over."""
+_LOOKED_AFTER, _LONGEST, _SECONDS = 5, 200, 0.2
+"""`changing` looks for changes after each of the first steps of an episode and at its end, at the latest after so many
+steps; and for about these seconds."""
 
 _ACTIONS = 20
 """How many are sampled for the walk in which `unlike` looks for differences."""
@@ -44,7 +53,7 @@ _LEAST_RESETS, _MOST_RESETS = 10, 100
 every second reset, one is missed in less than one in a thousand cases."""
 
 
-def attributes(env: gymnasium.Env, *, but: Iterable[str] = ()) -> dict[str, Any]:
+def attributes(env: gymnasium.Env, *, but: Set[str] = _NONE) -> dict[str, Any]:
     """The `fingerprint` of every attribute of an environment and its wrappers, by name.
 
     Attributes of a wrapper are called `WRAPPER.NAME`, those of a second of its kind `WRAPPER.2.NAME`. Class attributes
@@ -65,34 +74,25 @@ def attributes(env: gymnasium.Env, *, but: Iterable[str] = ()) -> dict[str, Any]
     return held
 
 
-def changing(env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Generator, **but: Any) -> set[str]:
-    """The names of the attributes that change in resets and steps of a random walk.
+def changing(
+    env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Generator, *, times: int = 1, but: Set[str] = _NONE
+) -> set[str]:
+    """The names of the attributes that change at least so many times in resets and steps of a random walk.
 
     Args:
         env: an instance for this alone; it is stepped.
         but: as in `attributes`.
+
+    Raises:
+        Failed: the environment raises.
     """
-    return set(_changes(env, actions, generator, **but))
-
-
-def _changes(
-    env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Generator, **but: Any
-) -> collections.Counter[str]:
-    """How often each attribute is seen to change in a random walk."""
-    now, found, until = attributes(env, **but), collections.Counter[str](), time.monotonic() + _SECONDS
-    for _ in range(_EPISODES):
-        env.reset(seed=int(generator.integers(2**31)))
-        over, taken = False, 0
-        while not over:
-            if taken <= _LOOKED_AFTER:
-                before, now = now, attributes(env, **but)
-                found.update(different(before, now))
-            *_, terminated, truncated, _ = env.step(actions[int(generator.integers(len(actions)))])
-            taken += 1
-            over = terminated or truncated or taken == _LONGEST or time.monotonic() > until
-        before, now = now, attributes(env, **but)
-        found.update(different(before, now))
-    return found
+    now, found, age = attributes(env, but=but), collections.Counter[str](), 0
+    for taken in random_walk(env, actions, generator, steps=0, longest=_LONGEST, seconds=_SECONDS):
+        age = 0 if taken.action is None else age + 1
+        if age <= _LOOKED_AFTER or taken.ends or age == _LONGEST:
+            before, now = now, attributes(env, but=but)
+            found.update(different(before, now))
+    return {name for name, count in found.items() if count >= times}
 
 
 class Unlike(NamedTuple):
@@ -105,10 +105,10 @@ class Unlike(NamedTuple):
 def unlike(
     envs: Iterable[gymnasium.Env],
     new: Iterable[gymnasium.Env],
-    walked: gymnasium.Env,
+    make: Callable[[], gymnasium.Env],
     generator: np.random.Generator,
     *,
-    apart: Set[str] = frozenset(),
+    apart: Set[str] = _NONE,
 ) -> Unlike | None:
     """The first environment that is not like the new instance beside it, whatever its present state; None: all are.
 
@@ -119,18 +119,22 @@ def unlike(
     Args:
         envs: the environments.
         new: instances that are not changed.
-        walked: an instance for this alone; it is stepped, and rendered if it can be.
+        make: makes an instance for this alone; it is stepped, and rendered if it can be.
         apart: attributes of which each instance has its own.
+
+    Raises:
+        Failed: an environment raises.
     """
     pairs = [(attributes(env), attributes(other)) for env, other in zip(envs, new, strict=False)]
     left = [different(*pair) - apart for pair in pairs]
     if not any(left):
         return None
+    walked = make()
     walked.action_space.seed(int(generator.integers(2**31)))
     actions = [walked.action_space.sample() for _ in range(_ACTIONS)]
-    of_state = {name for name, count in _changes(walked, actions, generator).items() if count > 1}
+    of_state = changing(walked, actions, generator, times=2)
     if walked.render_mode is not None:  # attributes that rendering sets are no difference
-        with contextlib.suppress(Exception):
+        with contextlib.suppress(Failed), environment_code():
             walked.render()
     until = time.monotonic() + _SECONDS
     for k in range(_MOST_RESETS):
@@ -138,7 +142,7 @@ def unlike(
         left = [(names - of_state) & different(held, now) for names, (held, _) in zip(left, pairs, strict=True)]
         if not any(left) or (k >= _LEAST_RESETS and time.monotonic() > until):
             break
-        walked.reset(seed=int(generator.integers(2**31)))
+        reset(walked, seed=int(generator.integers(2**31)))
         of_state |= different(now, attributes(walked))
     return next((Unlike(k, in_words(min(names), pairs[k][0], now)) for k, names in enumerate(left) if names), None)
 
@@ -169,13 +173,46 @@ def fingerprint(value: Any, *, besides: Sequence[Any] = ()) -> Any:
     """A value that is equal for values that are alike. Functions are alike where their code and the values that they
     enclose are; objects where their attributes are; objects that cannot be looked into where their classes are the
     same; and each object in `besides` is like the one at the same position in another call."""
-    return _print_of(value, {id(known): -1 - k for k, known in enumerate(besides)}, [0])
+    looks = [look for _, _, look in _inside(value, besides, left_out=_NOT_COMPARED)]
+    return looks[0] if len(looks) == 1 else looks
 
 
-def _print_of(value: Any, seen: dict[int, int], parts: list[int]) -> Any:
-    parts[0] += 1
+def own_generator(env: Any) -> str:
+    """The name of a random generator in an environment other than its `np_random`, empty where there is none: for
+    instance "dice", or "box.0.dice" of the first entry of a list."""
+    with environment_code():
+        known = env.np_random
+    inside = _inside(env, [known], left_out=frozenset({"spec"}))
+    return next((where for where, part, _ in inside if isinstance(part, _GENERATORS) and part is not known), "")
+
+
+def _inside(value: Any, known: Sequence[Any], *, left_out: Set[str]) -> Iterator[tuple[str, Any, Any]]:
+    """Everything that a value consists of, itself first: where it is, what it is, and what it looks like.
+
+    An object that was met before, or is among those `known`, looks like its number; its parts are not met again.
+    """
+    met = {id(each): -1 - k for k, each in enumerate(known)}
+    waiting: list[tuple[str, Any]] = [("", value)]
+    for _ in range(_MOST_PARTS):
+        if not waiting:
+            return
+        where, part = waiting.pop()
+        look = _look_of(part)
+        if look is _PARTS and id(part) in met:
+            look = "=", met[id(part)]
+        elif look is _PARTS:
+            met[id(part)] = len(met)
+            parts = _parts_of(part, _NOT_COMPARED if isinstance(part, spaces.Space) else left_out)
+            look = type(part), [repr(name) for name, _ in parts]
+            # The first part comes next, so the looks of all parts follow that of the whole in one order.
+            waiting += [(f"{where}.{name}" if where else str(name), inner) for name, inner in reversed(parts)]
+        yield where, part, look
+
+
+def _look_of(value: Any) -> Any:
+    """What a value looks like that needs no look into its parts; else `_PARTS`."""
     kind = type(value)
-    if value is None or kind in (bool, int, str, bytes) or isinstance(value, type | types.ModuleType | enum.Enum):
+    if value is None or kind in (bool, int, str, bytes) or isinstance(value, _COMPARED_BY_EQUALITY):
         return value
     if isinstance(value, float | np.generic):
         plain = value.item() if isinstance(value, np.generic) else float(value)
@@ -185,43 +222,42 @@ def _print_of(value: Any, seen: dict[int, int], parts: list[int]) -> Any:
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         content = value.tobytes()
         return value.dtype.str, value.shape, content if len(content) < _LARGE else hashlib.blake2b(content).digest()
-    if isinstance(value, _GENERATORS) or parts[0] > _MOST_PARTS:
+    if isinstance(value, _GENERATORS):
         return kind
+    if isinstance(value, set | frozenset):
+        return kind, sorted(map(repr, value))
     if kind in (list, tuple, dict):
         try:
             return marshal.dumps(value, 2)  # a large table takes a millisecond; entry by entry twenty
         except ValueError:
             pass
-    if id(value) in seen:
-        return "=", seen[id(value)]
-    seen[id(value)] = len(seen)
-    inner = functools.partial(_print_of, seen=seen, parts=parts)
-    return kind, _parts_of(value, inner)
+    return _PARTS
 
 
-def _parts_of(value: Any, inner: Callable[[Any], Any]) -> Any:
-    """What a value consists of."""
+def _parts_of(value: Any, left_out: Set[str]) -> list[tuple[Any, Any]]:
+    """The names and the values of which a value consists."""
     if isinstance(value, dict):
-        return [(repr(name), inner(part)) for name, part in value.items()]
-    if isinstance(value, set | frozenset):
-        return sorted(map(repr, value))
-    if isinstance(value, list | tuple | collections.deque | np.ndarray):
-        return [inner(part) for part in value]
+        return list(value.items())
+    if isinstance(value, list | tuple | collections.deque):
+        return list(enumerate(value))
+    if isinstance(value, np.ndarray):
+        return list(enumerate(value.ravel().tolist()))
     if isinstance(value, types.FunctionType):
-        cells = [inner(cell.cell_contents) for cell in value.__closure__ or ()]
-        return value.__code__, inner(value.__defaults__), inner(value.__kwdefaults__), cells
+        return [(name, getattr(value, name)) for name in ("__code__", "__defaults__", "__kwdefaults__", "__closure__")]
+    if isinstance(value, types.CellType):
+        return [("cell_contents", value.cell_contents)] if value != types.CellType() else []
     if isinstance(value, types.MethodType):
-        return inner(value.__func__), inner(value.__self__)
+        return [("__func__", value.__func__), ("__self__", value.__self__)]
     if isinstance(value, functools.partial):
-        return inner(value.func), inner(value.args), inner(value.keywords)
+        return [("func", value.func), ("args", value.args), ("keywords", value.keywords)]
     slots = [name for cls in type(value).__mro__ for name in getattr(cls, "__slots__", ()) if hasattr(value, name)]
     named = {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})
     if named or isinstance(value, spaces.Space):
-        return [(name, inner(part)) for name, part in named.items() if name not in _NOT_COMPARED]
+        return [(name, part) for name, part in named.items() if name not in left_out]
     try:
-        return pickle.dumps(value)
+        return [("pickle", pickle.dumps(value))]
     except Exception:  # a window, a lock, a file: nothing to compare
-        return None
+        return []
 
 
 def _classes_outside(cls: type) -> list[type]:

@@ -132,6 +132,16 @@ class ExactModel(Model):
     def outcomes_text(self, state: int, action: int) -> str:
         """The outcomes of a state and an action, in a message."""
 
+    def contradiction(self, happened: Happened) -> str:
+        """The first of some steps that are none of its outcomes, and what it has instead, in a message."""
+        state, action, reward, discount, next_state, follows = (column[0].item() for column in vars(happened).values())
+        gave = step_text(reward, discount, self.state_text(next_state))
+        gave += ", and the episode went on" * (follows and not self.is_cheap)
+        return (
+            f"{self.state_text(state)} under action {action} gave {gave}; the {self.kind} says "
+            f"{self.outcomes_text(state, action)}"
+        )
+
 
 class LearningModel(Model):
     """A model that learns from the steps of an environment. It is never called exact."""

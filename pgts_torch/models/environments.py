@@ -1,5 +1,6 @@
 """The environment that a user gives, understood once: `EnvSource` makes others of its kind, whatever it is."""
 
+import copy
 import importlib
 import warnings
 import weakref
@@ -192,8 +193,8 @@ class EnvSource:
 
     def _check_like(self, envs: Sequence[gymnasium.Env], made: Sequence[gymnasium.Env]) -> None:
         """PgtsError if environments that were given are not what their functions make."""
-        found = _unlike(envs, made, self.like())
-        if found and (found := _unlike(envs, made, self.like(), apart=own_to_each(self.like))):
+        found = _unlike(envs, made, self.like, self.name)
+        if found and (found := _unlike(envs, made, self.like, self.name, apart=own_to_each(self.like))):
             raise PgtsError(
                 f"environment {found.number} of {self.name} has {found.what}: others come from its function, "
                 "which has to make it as it is"
@@ -259,6 +260,11 @@ def _spec_like(env: gymnasium.Env) -> EnvSpec:
     name = env_name(env)
     if env.spec is None:
         raise PgtsError(f"{name} has no spec to make another instance from: give a function that makes one")
+    if isinstance(env, TimeLimit) and type(env) is type(env.env) is TimeLimit:
+        # A spec has only the outermost limit; the shortest ends an episode.
+        spec = copy.copy(_spec_like(env.env))
+        spec.max_episode_steps = min(env._max_episode_steps, spec.max_episode_steps or env._max_episode_steps)
+        return spec
     given, way_out = f"{name} was given as an instance", "give a function that makes it as it is"
     try:
         with _making(name):
@@ -268,18 +274,18 @@ def _spec_like(env: gymnasium.Env) -> EnvSpec:
     if kinds_of(env) != kinds_of(made):
         own, other = (" in ".join(kind.__name__ for kind in reversed(kinds_of(each))) for each in (env, made))
         raise PgtsError(f"{given}, {own}, of whose spec comes {other}: {way_out}")
-    if found := _unlike([env], [made], made):
+    if found := _unlike([env], [made], lambda: made, name):
         raise PgtsError(f"{given} with {found.what} of its spec: {way_out}")
     return env.spec
 
 
 def _unlike(
-    envs: Sequence[gymnasium.Env], new: Sequence[gymnasium.Env], walked: gymnasium.Env, **apart: Any
+    envs: Sequence[gymnasium.Env], new: Sequence[gymnasium.Env], make: _Maker, name: str, **apart: Any
 ) -> Unlike | None:
     try:
-        return unlike(envs, new, walked, numpy_stream(0, "unlike"), **apart)
-    except Exception as error:
-        raise failure(f"{env_name(walked)} failed in a random walk", error) from error
+        return unlike(envs, new, make, numpy_stream(0, "unlike"), **apart)
+    except PgtsError as error:
+        raise failure(f"{name} failed in a random walk", error) from error
 
 
 _MODULES = {"MiniGrid-": ("minigrid", "envs"), "BabyAI-": ("minigrid", "envs"), "ALE/": ("ale_py", "atari")}

@@ -1,5 +1,7 @@
 """Tables of transitions that environments publish, and whether these are what the environments do."""
 
+import contextlib
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -7,20 +9,32 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import MissingModel
+from pgts_torch.errors import MissingModel, ModelMismatch
 from pgts_torch.models.actions import base_actions
 from pgts_torch.models.provenance import origin, overridden
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.steps import number_of
-from pgts_torch.models.tabular import tabular_truth
-from pgts_torch.models.trial import counted_starts, table_contradiction
+from pgts_torch.models.tabular import TabularModel, tabular_truth
+from pgts_torch.models.trial import SECONDS, Taken, compare, reset
 from pgts_torch.models.wrappers import Transforms, transforms_of
 from pgts_torch.tabular.mdp import TabularMDP
 
 _STARTS = "initial_state_distrib"
 """The attribute with the start distribution of a table P."""
+
+_RESETS = 1000
+
+
+def published_table(env: gymnasium.Env, *, gamma: float) -> TabularMDP | None:
+    """The table that an environment publishes, as it stands (`tabular_truth`); None where it has an attribute `mdp` or
+    P of another meaning, or neither."""
+    if publishes_table(env):
+        with contextlib.suppress(Exception):  # whatever a P of another meaning raises where it is read
+            return tabular_truth(env, gamma=gamma)
+    return None
 
 
 def publishes_table(env: gymnasium.Env) -> bool:
@@ -49,48 +63,67 @@ def table_of(env: gymnasium.Env, *, gamma: float, generator: np.random.Generator
             the spaces, or is contradicted by a step of a short walk.
     """
     base: Any = env.unwrapped
-    name, transforms = env_name(env), transforms_of(env)
+    transforms = transforms_of(env)
     attribute = "mdp" if isinstance(getattr(base, "mdp", None), TabularMDP) else "P"
+    unused = f"the table {attribute} of {env_name(env)} is not used"
     starts_known = attribute == "mdp" or getattr(base, _STARTS, None) is not None
     why = overridden(base, origin(base, attribute), ("step",))
     if starts_known and not why:
         why = overridden(base, origin(base, attribute if attribute == "mdp" else _STARTS), ("reset",))
     if why:
-        raise MissingModel(f"the table {attribute} of {name} is not used, for it was not written for what runs: {why}")
+        raise MissingModel(f"{unused}, for it was not written for what runs: {why}")
     if transforms.observations:
-        raise MissingModel(
-            f"the table {attribute} of {name} is not used, for its wrappers show something else than states"
-        )
-    mdp = tabular_truth(base, gamma=gamma) if attribute == "mdp" else _published(env, gamma, transforms, generator)
+        raise MissingModel(f"{unused}, for its wrappers show something else than states")
     if attribute == "mdp":
-        mdp = _transformed(mdp, [_position(base, action) for action in base_actions(env)], transforms)
+        positions = [_position(base, action) for action in base_actions(env)]
+        mdp = _transformed(tabular_truth(base, gamma=gamma), positions, transforms)
+    elif getattr(base, "fickle_passenger", False):
+        raise MissingModel(f"{unused}: it lacks what a fickle passenger draws")
+    else:
+        mdp = _from_rows(env, gamma, transforms, generator)
     sizes = mdp.num_states, mdp.num_actions
-    spaces_have = tuple(int(getattr(space, "n", 0)) for space in (env.observation_space, env.action_space))
-    if sizes != spaces_have:
+    if sizes != tuple(int(getattr(space, "n", 0)) for space in (env.observation_space, env.action_space)):
         raise MissingModel(
-            f"the table {attribute} of {name} is not used: it has {sizes[0]} states and {sizes[1]} actions, and its "
-            f"spaces are {env.observation_space} and {env.action_space}"
+            f"{unused}: it has {sizes[0]} states and {sizes[1]} actions, and its spaces are {env.observation_space} "
+            f"and {env.action_space}"
         )
-    if why := table_contradiction(mdp, env, gamma, generator)[0]:
-        raise MissingModel(f"the table {attribute} of {name} is not used, for its steps contradict it: {why}")
+    try:
+        compare_table(mdp, env, gamma, generator)
+    except ModelMismatch as off:
+        raise MissingModel(f"{unused}, for its steps contradict it: {off}") from off
     return mdp, starts_known
 
 
-def _published(env: gymnasium.Env, gamma: float, transforms: Transforms, generator: np.random.Generator) -> TabularMDP:
+def compare_table(
+    mdp: TabularMDP, env: gymnasium.Env, gamma: float, generator: np.random.Generator, *, seconds: float = SECONDS
+) -> int:
+    """`compare` a random walk with a table: starts must have positive probability there, and each step must be an
+    outcome that has (`TabularModel.outcome_of`).
+
+    Args:
+        env: an instance for this alone, in the wrappers that the table is meant for.
+        gamma: discount of a step that names none.
+    """
+
+    def state_of(taken: Taken) -> int:
+        seen = taken.observation
+        if not _is_state(seen, mdp.num_states):
+            raise ModelMismatch(f"it shows {seen!r}, which is none of the states 0 to {mdp.num_states - 1}")
+        if taken.action is None and mdp.start_S[int(seen)] == 0:
+            raise ModelMismatch(f"it starts in state {seen}, which has probability 0 there")
+        return int(seen)
+
+    return compare(TabularModel(mdp), env, generator, state_of, gamma=gamma, seconds=seconds)
+
+
+def _from_rows(env: gymnasium.Env, gamma: float, transforms: Transforms, generator: np.random.Generator) -> TabularMDP:
     """The MDP of a table P with the transforms of wrappers; MissingModel if it is no such table."""
     base: Any = env.unwrapped
-    if getattr(base, "fickle_passenger", False):
-        raise MissingModel(f"the table P of {env_name(env)} is not used: it lacks what a fickle passenger draws")
     start = getattr(base, _STARTS, None)
     try:
         if start is None:
-            start = counted_starts(env, len(base.P), generator)
+            start = _counted_starts(env, len(base.P), generator)
         mdp = TabularMDP.from_gymnasium(env, gamma, start=start)
-        if mdp.num_actions != base.action_space.n:
-            raise MissingModel(
-                f"the table P of {env_name(env)} is not used: it has {mdp.num_actions} actions, and its space is "
-                f"{base.action_space}"
-            )
         if not (transforms.actions or transforms.rewards):
             return mdp
         positions = [_position(base, action) for action in base_actions(env)]
@@ -106,6 +139,24 @@ def _published(env: gymnasium.Env, gamma: float, transforms: Transforms, generat
         raise
     except Exception as error:
         raise MissingModel(f"the attribute P of {env_name(env)} is no transition table: {error}") from error
+
+
+def _counted_starts(env: gymnasium.Env, num_states: int, generator: np.random.Generator) -> Float[np.ndarray, "S"]:
+    """The share of up to 1,000 seeded resets in which each state was the start; ValueError if a start is no state."""
+    counts, until = np.zeros(num_states), time.monotonic() + SECONDS
+    for _ in range(_RESETS):
+        state = reset(env, seed=int(generator.integers(2**31))).observation
+        if not _is_state(state, num_states):
+            raise ValueError(f"reset gave {state!r}, which is none of the states 0 to {num_states - 1}")
+        counts[int(state)] += 1
+        if time.monotonic() > until:
+            break
+    return counts / counts.sum()
+
+
+def _is_state(seen: Any, num_states: int) -> bool:
+    array = np.asarray(seen)
+    return array.ndim == 0 and array.dtype.kind in "iu" and 0 <= int(array) < num_states
 
 
 def _position(base: Any, action: Any) -> int:

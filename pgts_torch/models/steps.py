@@ -1,6 +1,7 @@
 """Rewards, discounts and observations of a step, in all forms in which environments return them."""
 
 import contextlib
+from collections.abc import Mapping
 from decimal import Decimal
 from numbers import Real
 from typing import Any
@@ -51,7 +52,7 @@ def _plain(value: Any) -> Any:
 
 
 def rewards_of(values: Any, count: int) -> np.ndarray:
-    """The rewards of copies that step together, one number a copy, in float64.
+    """The rewards of environments that step together, one number each, in float64.
 
     Raises:
         PgtsError: there is another count of them, or they are no numbers.
@@ -61,7 +62,7 @@ def rewards_of(values: Any, count: int) -> np.ndarray:
     except (ValueError, TypeError) as error:
         raise PgtsError(f"the rewards are {values!r}; they must be {count} numbers") from error
     if reward_B.size != count or len(reward_B) != count:
-        raise PgtsError(f"the rewards have shape {reward_B.shape}; they must be {count} numbers, one for each copy")
+        raise PgtsError(f"the rewards have shape {reward_B.shape}; they must be {count} numbers, one each")
     return reward_B.reshape(count)
 
 
@@ -83,7 +84,7 @@ def names_discounts(env: Any) -> bool:
     return bool((env.metadata or {}).get("discounts", False))
 
 
-def discount_of(info: dict[str, Any], gamma: float, *, named: bool) -> float:
+def discount_of(info: Mapping[str, Any], gamma: float, *, named: bool) -> float:
     """The discount of a step that ends no episode: that which it names, or gamma.
 
     Args:
@@ -153,3 +154,14 @@ def as_declared(space: spaces.Space, value: Any) -> Any:
             _check_observation(space, value)
             return np.asarray(value).astype(space.dtype)
     return value
+
+
+def bits(value: Any) -> bytes:
+    """Every bit of an observation, or of a step."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{value.shape}".encode() + value.tobytes()
+    if isinstance(value, dict):
+        return b"".join(str(name).encode() + bits(value[name]) for name in sorted(value, key=str))
+    if isinstance(value, tuple | list):
+        return b"".join(b"(" + bits(part) for part in value)
+    return repr(value.item() if isinstance(value, np.generic) else value).encode()

@@ -1,165 +1,139 @@
-"""A short trial of models that claim to be an environment: do its steps contradict them?"""
+"""Short trials of an environment: random walks in which an error of its code is told from one of ours."""
 
-import contextlib
-import math
+import itertools
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from jaxtyping import Float
 
-from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import CONTRADICTED, ExactModel, Happened, step_text
-from pgts_torch.models.classic import dynamics_of
-from pgts_torch.models.dynamics import DynamicsModel
+from pgts_torch.errors import Failed, ModelMismatch, PgtsError, text_of
+from pgts_torch.models.base import CONTRADICTED, ExactModel, Happened
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
-from pgts_torch.models.tabular import TabularModel, tabular_truth
-from pgts_torch.tabular.mdp import TabularMDP
 
-_GAMMA = 0.5
-"""Only an end, of discount 0, has to differ from it."""
+SECONDS = 0.3
+"""After these a random walk ends in a slow environment."""
 
-_STEPS, _LONGEST_EPISODE, _RESETS = 400, 40, 1000
-_SECONDS = 0.3
-"""After these a trial ends in a slow environment, though never before its first step."""
+_LEAST_EPISODES = 3
+"""Of a random walk, however slow the environment is; each has at least one step."""
+
+_COMPARED_STEPS, _LONGEST_EPISODE = 400, 40
 
 
-def table_contradiction(
-    mdp: TabularMDP, env: gymnasium.Env, gamma: float, generator: np.random.Generator, *, seconds: float = _SECONDS
-) -> tuple[str, int]:
-    """The first thing in a short random walk that a table rules out, empty where there is none; and how many steps were
-    compared.
-
-    Starts must have positive probability, and each step must be an outcome that has (`TabularModel.outcome_of`).
-
-    Args:
-        env: an instance for this alone, in the wrappers that the table is meant for.
-        gamma: discount of a step that names none.
-    """
-
-    def state_of(seen: Any) -> int:
-        if not _is_state(seen, mdp.num_states):
-            raise _NoState(f"it shows {seen!r}, which is none of the states 0 to {mdp.num_states - 1}")
-        return int(seen)
-
-    def began(state: int) -> None:
-        if mdp.start_S[state] == 0:
-            raise _NoState(f"it starts in state {state}, which has probability 0 there")
-
+@contextmanager
+def environment_code() -> Iterator[None]:
+    """Whatever the code of an environment raises in this context is `Failed`, so that it is told from an error of our
+    own code; Ctrl-C is the user's."""
     try:
-        return _contradiction(TabularModel(mdp), _walk(env, gamma, generator, state_of, began, seconds))
-    except _NoState as off:
-        return str(off), 0
+        yield
+    except (PgtsError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        raise Failed(text_of(error)) from error
 
 
-def dynamics_contradiction(
-    model: DynamicsModel, env: gymnasium.Env, generator: np.random.Generator, *, seconds: float = _SECONDS
-) -> tuple[str, int]:
-    """The first step of a short random walk that dynamics in torch contradict (`TensorModel.outcome_of`), empty where
-    there is none; and how many steps were compared.
+class Taken(NamedTuple):
+    """What a step gave, or a reset: then there is no action and no reward."""
 
-    Args:
-        model: for this alone: it numbers the states of the walk.
-        env: an instance for this alone, in the wrappers that the dynamics are meant for.
-    """
-    numbers = _walk(env, model.gamma, generator, lambda _: int(model.roots([env])), lambda _: None, seconds)
-    return _contradiction(model, numbers)
+    action: Any
+    observation: Any
+    reward: Any = None
+    terminated: bool = False
+    truncated: bool = False
+    info: Mapping[str, Any] = MappingProxyType({})
 
-
-def claims(env: gymnasium.Env, generator: np.random.Generator) -> Iterator[tuple[str, str, int]]:
-    """The models that claim to be an environment, "table" or "dynamics", each with its contradiction as above.
-
-    Args:
-        env: an instance for this alone. Its table is compared with the environment inside its wrappers.
-    """
-    base: Any = env.unwrapped
-    with contextlib.suppress(PgtsError):  # the attribute P is no table
-        mdp = tabular_truth(base, gamma=_GAMMA)
-        yield "table", *table_contradiction(mdp, base, _GAMMA, generator, seconds=math.inf)
-    if (kind := dynamics_of(env)) is not None:
-        model = kind(env, gamma=_GAMMA)
-        yield "dynamics", *dynamics_contradiction(model, env, generator, seconds=math.inf)
+    @property
+    def ends(self) -> bool:
+        """Whether the episode is over."""
+        return self.terminated or self.truncated
 
 
-def counted_starts(env: gymnasium.Env, num_states: int, generator: np.random.Generator) -> Float[np.ndarray, "S"]:
-    """The share of up to 1,000 seeded resets in which each state was the start.
+def reset(env: gymnasium.Env, *, seed: int | None = None) -> Taken:
+    """Reset an environment; Failed if it raises, or returns something else than two values."""
+    with environment_code():
+        observation, _ = env.reset(seed=seed)
+        return Taken(None, observation)
+
+
+def step(env: gymnasium.Env, action: Any) -> Taken:
+    """Take an action; Failed if the environment raises, or returns something else than five values."""
+    with environment_code():
+        observation, reward, terminated, truncated, info = env.step(action)
+        return Taken(action, observation, reward, bool(terminated), bool(truncated), dict(info))
+
+
+def random_walk(
+    env: gymnasium.Env,
+    actions: Sequence[Any],
+    generator: np.random.Generator,
+    *,
+    steps: int,
+    longest: int,
+    seconds: float = SECONDS,
+) -> Iterator[Taken]:
+    """Resets and steps of random episodes: three, and more until there are `steps` steps or the time is over.
+
+    An episode is ended after `longest` steps, and after its next step once the time is over.
 
     Raises:
-        ValueError: a start is no state.
+        Failed: the environment raises.
     """
-    counts, until = np.zeros(num_states), time.monotonic() + _SECONDS
-    for _ in range(_RESETS):
-        state, _ = env.reset(seed=_seed(generator))
-        if not _is_state(state, num_states):
-            raise ValueError(f"reset gave {state!r}, which is none of the states 0 to {num_states - 1}")
-        counts[int(state)] += 1
-        if time.monotonic() > until:
-            break
-    return counts / counts.sum()
+    until, taken = time.monotonic() + seconds, 0
+    for episode in itertools.count():
+        if episode >= _LEAST_EPISODES and (taken >= steps or time.monotonic() > until):
+            return
+        yield reset(env, seed=int(generator.integers(2**31)))
+        for _ in range(longest):
+            now = step(env, actions[int(generator.integers(len(actions)))])
+            taken += 1
+            yield now
+            if now.ends or time.monotonic() > until:
+                break
 
 
-class _NoState(Exception):
-    """An observation is no state, or a start that has no probability."""
-
-
-_Step = tuple[int, int, float, float, int]
-"""State, number of the action, reward, discount and next state."""
-
-
-def _contradiction(model: ExactModel, steps: Iterator[_Step]) -> tuple[str, int]:
-    """The first step that contradicts a model, in words, and how many steps there were."""
-    columns = list(zip(*steps, strict=True))
-    if not columns:
-        return "", 0
-    state_N, action_N, reward_N, discount_N, next_N = map(np.array, columns)
-    happened = Happened(state_N, action_N, reward_N, discount_N, next_N, np.zeros(len(state_N), dtype=bool))
-    off = np.flatnonzero(model.outcome_of(happened) == CONTRADICTED)
-    if not off.size:
-        return "", len(state_N)
-    state, action, reward, discount, following = (column[off[0]] for column in columns)
-    return (
-        f"after action {action} in {model.state_text(state)} came "
-        f"{step_text(reward, discount, model.state_text(following))}; it has {model.outcomes_text(state, action)}"
-    ), len(state_N)
-
-
-def _walk(
+def compare(
+    model: ExactModel,
     env: gymnasium.Env,
-    gamma: float,
     generator: np.random.Generator,
-    state_of: Callable[[Any], int],
-    began: Callable[[int], None],
-    seconds: float,
-) -> Iterator[_Step]:
-    """Random episodes, up to an error of the environment: that is no contradiction, and is reported when it stops a
-    training."""
-    until, taken, named = time.monotonic() + seconds, 0, names_discounts(env)
+    state_of: Callable[[Taken], int],
+    *,
+    gamma: float,
+    seconds: float = SECONDS,
+) -> int:
+    """Compare a random walk with a model that claims to be the environment (`ExactModel.outcome_of`).
+
+    Args:
+        model: for this alone: it may number the states of the walk.
+        env: an instance for this alone, in the wrappers that the model is meant for, with actions from 0 on.
+        state_of: the state of the model in which a step or a reset has left the environment; it may raise too.
+        gamma: discount of a step that names none.
+
+    Returns:
+        How many steps were compared. An error of the environment ends the walk: it is no contradiction, and reported
+        when it stops a training.
+
+    Raises:
+        ModelMismatch: the model rules a step out. The message has the first such step.
+    """
+    rows, state, named = list[tuple[Any, ...]](), 0, names_discounts(env)
     try:
-        while taken < _STEPS and (time.monotonic() < until or taken == 0):
-            seen, _ = env.reset(seed=_seed(generator))
-            state = state_of(seen)
-            began(state)
-            for _ in range(_LONGEST_EPISODE):
-                action = int(generator.integers(env.action_space.n))  # type: ignore[attr-defined]
-                seen, reward, terminated, truncated, info = env.step(action)
-                discount = 0.0 if terminated else discount_of(info, gamma, named=named)
-                before, state = state, state_of(seen)
-                yield before, action, number_of("reward", reward), discount, state
-                taken += 1
-                if terminated or truncated or time.monotonic() > until:
-                    break
-    except (_NoState, KeyboardInterrupt):
+        for taken in random_walk(
+            env, range(model.num_actions), generator, steps=_COMPARED_STEPS, longest=_LONGEST_EPISODE, seconds=seconds
+        ):
+            before, state = state, state_of(taken)
+            if taken.action is not None:
+                discount = 0.0 if taken.terminated else discount_of(taken.info, gamma, named=named)
+                rows.append((before, taken.action, number_of("reward", taken.reward), discount, state, False))
+    except ModelMismatch:
         raise
-    except BaseException:
-        return
-
-
-def _is_state(seen: Any, num_states: int) -> bool:
-    array = np.asarray(seen)
-    return array.ndim == 0 and array.dtype.kind in "iu" and 0 <= int(array) < num_states
-
-
-def _seed(generator: np.random.Generator) -> int:
-    return int(generator.integers(2**31))
+    except PgtsError:
+        pass
+    if rows:
+        happened = Happened(*map(np.array, zip(*rows, strict=True)))
+        off = np.flatnonzero(model.outcome_of(happened) == CONTRADICTED)
+        if off.size:
+            raise ModelMismatch(model.contradiction(happened.part(off)))
+    return len(rows)

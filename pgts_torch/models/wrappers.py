@@ -2,11 +2,10 @@
 one observation, and refused where they do more than that."""
 
 import copy
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from inspect import getattr_static
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -15,6 +14,7 @@ from gymnasium import ActionWrapper, ObservationWrapper, RewardWrapper, wrappers
 from pgts_torch.errors import MissingModel
 from pgts_torch.models.attributes import attributes, different, fingerprint
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.trial import environment_code, random_walk
 
 _HARMLESS = (
     wrappers.TimeLimit,
@@ -30,8 +30,8 @@ _HARMLESS = (
 _HOOKS = {ActionWrapper: "action", ObservationWrapper: "observation", RewardWrapper: "reward", gymnasium.Wrapper: ""}
 """What a wrapper transforms whose `step` and `reset` are those of this base class of Gymnasium."""
 
-_TRIED_STEPS, _SECONDS = 60, 0.2
-"""How long the trial of wrappers is."""
+_TRIED_STEPS, _LONGEST, _SECONDS = 60, 20, 0.2
+"""How long the trial of wrappers is, and the episodes in it."""
 
 
 @dataclass(frozen=True)
@@ -93,72 +93,58 @@ def check_transforms(env: gymnasium.Env, actions: Sequence[Any], generator: np.r
 
     Raises:
         MissingModel: as `transforms_of` does, or a wrapper has a memory, or uses chance.
+        Failed: the environment raises.
     """
     transforms, hooked = transforms_of(env), [wrapper for wrapper in wrappers_of(env) if _kind(wrapper)]
     if not hooked:
         return
     before = attributes(env)
-    raw, seen = _walk(env, actions, generator)
+    innermost = wrappers_of(env)[-1]
+    innermost.env = recorder = _Recorder(innermost.env)
+    walk = random_walk(env, actions, generator, steps=_TRIED_STEPS, longest=_LONGEST, seconds=_SECONDS)
+    outside = [_copied(taken.action, taken.observation, taken.reward) for taken in walk]
+    innermost.env = recorder.env
     changed = different(before, attributes(env))
     for wrapper in hooked:
         if any(name.startswith(f"{type(wrapper).__name__}.") for name in changed):
             raise refusal(env, wrapper, "which remembers something from step to step")
     # The environment is in another state by now, and the wrappers have been used in between.
-    for (taken, observation, reward), (action, outside, paid) in zip(raw, seen, strict=True):
-        if fingerprint(transforms.observation(observation)) != fingerprint(outside):
-            raise refusal(env, _with("observation", hooked), "which makes different things of the same observation")
-        if action is None:
-            continue
-        if fingerprint(transforms.action(action)) != fingerprint(taken):
-            raise refusal(env, _with("action", hooked), "which makes different things of the same action")
-        if fingerprint(transforms.reward(reward)) != fingerprint(paid):
-            raise refusal(env, _with("reward", hooked), "which makes different things of the same reward")
+    for (taken, observation, reward), (action, seen, paid) in zip(recorder.inside, outside, strict=True):
+        with environment_code():
+            pairs = {"observation": (transforms.observation(observation), seen)}
+            if action is not None:
+                pairs |= {"action": (transforms.action(action), taken), "reward": (transforms.reward(reward), paid)}
+        for kind, (now, then) in pairs.items():
+            if fingerprint(now) != fingerprint(then):
+                outermost = next((wrapper for wrapper in hooked if _kind(wrapper) == kind), hooked[0])
+                raise refusal(env, outermost, f"which makes different things of the same {kind}")
 
 
-_Seen = tuple[Any, Any, Any]
-"""Action, observation and reward of a step; the first and the last are None in a reset."""
+def _copied(action: Any, observation: Any, reward: Any) -> tuple[Any, Any, Any]:
+    """What a step took and gave, in objects of its own; action and reward are None in a reset."""
+    with environment_code():
+        return copy.deepcopy((action, observation, reward))
 
 
-def _walk(
-    env: gymnasium.Env, actions: Sequence[Any], generator: np.random.Generator
-) -> tuple[list[_Seen], list[_Seen]]:
-    """A random walk, as recorded inside the wrappers and outside of them."""
-    base, until = cast(Any, env.unwrapped), time.monotonic() + _SECONDS
-    raw, seen, inside = list[_Seen](), list[_Seen](), False
+class _Recorder(gymnasium.Wrapper):
+    """Between an environment and its wrappers: records what passes."""
 
-    def recorded(method: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            nonlocal inside
-            if inside:  # an environment may step itself in its reset
-                return method(*args, **kwargs)
-            inside = True
-            try:
-                answer = method(*args, **kwargs)
-            finally:
-                inside = False
-            raw.append(copy.deepcopy((args[0], *answer[:2]) if len(answer) > 2 else (None, answer[0], None)))
-            return answer
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self.inside: list[tuple[Any, Any, Any]] = []
 
-        return call
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.env, name)
 
-    own = {name: vars(base)[name] for name in ("step", "reset") if name in vars(base)}
-    base.step, base.reset = recorded(base.step), recorded(base.reset)
-    try:
-        over = True
-        for _ in range(_TRIED_STEPS):
-            if over:
-                observation, _ = env.reset(seed=int(generator.integers(2**31)))
-                seen.append(copy.deepcopy((None, observation, None)))
-            action = actions[int(generator.integers(len(actions)))]
-            observation, paid, terminated, truncated, _ = env.step(action)
-            seen.append(copy.deepcopy((action, observation, paid)))
-            over = terminated or truncated
-            if time.monotonic() > until:
-                break
-    finally:
-        del base.step, base.reset
-        vars(base).update(own)
-    return raw, seen
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        answer = self.env.reset(seed=seed, options=options)
+        self.inside.append(_copied(None, answer[0], None))
+        return answer
+
+    def step(self, action: Any) -> Any:
+        answer = self.env.step(action)
+        self.inside.append(_copied(action, *answer[:2]))
+        return answer
 
 
 def _kind(wrapper: gymnasium.Wrapper) -> str | None:
@@ -172,11 +158,6 @@ def _kind(wrapper: gymnasium.Wrapper) -> str | None:
         ):
             return hook
     return None
-
-
-def _with(kind: str, hooked: Sequence[gymnasium.Wrapper]) -> gymnasium.Wrapper:
-    """The outermost wrapper that transforms this."""
-    return next((wrapper for wrapper in hooked if _kind(wrapper) == kind), hooked[0])
 
 
 def _through(functions: Sequence[Callable[[Any], Any]], value: Any) -> Any:

@@ -11,13 +11,14 @@ from gymnasium import spaces
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
-from gymnasium.wrappers import TransformReward
+from gymnasium.wrappers import RepeatAction, TimeLimit, TransformReward
 
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.fidelity import check_model
+from pgts_torch.models.wrappers import wrappers_of
 from pgts_torch.tabular import exact
 from tests.agent.cells import FIRST, Cells, N, Walk, agrees, heavier, refusal_of, row_of_cells, vector_of, world_of
 
@@ -74,8 +75,14 @@ def patched() -> gymnasium.Env:
         (Encoded, "action_mask is overridden by Encoded"),
         (Chosen, "np_random is overridden by Chosen"),
         (patched, "step was set on the instance"),
-        (lambda: Cells(row_of_cells(), starts=FIRST, slip=0.1), r"after action \d in state \d came .* it has reward"),
-        (lambda: Cells(row_of_cells(), starts=FIRST, pays=2.0), r"came reward 2, an end; it has reward 1, an end"),
+        (
+            lambda: Cells(row_of_cells(), starts=FIRST, slip=0.1),
+            r"state \d under action \d gave .* the table says reward",
+        ),
+        (
+            lambda: Cells(row_of_cells(), starts=FIRST, pays=2.0),
+            r"gave reward 2, an end; the table says reward 1, an end",
+        ),
         (lambda: Cells(row_of_cells(), starts=FIRST, begins=3), "it starts in state [12], which has probability 0"),
         (lambda: Cells(row_of_cells(N - 1), starts=FIRST), "is no transition table: start_S has shape"),
         (lambda: Cells(row_of_cells(N - 1)), r"is no transition table: reset|it has 5 states|it shows 5"),
@@ -144,7 +151,7 @@ def test_more_actions_than_a_table_has_are_a_reason():
             super().__init__(row_of_cells(), starts=FIRST)
             self.action_space = spaces.Discrete(3)
 
-    assert "it has 2 actions, and its space is Discrete(3)" in refusal_of(Three)
+    assert "it has 6 states and 2 actions, and its spaces are Discrete(6) and Discrete(3)" in refusal_of(Three)
 
 
 def test_a_table_without_starts_takes_them_from_resets_and_says_so():
@@ -181,7 +188,7 @@ def test_a_table_that_changes_from_episode_to_episode_is_contradicted():
             self.initial_state_distrib = FIRST
             return answer
 
-    assert "came reward 0, an end; it has reward 1, an end" in refusal_of(
+    assert "gave reward 0, an end; the table says reward 1, an end" in refusal_of(
         lambda: Changing(row_of_cells(), starts=FIRST)
     )
 
@@ -293,6 +300,20 @@ def test_an_instance_that_was_rendered_or_is_in_an_episode_is_not_changed():
     assert isinstance(world_of(env), SimulatedWorld)
 
 
+class Chained(Walk):
+    """It holds a chain of objects that is longer than Python's recursion."""
+
+    def __init__(self, last: int = 0) -> None:
+        self.chain: Any = [last]
+        for _ in range(5_000):
+            self.chain = {"next": self.chain, "other": set}
+
+
+def test_instances_are_compared_to_the_end_of_long_chains_of_objects():
+    assert isinstance(world_of(vector_of(Chained, Chained)), SimulatedWorld)
+    assert "environment 1 of Chained has another chain" in refusal_of(vector_of(Chained, lambda: Chained(last=1)))
+
+
 def test_two_wrappers_of_a_kind_are_both_held_to_the_spec():
     lake, louder = gymnasium.make("FrozenLake-v1"), functools.partial(operator.mul, 2)
     for k in range(2):
@@ -327,3 +348,20 @@ def test_an_instance_that_its_spec_cannot_make_again_is_refused_with_the_way_out
 
     assert "its spec cannot make again" in refusal_of(Louder(gymnasium.make("CartPole-v1")))
     assert agrees(world_of(lambda: Louder(gymnasium.make("CartPole-v1"))), [0, 1])
+
+
+@pytest.mark.parametrize(("limits", "shortest"), [((100,), 100), ((9_000,), 500), ((100, 30, 200), 30)])
+def test_time_limits_around_an_instance_that_has_one_are_the_shortest_of_them(limits, shortest):
+    env = gymnasium.make("CartPole-v1")
+    for limit in limits:
+        env = TimeLimit(env, limit)
+    source = EnvSource.of(env)
+    assert source.time_limit == shortest
+    assert [made._max_episode_steps for made in wrappers_of(source.make_one()) if isinstance(made, TimeLimit)] == [
+        shortest
+    ]
+    assert isinstance(world_of(env), DynamicsWorld)
+    env.unwrapped.gravity = 20  # type: ignore[attr-defined]
+    assert "gravity = 20, where another instance has 9.8" in refusal_of(env)
+    skipping = TimeLimit(RepeatAction(gymnasium.make("CartPole-v1"), 2), 100)
+    assert "TimeLimit in RepeatAction" in refusal_of(skipping)  # its spec counts the steps that are repeated

@@ -14,7 +14,9 @@ from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
 from pgts_torch.agent.world import ModelWorld, SimulatedWorld
+from pgts_torch.models import check_model
 from tests.agent.cells import Walk, agrees, refusal_of, vector_of, world_of
+from tests.models import corridors
 
 # Dynamics and adapters
 
@@ -163,17 +165,6 @@ def test_constants_that_each_instance_draws_for_itself_are_refused():
 # Simulators
 
 
-class Forgetful(Walk):
-    def reset(self, **options: Any) -> Any:
-        self.fuel = 15
-        return super().reset(**options)
-
-    def step(self, action: int) -> Any:
-        observation, reward, ends, *rest = super().step(action)
-        self.fuel -= 1
-        return observation, reward, ends or self.fuel <= 0, *rest
-
-
 class Idle(Walk):
     def set_state(self, state: Any) -> None:
         pass
@@ -182,24 +173,6 @@ class Idle(Walk):
 class Trembling(Walk):
     def set_state(self, state: Any) -> None:
         self.position = max(0, min(3, state + int(self.np_random.integers(-1, 2))))
-
-
-class Global(Walk):
-    def step(self, action: int) -> Any:
-        return super().step(action if random.random() < 0.8 else 1 - action)
-
-
-class GlobalNumpy(Walk):
-    def step(self, action: int) -> Any:
-        return super().step(action if np.random.rand() < 0.8 else 1 - action)  # noqa: NPY002
-
-
-class OwnGenerator(Walk):
-    def __init__(self) -> None:
-        self.own = np.random.default_rng(1)
-
-    def step(self, action: int) -> Any:
-        return super().step(action if self.own.random() < 0.8 else 1 - action)
 
 
 class Mazes(Walk):
@@ -231,27 +204,26 @@ class Shared(Walk):
         return observation, reward + self.box[0], *rest
 
 
-DIFFERENTLY = "a restored state goes on differently at step"
-
-
 @pytest.mark.fault("get_state or set_state that does not hold what step reads or changes")
+@pytest.mark.parametrize("make", [corridors.Forgetful, Idle, Trembling, Goals, Mazes, Shared])
+def test_a_simulator_that_does_not_go_on_as_before_is_refused(make):
+    assert f"{make.__name__} cannot serve as a model: a restored state goes on differently" in refusal_of(make)
+    assert not isinstance(world_of(make, plain=True), ModelWorld)
+
+
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (Forgetful, DIFFERENTLY),
-        (Idle, DIFFERENTLY),
-        (Trembling, DIFFERENTLY),
-        (Goals, DIFFERENTLY),
-        (Mazes, DIFFERENTLY),
-        (Shared, DIFFERENTLY),
-        (Global, "step draws from the global generator of random"),
-        (GlobalNumpy, "step draws from the global generator of numpy"),
-        (OwnGenerator, "attribute own is a generator of its own"),
+        (corridors.GlobalGenerator, "step draws from the global generator of random"),
+        (lambda: corridors.GlobalGenerator("numpy"), "step draws from the global generator of numpy"),
+        (corridors.OwnGenerator, "attribute dice is a generator of its own"),
+        (corridors.Clairvoyant, "attribute box.0.dice is a generator of its own"),
+        (corridors.Prophet, "get_state returns the generator too"),
+        (corridors.SharedPlace, "a search changes the real environment"),
     ],
 )
-def test_a_simulator_that_cannot_be_restored_is_refused_in_the_words_of_check_model(make, why):
-    assert f"{make.__name__} cannot serve as a model: {why}" in refusal_of(make)
-    assert not isinstance(world_of(make, plain=True), ModelWorld)
+def test_a_simulator_whose_chance_or_state_is_not_its_own_is_refused(make, why):
+    assert f"cannot serve as a model: {why}" in refusal_of(make)
 
 
 def test_an_environment_that_is_slow_is_tried_in_few_steps():
@@ -268,20 +240,42 @@ def test_an_environment_that_is_slow_is_tried_in_few_steps():
     assert steps < 60
 
 
-def test_what_is_drawn_and_done_while_models_are_sought_is_noticed_by_nobody():
+def test_the_search_for_a_model_changes_no_environment_and_no_global_generator():
     states = random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state().tolist()  # type: ignore[index]  # noqa: NPY002
-    copies = vector_of(Walk, Walk)
-    copies.reset(seed=1)
-    before = [(env.position, env.np_random.bit_generator.state) for env in copies.envs]  # type: ignore[attr-defined]
-    world_of(copies)
-    refusal_of(Global)
-    assert [(env.position, env.np_random.bit_generator.state) for env in copies.envs] == before  # type: ignore[attr-defined]
+    vector = vector_of(Walk, Walk)
+    vector.reset(seed=1)
+    before = [(env.position, env.np_random.bit_generator.state) for env in vector.envs]  # type: ignore[attr-defined]
+    world_of(vector)
+    refusal_of(corridors.GlobalGenerator)
+    assert [(env.position, env.np_random.bit_generator.state) for env in vector.envs] == before  # type: ignore[attr-defined]
     assert states == (random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state().tolist())  # type: ignore[index]  # noqa: NPY002
 
 
-def test_what_an_environment_raises_while_it_is_tried_is_told_by_the_training():
+def test_an_error_of_the_environment_in_a_trial_is_left_to_the_training():
     class Falling(Walk):
         def step(self, action: int) -> Any:
             raise RuntimeError("it fell")
 
     assert isinstance(world_of(Falling), SimulatedWorld)
+
+
+@pytest.mark.parametrize(
+    ("ours", "make"),
+    [
+        ("restoring.sample_keys", Walk),
+        ("restoring.bits", Walk),
+        ("attributes.different", InDict),
+        ("wrappers.fingerprint", lambda: wrappers.FlattenObservation(Walk())),
+        ("trial.number_of", lambda: gymnasium.make("CartPole-v1")),
+    ],
+)
+def test_an_error_of_our_own_in_a_trial_is_not_taken_for_one_of_the_environment(ours, make, monkeypatch):
+    def broken(*args: Any, **kwargs: Any) -> Any:
+        raise IndexError("a bug of ours")
+
+    monkeypatch.setattr(f"pgts_torch.models.{ours}", broken)
+    with pytest.raises(IndexError, match="a bug of ours"):
+        world_of(make)
+    if ours.startswith("restoring"):
+        with pytest.raises(IndexError, match="a bug of ours"):
+            check_model(make)

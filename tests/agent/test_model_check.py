@@ -263,7 +263,7 @@ def test_probabilities_that_are_wrong_stop_the_training(slip, listed):
     for env in real(model):
         env.slip = slip
     with pytest.raises(
-        ModelMismatch, match=r"contradicts the probabilities of its table: state \d under action \d gave"
+        ModelMismatch, match=r"contradicts its table: state \d under action \d gave .* in \d+ of \d+ cases"
     ):
         model.learn(30_000)
 
@@ -292,7 +292,7 @@ def test_a_start_that_is_too_frequent_stops_the_training():
     model.learn(400)
     for env in real(model):
         env.shares = [0.6, 0.1, 0.1, 0.1, 0.1]
-    with pytest.raises(ModelMismatch, match=r"probabilities of its table: an episode began in state 0 in \d+ of \d+"):
+    with pytest.raises(ModelMismatch, match=r"contradicts its table: an episode began in state 0 in \d+ of \d+"):
         model.learn(40_000)
 
 
@@ -432,9 +432,6 @@ def test_a_saved_check_goes_on_with_the_same_bits(tmp_path):
     first, second = (each.model_check.state_dict() for each in (model, other))
     assert first["frequencies"]["steps"]["counts"].sum() > 50
     assert repr(first) == repr(second)
-    assert [f.log_evidence for f in model.model_check._frequencies.values()] == [
-        f.log_evidence for f in other.model_check._frequencies.values()
-    ]
 
 
 @pytest.mark.usefixtures("unchecked_shapes")

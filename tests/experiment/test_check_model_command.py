@@ -61,9 +61,10 @@ def test_a_usable_environment_is_told_in_a_table_with_exit_code_0(capsys):
 @pytest.mark.parametrize(("kwargs", "states"), [([], 100), (["--kwargs", '{"size": 4, "traps": []}'], 16)])
 def test_a_table_is_told_to_need_no_snapshot_and_to_agree_with_the_steps(kwargs, states, capsys):
     assert main(["check-model", "pgts/Grid-v0", *kwargs]) == 0
-    size = f"pgts/Grid-v0: a table of {states} states and 4 actions"
-    verdict = f"{size}, no snapshot is needed; 400 steps agree, bit for bit"
-    assert " ".join(capsys.readouterr().out.split()) == verdict
+    verdict = f"pgts/Grid-v0 can serve as a model: a table of {states} states, so no snapshot is needed"
+    words = " ".join(capsys.readouterr().out.split())
+    assert words.startswith(f"pgts/Grid-v0: table, {states} states, 4 actions table yes 400 steps agree")
+    assert words.endswith(verdict)
     told = answer(capsys, "pgts/Grid-v0", *kwargs)
     checks = told.pop("checks")
     assert told == {
@@ -71,6 +72,8 @@ def test_a_table_is_told_to_need_no_snapshot_and_to_agree_with_the_steps(kwargs,
         "family": "table",
         "num_states": states,
         "num_actions": 4,
+        "random_share": 1.0,
+        "cost": None,
         "usable": True,
         "verdict": verdict,
     }
@@ -81,9 +84,8 @@ def test_a_table_is_told_to_need_no_snapshot_and_to_agree_with_the_steps(kwargs,
 def test_a_table_and_dynamics_that_step_contradicts_are_a_failed_check_with_the_step(own_environments, capsys):
     assert main(["check-model", "corridors_of_mine:Liar-v0"]) == 1
     words = " ".join(capsys.readouterr().out.split())
-    assert "after action" in words
-    assert "came reward 0.5, discount 0.5, then state" in words
-    assert "; it has reward 0, discount 0.5, then state" in words
+    assert "gave reward 0.5, discount 0.5, then state" in words
+    assert "; the table says reward 0, discount 0.5, then state" in words
     [dynamics] = [check for check in answer(capsys, "CartPole-v1")["checks"] if check["name"] == "dynamics"]
     assert dynamics["passed"]
     assert dynamics["detail"] == "412 steps agree, within 1e-12"  # the last episode is taken to its end

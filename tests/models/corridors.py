@@ -95,7 +95,7 @@ class Prophet(Corridor):
 
 
 class OwnGenerator(Corridor):
-    """It draws from a generator that nobody else knows."""
+    """It draws from a generator of its own."""
 
     def __init__(self, slip: float = 0.3) -> None:
         super().__init__(slip)
@@ -127,8 +127,8 @@ class Clairvoyant(Corridor):
         self.position, self.fuel, self.box = state
 
 
-class Heedless(Corridor):
-    """Where an episode begins its seed does not say."""
+class Unseeded(Corridor):
+    """Its seed does not decide where an episode begins."""
 
     count: ClassVar = itertools.count()
 
@@ -159,8 +159,8 @@ class GlobalGenerator(Corridor):
         return {"random": random.random, "numpy": np.random.rand, "torch": lambda: float(torch.rand(()))}[self.share]()
 
 
-class Siamese(Corridor):
-    """All its instances stand in one place."""
+class SharedPlace(Corridor):
+    """All its instances have one position."""
 
     place: ClassVar = [0]
 

@@ -1,0 +1,284 @@
+"""Whether a simulator can be restored from snapshots: random walks, recorded bit for bit and made again."""
+
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from pgts_torch.errors import MissingModel
+from pgts_torch.models.adapters import methods_for
+from pgts_torch.models.attributes import changing, own_generator
+from pgts_torch.models.simulator import SimulatorModel
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, generator_state
+from pgts_torch.models.steps import as_declared, bits, number_of
+from pgts_torch.models.trial import Taken, environment_code, reset, step
+from pgts_torch.seeding import SharedGenerators, sample_keys, stream
+
+ACTIONS_TRIED = 8
+"""In each state, at the most."""
+
+_SHORT_WALKS, _SHORT_LENGTH, _LONG_LENGTH, _STEPS_IN_ALL, _TIMED_STEPS = 4, 20, 300, 20, 3
+"""Of `check_snapshots`: a few short walks, and one to the end of an episode, of which all the steps together are so
+many times as many. A few steps are timed first."""
+
+_WALKS_APART = 12
+"""In as many instances, where instances differ: two may be alike by chance."""
+
+_LEVELS, _WIDTH = 3, 8
+"""The search that is made beside a real environment: its levels, and the states of each."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all checks share. An error of the environment is `Failed`.
+
+    make: makes an instance without wrappers.   actions: of the environment inside them.
+    longest: the most steps before a walk is recorded, or before a state of another instance is restored.
+    alike: whether new instances are alike; else each state is restored in an instance of its own.
+    """
+
+    name: str
+    make: Callable[[], Any]
+    adapter: SnapshotAdapter
+    actions: Sequence[Any]
+    random: np.random.Generator
+    longest: int = 50
+    alike: bool = True
+
+    def model(self) -> SimulatorModel:
+        return SimulatorModel(self.make, gamma=1.0, actions=self.actions, adapter=self.adapter)
+
+    def number(self) -> int:
+        return int(self.random.integers(2**31))
+
+    def action(self) -> Any:
+        return self.actions[int(self.random.integers(len(self.actions)))]
+
+    def fresh(self) -> Any:
+        """A new instance, without wrappers, at the start of some episode."""
+        env = self.make()
+        reset(env, seed=self.number())
+        return env
+
+    def snapshot(self, env: Any) -> Snapshot:
+        with environment_code():
+            return self.adapter.get_state(env)
+
+    def stable_key(self, env: Any) -> bytes | None:
+        """The key of a snapshot; None if a second one of the same state has another key."""
+        key = self.snapshot(env).key
+        return key if self.snapshot(env).key == key else None
+
+    def restore(self, env: Any, snapshot: Snapshot) -> None:
+        with environment_code():
+            self.adapter.set_state(env, snapshot.data)
+
+    def seed(self, env: Any, key: int) -> None:
+        with environment_code():
+            self.adapter.seed(env, key)
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A recorded walk: its start, the key of its chance, its actions, what was seen and the keys of its states."""
+
+    start: Snapshot
+    key: int
+    actions: tuple[Any, ...]
+    seen: tuple[bytes, ...]
+    states: tuple[bytes, ...]
+
+
+def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> None:
+    """The checks `chance`, `restore` and `untouched` with a few short walks and a long one; their length is such that
+    all takes about these seconds, and at least two steps.
+
+    Raises:
+        MissingModel: snapshots of the environment cannot be trusted; the message says why.
+        PgtsError: the environment fails.
+    """
+    beside_snapshots(setup)
+    longest = int(np.clip(seconds / (_STEPS_IN_ALL * _seconds_of_a_step(setup)), 2, _LONG_LENGTH))
+    few = setup.actions[: max(2, min(longest, ACTIONS_TRIED))]
+    short = replace(setup, longest=longest, actions=few)
+    # Making an instance may take long: where all are alike three take turns, one for each part of a check.
+    three = itertools.cycle([setup.make() for _ in range(3)]) if setup.alike else None
+    many, turns = (_WALKS_APART, short) if three is None else (_SHORT_WALKS, replace(short, make=three.__next__))
+    for count, length in ((many, min(longest, _SHORT_LENGTH)), (1, longest)):
+        walks = walks_of(turns, count, length)
+        chance(turns, walks)
+        restored(walks, repeated(turns, walks))
+    untouched(short, min(longest, _SHORT_LENGTH), width=max(1, min(_WIDTH, longest // _WIDTH)))
+
+
+def _seconds_of_a_step(setup: Setup) -> float:
+    """Of a step with its snapshot: the smallest of a few times, which other processes have disturbed least."""
+    env, times = setup.fresh(), []
+    for _ in range(_TIMED_STEPS):
+        begin = time.perf_counter()
+        state = setup.snapshot(env)
+        step(env, setup.action())
+        times.append(time.perf_counter() - begin)
+        setup.restore(env, state)
+    return min(times)
+
+
+def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
+    """Walks without a restored state in between, each from the state that some random steps have led to."""
+    env, walks = setup.fresh(), list[Walk]()
+    for _ in range(count):
+        reset(env, seed=setup.number())
+        for _ in range(int(setup.random.integers(setup.longest))):
+            if step(env, setup.action()).ends:
+                reset(env, seed=setup.number())
+        walks.append(_recorded(setup, env, setup.number(), tuple(setup.action() for _ in range(length))))
+    return walks
+
+
+def _recorded(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
+    """These actions from the present state, up to an end."""
+    start = setup.snapshot(env)
+    setup.seed(env, key)
+    seen, states = list[bytes](), list[bytes]()
+    for action in actions:
+        taken = step(env, action)
+        seen.append(_bits_of(env, taken))
+        states.append(setup.snapshot(env).key)
+        if taken.ends:
+            break
+    return Walk(start, key, actions, tuple(seen), tuple(states))
+
+
+def _again(setup: Setup, env: Any, walk: Walk) -> Walk:
+    setup.restore(env, walk.start)
+    return _recorded(setup, env, walk.key, walk.actions)
+
+
+def repeated(setup: Setup, walks: Sequence[Walk]) -> list[Walk]:
+    """Repeat each walk in an instance that was at the end of an episode, and then in another walk: anything that a
+    snapshot lacks is then likely to differ."""
+    env, found = _at_the_end(setup), list[Walk]()
+    for walk in walks:
+        found.append(_again(setup, env if setup.alike else _at_the_end(setup), walk))
+    return found
+
+
+def _at_the_end(setup: Setup) -> Any:
+    """A new instance at the end of an episode, or late in one."""
+    env = setup.fresh()
+    for _ in range(setup.longest):
+        if step(env, setup.action()).ends:
+            break
+    return env
+
+
+def _bits_of(env: gymnasium.Env, taken: Taken) -> bytes:
+    """The bits of a step, or of a reset, as an agent sees it."""
+    declared = as_declared(env.observation_space, taken.observation)
+    reward = None if taken.action is None else number_of("reward", taken.reward)
+    return bits((declared, reward, taken.terminated, taken.truncated))
+
+
+def beside_snapshots(setup: Setup) -> None:
+    """MissingModel if a subclass has attributes that change and are not in the snapshots of its family."""
+    env, known = setup.fresh(), setup.adapter.restored
+    if known is None or type(env).__module__.split(".")[0] in ("gymnasium", "ale_py"):
+        return
+    if names := changing(env, setup.actions, setup.random, but=known):
+        raise MissingModel(
+            f"{min(names)} changes in its steps or resets and is in no snapshot of {setup.adapter.name}: "
+            f"{methods_for(env)}"
+        )
+
+
+def restored(walks: Sequence[Walk], others: Sequence[Walk]) -> str:
+    """Whether walks that were repeated went on as at first."""
+    for walk, other in zip(walks, others, strict=True):
+        pairs = itertools.zip_longest(walk.seen, other.seen)
+        if (off := next((k for k, (seen, now) in enumerate(pairs) if seen != now), None)) is not None:
+            raise MissingModel(
+                f"a restored state goes on differently at step {off + 1}: get_state misses something that step reads "
+                "or changes, or step draws from elsewhere than self.np_random"
+            )
+    steps = sum(len(walk.seen) for walk in walks)
+    return f"{len(walks)} continuations of {steps} steps in all are the same, bit for bit"
+
+
+def chance(setup: Setup, walks: Sequence[Walk]) -> str:
+    """Whether steps use generators other than the one that the key seeds; and how often another key matters."""
+    env = setup.fresh()
+    if name := own_generator(env):
+        raise MissingModel(f"attribute {name} is a generator of its own: draw from self.np_random only")
+    differ = 0
+    for walk in walks:
+        setup.restore(env, walk.start)
+        before = setup.stable_key(env)
+        setup.seed(env, setup.number())
+        if setup.stable_key(env) != before:
+            raise MissingModel(
+                "get_state returns the generator too, and a search would foresee what will be drawn: leave it out"
+            )
+        with SharedGenerators() as shared:
+            differ += _again(setup, env, replace(walk, key=setup.number())).seen != walk.seen
+        if shared.used:
+            raise MissingModel(
+                f"step draws from the global generator of {shared.used[0]}: draw from self.np_random only"
+            )
+    return f"of the key alone; {differ} of {len(walks)} continuations differ under another key"
+
+
+def untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
+    """Whether two equal real environments stay equal when a search starts from one of them."""
+    real, twin = setup.make(), setup.make()
+    seed, actions = setup.number(), [setup.action() for _ in range(2 * length)]
+    for env in (real, twin):
+        reset(env, seed=seed)
+    begun = _live(real, actions[:length]), _live(twin, actions[:length])
+    before = _state_of(setup, real)
+    model, after = setup.model(), {before}
+    with environment_code():
+        frontier_N = model.roots([real])
+    for level in range(_LEVELS):
+        state_N = frontier_N[:width].repeat_interleave(len(setup.actions))
+        action_N = torch.arange(len(setup.actions)).repeat(len(frontier_N[:width]))
+        key_N = sample_keys(len(state_N), generator=stream(seed, "untouched", level))
+        sampled = model.sample(state_N, action_N, key_N=key_N)
+        frontier_N = sampled.next_state_N[sampled.discount_N > 0].unique()
+        after.add(_state_of(setup, real))
+    if after != {before}:
+        raise MissingModel(
+            "a search changes the real environment: instances share something, or get_state changes its own"
+        )
+    if begun[0] != begun[1]:
+        raise MissingModel(
+            "after reset with the same seed two instances go on differently: reset must hand its seed to "
+            "super().reset, and draw from self.np_random only"
+        )
+    if _live(real, actions[length:]) != _live(twin, actions[length:]):
+        raise MissingModel(
+            "a real environment goes on differently after a search: it shares something with the model's"
+        )
+    return f"a search of {model.simulator_steps} steps left a real environment as it was, bit for bit"
+
+
+def _live(env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
+    """The bits that an agent sees as it takes these actions; where an episode ends a new one starts."""
+    seen = []
+    for action in actions:
+        taken = step(env, action)
+        seen.append(_bits_of(env, taken))
+        if taken.ends:
+            seen.append(_bits_of(env, reset(env)))
+    return seen
+
+
+def _state_of(setup: Setup, env: Any) -> tuple[bytes | None, str]:
+    """The key of its snapshot, and its generator."""
+    with environment_code():
+        generator = repr(generator_state(env))
+    return setup.stable_key(env), generator
