@@ -75,33 +75,39 @@ class Figure:
     num_envs: int = 32
 
 
-Pending = Sequence[tuple[tuple[str, str, int], Future[list[float]]]]
-"""Sampled runs under way, each with the (update, start, depth) that it belongs to."""
+Pending = Mapping[tuple[str, str, int], Sequence[Future[list[float]]]]
+"""Sampled runs under way, a seed each, by (update, start, depth)."""
 
 
 def start(figure: Figure, effort: Effort, executor: Executor) -> Pending:
     """Begin the sampled runs of a figure."""
-    return [(key, executor.submit(returns, job)) for key, job in _jobs(figure, effort)]
+    depths, share = (figure.quick_depths, 2) if effort.quick else (figure.sampled_depths, 1)
+    pending = {}
+    for update, start, depth in itertools.product(figure.moves, STARTS, depths):
+        iterations = figure.sampled_iterations[start] // share
+        given, names = sampled_arguments(figure, update, start, depth), (figure.name, update, start, depth)
+        jobs = [Job((*names, seed), figure.env_id, iterations, given) for seed in range(effort.seeds)]
+        pending[update, start, depth] = [executor.submit(returns, job) for job in jobs]
+    return pending
 
 
 def finish(figure: Figure, effort: Effort, pending: Pending, report: Report) -> dict[str, Any]:
     """The plain data of a figure: curves, parameters and checked statements."""
     report(f"{figure.name}: exact curves and statements")
     claims = figure.claims(effort.quick)
-    panels = [panel(figure, update, start) for update in figure.moves for start in STARTS]
-    results = []
-    for done, (_, future) in enumerate(pending, 1):
-        results.append(future.result())
+    panels = {(update, start): panel(figure, update, start) for update in figure.moves for start in STARTS}
+    for done, ((update, start, depth), runs) in enumerate(pending.items(), 1):
+        made = band(np.array([run.result() for run in runs]), update, start, depth)
+        panels[update, start]["sampled"][str(depth)] = {name: _rounded(J_K) for name, J_K in asdict(made).items()}
         if done % max(1, len(pending) // 4) == 0:
-            report(f"{figure.name}: {done} of {len(pending)} sampled runs")
-    _add_bands(panels, [key for key, _ in pending], results)
+            report(f"{figure.name}: {done} of {len(pending)} settings from samples")
     return {
         "part": figure.name,
         "title": figure.title,
         "quick": effort.quick,
         "seeds": effort.seeds,
         "parameters": [asdict(parameter) for parameter in figure.parameters],
-        "panels": panels,
+        "panels": list(panels.values()),
         "claims": [claim.plain() for claim in claims],
     }
 
@@ -126,19 +132,6 @@ def panel(figure: Figure, update: str, start: str) -> dict[str, Any]:
     }
 
 
-def _jobs(figure: Figure, effort: Effort) -> list[tuple[tuple[str, str, int], Job]]:
-    """All sampled runs, each with the (update, start, depth) that it belongs to."""
-    depths = figure.quick_depths if effort.quick else figure.sampled_depths
-    jobs = []
-    for update, start, depth in itertools.product(figure.moves, STARTS, depths):
-        iterations = figure.sampled_iterations[start] // (2 if effort.quick else 1)
-        given = sampled_arguments(figure, update, start, depth)
-        for seed in range(effort.seeds):
-            job = Job((figure.name, update, start, depth, seed), figure.env_id, iterations, given)
-            jobs.append(((update, start, depth), job))
-    return jobs
-
-
 def sampled_arguments(figure: Figure, update: str, start: str, depth: int) -> dict[str, Any]:
     """Arguments of PGTS for the paper's projected update of a simplex policy, or the softmax one."""
     move = figure.moves[update]
@@ -152,15 +145,6 @@ def sampled_arguments(figure: Figure, update: str, start: str, depth: int) -> di
         "gamma": figure.gamma,
         "env_kwargs": {"start": STARTS[start]},
     }
-
-
-def _add_bands(panels: list[dict[str, Any]], keys: list[tuple[str, str, int]], results: list[list[float]]) -> None:
-    for panel in panels:
-        for depth in dict.fromkeys(depth for _, _, depth in keys):
-            key = (panel["update"], panel["start"], depth)
-            J_NK = np.array([J_K for k, J_K in zip(keys, results, strict=True) if k == key])
-            made = asdict(band(J_NK, *key))
-            panel["sampled"][str(depth)] = {name: _rounded(values) for name, values in made.items()}
 
 
 def _rounded(values: list[float]) -> list[float]:

@@ -1,6 +1,7 @@
 """Table 1 of the paper beside the stationary sets as they are, for all policies."""
 
-import itertools
+import math
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -24,13 +25,13 @@ LEGEND = "0 never right, 1 always, x strictly between, + above 0, - below 1, b 0
 
 MARKS = {sign: marks for marks, sign in SIGNS.items()}
 
-FOREVER = -1
-"""The last depth at which an optimal policy is stationary: there is none."""
+NOWHERE, FOREVER = -1, sys.maxsize
+"""Stand for the last depth of policies that are stationary at no depth, and at all of them."""
 
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One line of the table as printed, and the classes that leave after this depth (FOREVER: that never do)."""
+    """One line of the table as printed, and the classes that leave after this depth."""
 
     depth: int
     printed: str
@@ -39,7 +40,7 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A column of Table 1. depths: how many lines it has; staying: the classes that never leave."""
+    """A column of Table 1. staying: the classes that never leave."""
 
     make: Callable[[], TabularMDP]
     rows: tuple[PaperRow, ...]
@@ -79,10 +80,10 @@ PAPER: dict[str, PaperTable] = {
 
 @dataclass(frozen=True)
 class Decided:
-    """What is true of a pattern: the last depth at which all its policies are stationary (FOREVER: at all; None: at
-    none), and the condition under which those of a later depth still are."""
+    """What is true of a pattern: the last depth at which all its policies are stationary, and the condition under
+    which they still are at the next one."""
 
-    last: int | None
+    last: int
     condition: str = ""
     interior: float = 0.5
 
@@ -115,23 +116,22 @@ def decided(found: list[Membership]) -> Decided:
     full = sum(membership.verdict == "all" for membership in found)
     if full == len(found):
         return Decided(FOREVER)
-    last = full - 1 if full else None
     partial = found[full]
     if partial.verdict == "none":
-        return Decided(last)
+        return Decided(full - 1)
     if partial.threshold is None:
-        return Decided(last, "for some values")
+        return Decided(full - 1, "for some values")
     sign = "<=" if partial.below else ">="
     inside = partial.threshold / 2 if partial.below else (partial.threshold + 1) / 2
-    return Decided(last, f"a_{partial.state} {sign} {partial.threshold}", float(inside))
+    return Decided(full - 1, f"a_{partial.state} {sign} {partial.threshold}", float(inside))
 
 
-def printed_last(column: PaperTable, pattern: str) -> int | None:
-    """The last depth at which the paper has the pattern in its set; FOREVER, or None for never."""
+def printed_last(column: PaperTable, pattern: str) -> int:
+    """The last depth at which the paper has the pattern in its set."""
     if any(in_class(pattern, name) for name in column.staying):
         return FOREVER
     depths = [row.depth for row in column.rows if any(in_class(pattern, name) for name in row.leaving)]
-    return max(depths, default=None)
+    return max(depths, default=NOWHERE)
 
 
 def in_class(pattern: str, name: str) -> bool:
@@ -148,35 +148,26 @@ def _spelled(chosen: Iterable[str]) -> list[str]:
     return sorted(class_name(cube) for cube in cover(chosen))
 
 
-def _members(last: Mapping[str, int | None], depth: int) -> int:
-    return sum(found == FOREVER or (found is not None and found >= depth) for found in last.values())
+def _members(last: Mapping[str, int], depth: int) -> int:
+    return sum(found >= depth for found in last.values())
 
 
 def _correct_row(truth: Mapping[str, Decided], depth: int) -> dict[str, Any]:
     """The classes that are stationary at this depth and not at the next one."""
     leaving = [pattern for pattern, found in truth.items() if found.last == depth]
-    partly = {pattern: found for pattern, found in truth.items() if found.condition and _partial_depth(found) == depth}
+    partly = {pattern: found for pattern, found in truth.items() if found.condition and found.last + 1 == depth}
     conditions = {found.condition for found in partly.values()}
     conditional = [
         {"classes": _spelled(p for p, found in partly.items() if found.condition == condition), "condition": condition}
         for condition in sorted(conditions)
     ]
-    last = {pattern: found.last for pattern, found in truth.items()}
-    return {
-        "depth": depth,
-        "leaving": _spelled(leaving),
-        "conditional": conditional,
-        "patterns": _members(last, depth),
-    }
+    members = _members({pattern: found.last for pattern, found in truth.items()}, depth)
+    return {"depth": depth, "leaving": _spelled(leaving), "conditional": conditional, "patterns": members}
 
 
-def _partial_depth(found: Decided) -> int:
-    return 0 if found.last is None else found.last + 1
-
-
-def _differences(truth: Mapping[str, Decided], printed: Mapping[str, int | None]) -> list[dict[str, Any]]:
+def _differences(truth: Mapping[str, Decided], printed: Mapping[str, int]) -> list[dict[str, Any]]:
     """The classes whose last depth the paper has wrong, each with a witness policy."""
-    keyed: dict[tuple[int | None, str, int | None], list[str]] = {}
+    keyed: dict[tuple[int, str, int], list[str]] = {}
     for pattern, found in truth.items():
         if printed[pattern] != found.last or found.condition:
             keyed.setdefault((found.last, found.condition, printed[pattern]), []).append(pattern)
@@ -184,40 +175,24 @@ def _differences(truth: Mapping[str, Decided], printed: Mapping[str, int | None]
     for (last, condition, said), chosen in keyed.items():
         for cube in cover(chosen):
             witness = "".join(next(mark for mark in "x10" if mark in marks) for marks in cube)
-            answer.append(_difference(cube, witness, truth[witness], last, condition, said))
-    return sorted(answer, key=lambda row: (row["kind"], row["stationary_at"], row["class"]))
+            probabilities = {NEVER: 0.0, SOMETIMES: truth[witness].interior, ALWAYS: 1.0}
+            true_last = last + 1 if condition else last
+            row = {
+                "kind": "missing" if true_last > said else "too many",
+                "class": class_name(cube),
+                "condition": condition,
+                "patterns": math.prod(map(len, cube)),
+                "printed_in": _sets(said),
+                "belongs_in": _sets(true_last),
+                "witness": [probabilities[mark] for mark in witness],
+                "stationary_at": None if true_last in (NOWHERE, FOREVER) else true_last,
+                "escapes_at": None if true_last == FOREVER else true_last + 1,
+            }
+            answer.append((row["kind"], true_last, row["class"], row))
+    return [row for *_, row in sorted(answer, key=lambda entry: entry[:3])]
 
 
-def _difference(
-    cube: Cube[str], witness: str, found: Decided, last: int | None, condition: str, said: int | None
-) -> dict[str, Any]:
-    true_last = _partial_depth(found) if condition else last
-    missing = _rank(true_last) > _rank(said)
-    probabilities = {NEVER: 0.0, SOMETIMES: found.interior, ALWAYS: 1.0}
-    return {
-        "kind": "missing" if missing else "too many",
-        "class": class_name(cube),
-        "condition": condition,
-        "patterns": _size(cube),
-        "printed_in": _sets(said),
-        "belongs_in": _sets(true_last),
-        "witness": [probabilities[mark] for mark in witness],
-        "stationary_at": true_last,
-        "escapes_at": None if true_last == FOREVER else 0 if true_last is None else true_last + 1,
-    }
-
-
-def _rank(last: int | None) -> float:
-    if last is None:
-        return -1
-    return float("inf") if last == FOREVER else last
-
-
-def _sets(last: int | None) -> str:
-    if last is None:
-        return "none"
-    return "all" if last == FOREVER else "Pi^0" if last == 0 else f"Pi^0 .. Pi^{last}"
-
-
-def _size(cube: Cube[str]) -> int:
-    return len(list(itertools.product(*cube)))
+def _sets(last: int) -> str:
+    if last in (NOWHERE, FOREVER):
+        return "none" if last == NOWHERE else "all"
+    return "Pi^0" if last == 0 else f"Pi^0 .. Pi^{last}"

@@ -116,8 +116,7 @@ class TabularMDP:
 
         Args:
             P: transitions for states 0..S-1 and actions 0..A-1.
-            gamma: discount in [0, 1] of the transitions that do not terminate.
-            start: a state, a distribution over states, or None for the uniform one.
+            gamma: discount of the transitions that do not terminate.
         """
         check_gamma(gamma)
         outcomes, start_S, reward_SAK = transitions.outcomes_of(P, gamma, start)
@@ -129,8 +128,7 @@ class TabularMDP:
 
         Args:
             env: FrozenLake, CliffWalking, Taxi, or any environment with a P table of the same form.
-            gamma: discount in [0, 1].
-            start: a state or a distribution. Default: the environment's `initial_state_distrib`, or the uniform one.
+            start: as in `from_dense`. Default: the environment's `initial_state_distrib`, or the uniform one.
 
         Raises:
             MissingModel: the environment has no P table.
@@ -161,13 +159,9 @@ class TabularMDP:
         outcomes = self.outcomes
         happens_SAK = outcomes.prob_NAK > 0
         gamma = float(outcomes.discount_NAK[happens_SAK][0])
-        _refuse(
-            (happens_SAK & (outcomes.discount_NAK != gamma)).any(-1),
-            lambda s, a: (
-                f"outcomes of ({s}, {a}) have discounts {outcomes.discount_NAK[s, a].tolist()}, others {gamma}; an npz "
-                f"file holds one gamma: let an end lead to a state that earns 0 for ever"
-            ),
-        )
+        other_SA = (happens_SAK & (outcomes.discount_NAK != gamma)).any(-1)
+        must = f"others have {gamma}, and an npz file holds one gamma: let an end lead to a state that earns 0 for ever"
+        _refuse(other_SA, "the outcomes of ({}, {}) have discounts", outcomes.discount_NAK, must)
         P_SAS = torch.zeros(self.num_states, self.num_actions, self.num_states, dtype=torch.float64)
         P_SAS.scatter_add_(-1, outcomes.child_NAK, outcomes.prob_NAK)
 
@@ -212,80 +206,56 @@ def check_gamma(gamma: float) -> None:
 def _check_start(start_S: Tensor, num_states: int) -> None:
     if start_S.shape != (num_states,):
         raise PgtsError(f"start_S has shape {tuple(start_S.shape)}; the MDP needs ({num_states},)")
-    off = torch.nonzero(~torch.isfinite(start_S) | (start_S < 0)).flatten()
-    if len(off):
-        raise PgtsError(f"start_S[{off[0]}] is {start_S[off[0]]}; probabilities are finite and at least 0")
+    impossible_S = ~torch.isfinite(start_S) | (start_S < 0)
+    _refuse(impossible_S, "start_S[{}] is", start_S, "probabilities are finite and at least 0")
     if abs(float(start_S.sum()) - 1) > EXACT:
         raise PgtsError(f"start_S is not a distribution: it sums to {float(start_S.sum())}")
 
 
 def _check_rewards(reward_SAK: Tensor, outcomes: Outcomes) -> None:
-    """Raise PgtsError with the first offending (s, a) unless these are rewards of the outcomes, with their means."""
+    """PgtsError with the first offending (s, a) unless these are rewards of the outcomes, with their means."""
     if reward_SAK.shape != outcomes.prob_NAK.shape or reward_SAK.dtype != torch.float64:
         raise PgtsError(
             f"reward_SAK is {reward_SAK.dtype} with shape {tuple(reward_SAK.shape)}; it must be torch.float64 with "
             f"shape {tuple(outcomes.prob_NAK.shape)}"
         )
-    finite_SA = torch.isfinite(reward_SAK).all(-1)
-    _refuse(~finite_SA, lambda s, a: f"reward_SAK[{s}, {a}] is {reward_SAK[s, a].tolist()}; rewards must be finite")
+    _refuse(~torch.isfinite(reward_SAK).all(-1), "reward_SAK[{}, {}] is", reward_SAK, "rewards must be finite")
     mean_SA, largest_SA = (outcomes.prob_NAK * reward_SAK).sum(-1), reward_SAK.abs().amax(-1)
-    _refuse(
-        (mean_SA - outcomes.reward_NA).abs() > MEAN_TOLERANCE * largest_SA,
-        lambda s, a: (
-            f"reward_SAK[{s}, {a}] has the mean {mean_SA[s, a]}; reward_NA is {outcomes.reward_NA[s, a]}: give both, "
-            "or reward_SAK=None where each outcome pays the mean"
-        ),
-    )
+    off_SA = (mean_SA - outcomes.reward_NA).abs() > MEAN_TOLERANCE * largest_SA
+    must = "reward_NA must be the same; reward_SAK=None where each outcome pays the mean"
+    _refuse(off_SA, "reward_SAK[{}, {}] has the mean", mean_SA, must)
 
 
 def _check_outcomes(outcomes: Outcomes) -> None:
-    """Raise PgtsError with the first offending (s, a) unless the table is one of valid outcomes."""
-    reward, prob = outcomes.reward_NA, outcomes.prob_NAK
-    if outcomes.child_NAK.ndim != 3:
-        raise PgtsError(f"child_NAK has shape {tuple(outcomes.child_NAK.shape)}; it must have three axes")
-    N, A, K = outcomes.child_NAK.shape
-    if min(N, A, K) == 0:
-        raise PgtsError(f"outcomes have shape {(N, A, K)}; each side must be at least 1")
-    for name, tensor, shape in [
-        ("reward_NA", reward, (N, A)),
-        ("prob_NAK", prob, (N, A, K)),
-        ("discount_NAK", outcomes.discount_NAK, (N, A, K)),
-    ]:
-        if tensor.shape != shape:
-            raise PgtsError(f"{name} has shape {tuple(tensor.shape)}; child_NAK needs {shape}")
+    """PgtsError with the first offending (s, a) unless the table is one of valid outcomes."""
+    reward, prob, discount, child = outcomes.reward_NA, outcomes.prob_NAK, outcomes.discount_NAK, outcomes.child_NAK
+    if child.ndim != 3:
+        raise PgtsError(f"child_NAK has shape {tuple(child.shape)}; it must have three axes")
+    if 0 in child.shape:
+        raise PgtsError(f"outcomes have shape {tuple(child.shape)}; each side must be at least 1")
+    for name, tensor, axes in [("reward_NA", reward, 2), ("prob_NAK", prob, 3), ("discount_NAK", discount, 3)]:
+        if tensor.shape != child.shape[:axes]:
+            raise PgtsError(f"{name} has shape {tuple(tensor.shape)}; child_NAK needs {tuple(child.shape[:axes])}")
         if tensor.dtype != torch.float64:
             raise PgtsError(f"{name} is {tensor.dtype}; the exact world is float64")
-    _refuse(~torch.isfinite(reward), lambda s, a: f"R_SA[{s}, {a}] is {reward[s, a]}; rewards must be finite")
-    _refuse(
-        ~((prob >= 0) & (prob <= 1 + EXACT)).all(-1),
-        lambda s, a: f"P_SAS[{s}, {a}] has probabilities {prob[s, a].tolist()}; each must be in [0, 1]",
-    )
-    total = prob.sum(-1)
-    _refuse(
-        (total - 1).abs() > EXACT,
-        lambda s, a: f"P_SAS[{s}, {a}] is not a distribution: it sums to {float(total[s, a]):.10g}",
-    )
-    discount = outcomes.discount_NAK
-    _refuse(
-        ~((discount >= 0) & (discount <= 1)).all(-1),
-        lambda s, a: f"discount of ({s}, {a}) is {discount[s, a].tolist()}; each must be in [0, 1]",
-    )
+    _refuse(~torch.isfinite(reward), "R_SA[{}, {}] is", reward, "rewards must be finite")
+    off_SA = ~((prob >= 0) & (prob <= 1 + EXACT)).all(-1)
+    _refuse(off_SA, "P_SAS[{}, {}] has probabilities", prob, "each must be in [0, 1]")
+    total_SA = prob.sum(-1)
+    off_SA = (total_SA - 1).abs() > EXACT
+    _refuse(off_SA, "P_SAS[{}, {}] is not a distribution: it sums to", total_SA.round(decimals=10), "that must be 1")
+    off_SA = ~((discount >= 0) & (discount <= 1)).all(-1)
+    _refuse(off_SA, "discount_NAK[{}, {}] is", discount, "each must be in [0, 1]")
     # So that no value, 1 / (1 - discount) times a reward, and no difference of values is infinite.
     most = LARGEST_VALUE * max(1 - float(discount.max()), 1e-100)
-    _refuse(
-        reward.abs() > most,
-        lambda s, a: (
-            f"R_SA[{s}, {a}] is {reward[s, a]}; with discounts up to {discount.max():.6g} rewards may be {most:.2g} in "
-            "size: beyond that values are no numbers"
-        ),
-    )
-    child = outcomes.child_NAK
-    _refuse(
-        ((child < 0) | (child >= outcomes.num_children)).any(-1),
-        lambda s, a: f"children of ({s}, {a}) are {child[s, a].tolist()}; states are 0 to {outcomes.num_children - 1}",
-    )
+    must = f"with discounts up to {discount.max():.6g} rewards may be at most {most:.2g} in size"
+    _refuse(reward.abs() > most, "R_SA[{}, {}] is", reward, must)
+    off_SA = ((child < 0) | (child >= outcomes.num_children)).any(-1)
+    _refuse(off_SA, "child_NAK[{}, {}] is", child, f"states are 0 to {outcomes.num_children - 1}")
 
 
-def _refuse(bad_SA: Tensor, message: Any) -> None:
-    if bad_SA.any():
-        raise PgtsError(message(*torch.nonzero(bad_SA)[0].tolist()))
+def _refuse(bad: Tensor, says: str, found: Tensor, must: str) -> None:
+    """PgtsError with the first place where something is bad, what is found there, and what must be."""
+    if bad.any():
+        place = torch.nonzero(bad)[0].tolist()
+        raise PgtsError(f"{says.format(*place)} {found[tuple(place)].tolist()}; {must}")
