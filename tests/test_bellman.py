@@ -54,19 +54,6 @@ def test_backup_of_a_hand_made_row_is_the_sum_on_paper():
     assert q.item() == pytest.approx(2 + 0.5 * 0.9 * 10 + 0.25 * 0.5 * 8, rel=1e-15)
 
 
-def test_nothing_after_a_terminal_outcome_counts():
-    v_C = torch.tensor([1e9, -1e9], dtype=torch.float64)
-    ends = outcomes_with(reward=1.0, prob=[0.5, 0.5], discount=[0.0, 0.0], child=[0, 1])
-    goes_on = outcomes_with(reward=1.0, prob=[1.0, 0.0], discount=[0.9, 0.9], child=[0, 1])
-    assert backup(ends, v_C).item() == 1.0
-    assert backup(goes_on, v_C).item() > 1e8
-
-
-def test_a_successor_that_stands_twice_in_a_row_counts_twice():
-    twice = outcomes_with(prob=[1 / 3, 1 / 3, 1 / 3], discount=[1.0, 1.0, 1.0], child=[0, 0, 1])
-    assert backup(twice, torch.tensor([3.0, 0.0], dtype=torch.float64)).item() == pytest.approx(2.0)
-
-
 def test_backup_leaves_the_rewards_as_they_are():
     outcomes = zoo("garnet").outcomes
     before, v_S = outcomes.reward_NA.clone(), torch.ones(30, dtype=torch.float64)

@@ -122,13 +122,12 @@ def test_a_picture_of_too_many_cells_is_refused():
         Drawing(in_rows(ladder(n=2000), 1000)).picture(0)
 
 
-@pytest.mark.parametrize("id", ["Ladder", "Tightrope", "Random", "Grid", "DeepSea"])
-def test_every_environment_renders_in_its_modes(id):
+def test_a_made_environment_renders_in_its_modes_and_in_those_of_gymnasiums_wrappers():
     for mode, kind in [("ansi", str), ("rgb_array", np.ndarray)]:
-        env = gymnasium.make(f"pgts/{id}-v0", render_mode=mode)
+        env = gymnasium.make("pgts/Ladder-v0", render_mode=mode)
         env.reset(seed=0)
         assert isinstance(env.render(), kind)
-    env = gymnasium.make(f"pgts/{id}-v0", render_mode="rgb_array_list")
+    env = gymnasium.make("pgts/Ladder-v0", render_mode="rgb_array_list")
     env.reset(seed=0)
     env.step(0)
     assert len(env.render()) == 2

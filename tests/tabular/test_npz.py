@@ -152,6 +152,30 @@ def test_an_array_larger_than_memory_is_refused(tmp_path):
         TabularMDP.load_npz(path)
 
 
+@pytest.mark.fault("npz file that unpacks to more than memory")
+def test_a_file_that_would_unpack_to_much_is_refused_before_it_is(tmp_path, monkeypatch):
+    header = io.BytesIO()
+    side = 160
+    np.lib.format.write_array_header_1_0(header, {"descr": "|i1", "fortran_order": False, "shape": (side, side, side)})
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name in ("R", "gamma"):
+            array = io.BytesIO()
+            np.save(array, 0.5)
+            archive.writestr(f"{name}.npy", array.getvalue())
+        with archive.open("P.npy", "w", force_zip64=True) as member:
+            member.write(header.getvalue())
+            for _ in range(side):
+                member.write(bytes(side * side))
+    assert path.stat().st_size < 2**15
+    monkeypatch.setattr("pgts_torch.tabular.npz.MOST_BYTES", 2**24)
+    monkeypatch.setattr(np.lib.npyio.NpzFile, "__getitem__", lambda *_: pytest.fail("it was unpacked"))
+    with pytest.raises(
+        PgtsError, match=r"array 'P' would take the file's arrays to 0\.0305 GiB in memory; they may take 0\.0156"
+    ):
+        TabularMDP.load_npz(path)
+
+
 @pytest.mark.fault("damaged MDP file")
 def test_a_damaged_file_is_either_refused_or_read_as_an_mdp(tmp_path):
     buffer, random, verdicts = io.BytesIO(), numpy_stream(0, "damage"), []

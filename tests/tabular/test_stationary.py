@@ -189,10 +189,3 @@ def test_a_policy_of_the_table_for_the_ladder_is_stationary_up_to_its_depth(deep
 def test_a_policy_of_the_table_for_the_tightrope_is_stationary_up_to_its_depth(deepest, right):
     verdicts = [stationary.is_stationary(tightrope(), right_with(*right), depth) for depth in range(10)]
     assert verdicts == [depth <= deepest for depth in range(10)]
-
-
-def test_on_the_tightrope_staying_is_stationary_for_policy_gradient_while_the_next_step_looks_bad():
-    # v(s1) = gamma (10 p - 100 (1 - p)) is not positive while p <= 10/11, which the table of the paper leaves out.
-    for p, stays in [(0.5, True), (0.9, True), (10 / 11 + 1e-6, False)]:
-        assert stationary.is_stationary(tightrope(), right_with(0, p, 0.5, 0.5), 0) == stays
-        assert not stationary.is_stationary(tightrope(), right_with(0, p, 0.5, 0.5), 1)

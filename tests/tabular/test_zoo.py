@@ -20,7 +20,7 @@ from pgts_torch.tabular import (
     river_swim,
     tightrope,
 )
-from tests.support import ZOO, always, outcomes_of, uniform_policy, zoo
+from tests.support import always, outcomes_of, uniform_policy
 
 LEFT, RIGHT, UP, DOWN = range(4)
 
@@ -37,15 +37,6 @@ def follows(mdp: TabularMDP) -> dict[tuple[int, int], int]:
 def rewards(mdp: TabularMDP) -> dict[tuple[int, int], float]:
     """The rewards that are not 0."""
     return {(s, a): float(mdp.outcomes.reward_NA[s, a]) for s, a in torch.nonzero(mdp.outcomes.reward_NA).tolist()}
-
-
-@pytest.mark.parametrize("name", ZOO)
-def test_every_mdp_of_the_zoo_gives_each_state_and_action_a_distribution(name):
-    mdp = zoo(name)
-    for s in range(0, mdp.num_states, 7):
-        for a in range(mdp.num_actions):
-            assert sum(outcomes_of(mdp, s, a).values()) == pytest.approx(1)
-    assert len(mdp.action_names) == mdp.num_actions
 
 
 # Ladder
@@ -282,6 +273,8 @@ def test_the_advantage_of_right_on_the_mirage_is_that_of_the_formula(width, delt
         (lambda: grid(goal=12), "state 12 is both goal and trap"),
         (lambda: grid(slip=1.5), "slip is 1.5"),
         (lambda: deep_sea(0), "n is 0"),
+        (lambda: corridor(slip=math.nan), "slip is nan"),
+        (lambda: combination_lock(num_actions=1), "num_actions is 1"),
     ],
 )
 def test_a_zoo_mdp_that_cannot_exist_is_refused_with_the_value(make, message):
@@ -346,9 +339,3 @@ def test_a_corridor_pays_at_its_end_alone():
     reward_SA = corridor(3, 5).outcomes.reward_NA.view(3, 5, 4)
     assert not reward_SA[:, :3].any()
     torch.testing.assert_close(reward_SA[:, 3], torch.tensor([[0.0, 0.8, 0.1, 0.1]] * 3, dtype=torch.float64))
-
-
-@pytest.mark.parametrize("slip", [-0.1, 1.5, math.nan])
-def test_a_corridor_does_not_slip_more_than_always(slip):
-    with pytest.raises(PgtsError, match="slip is"):
-        corridor(slip=slip)
