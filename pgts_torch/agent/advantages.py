@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.critics import lambda_returns
+from pgts_torch.agent.returns import lambda_returns
 from pgts_torch.agent.rollout import Rollout
 
 

@@ -2,7 +2,6 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, TypeVar, final
@@ -12,11 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.policies import Policy, exact_probs, fitting
+from pgts_torch.agent.returns import critic_targets
 from pgts_torch.agent.rollout import Rollout, simulated_returns
 from pgts_torch.bellman import policy_mean
-from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import SamplingModel
-from pgts_torch.options.critics import ExactValues, RolloutValues, TabularValues, TDLambda
+from pgts_torch.options.critics import ExactValues, RolloutValues, TabularValues
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
 
@@ -155,21 +155,18 @@ class TabularCritic(Critic):
         value_C = self._value_C
         if self.options.initial == "mean":
             value_C = torch.where(self._count_C > 0, value_C, self._mean_target(rollout))
-        target_TB = self._targets(rollout, partial(self._read, value_C))[rollout.alive_TB]
-        check_targets(target_TB)
-        cell_TB = rollout.observation_UB[:-1]
+        target_V = self._targets(rollout, value_C)
+        cell_V = rollout.observation_V
         if self.target == "q":
-            cell_TB = cell_TB * self.num_actions + rollout.action_TB
-        cell_V = cell_TB[rollout.alive_TB]
-        loss = float((target_TB - value_C[cell_V]).square().mean())
-        ones_V = torch.ones_like(target_TB)
-        count_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, ones_V)
-        sum_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, target_TB)
+            cell_V = cell_V * self.num_actions + rollout.action_TB[rollout.alive_TB]
+        loss = float((target_V - value_C[cell_V]).square().mean())
+        # the number of visits to each cell in this rollout, and the sum of their targets
+        count_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, torch.ones_like(target_V))
+        sum_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, target_V)
         self._count_C += count_C
         alpha_C = count_C / self._count_C.clamp(min=1) if self.options.step_size == "mean" else self.options.step_size
-        seen_C = count_C > 0
         mean_C = sum_C / count_C.clamp(min=1)
-        self._value_C = torch.where(seen_C, value_C + alpha_C * (mean_C - value_C), value_C)
+        self._value_C = torch.where(count_C > 0, value_C + alpha_C * (mean_C - value_C), value_C)
         return {"value": loss}
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -195,12 +192,10 @@ class TabularCritic(Critic):
             raise PgtsError("count_C has negative counts")
         self._value_C, self._count_C = value_C, count_C
 
-    def _targets(self, rollout: Rollout, v: Callable[[Tensor], Tensor]) -> Float[Tensor, "T B"]:
-        next_TB = rollout.observation_UB[1:]
-        bootstrap_TB = v(next_TB.reshape(-1)).view(next_TB.shape)
-        if isinstance(self.options.method, TDLambda):
-            return lambda_returns(rollout, bootstrap_TB, rollout.discount_TB, self.options.method.lambda_)
-        return lambda_returns(rollout, bootstrap_TB, rollout.survival_TB, 1.0)
+    def _targets(self, rollout: Rollout, value_C: Float[Tensor, "C"]) -> Float[Tensor, "V"]:
+        """The target of each visit, bootstrapped with the values of a table."""
+        _, next_v_TB = rollout.values(partial(self._read, value_C))
+        return critic_targets(rollout, next_v_TB, self.options.method)[rollout.alive_TB]
 
     def _mean_target(self, rollout: Rollout) -> Float[Tensor, ""]:
         """The w that is the mean of the targets if it is the value of all cells that were never visited.
@@ -209,11 +204,10 @@ class TabularCritic(Critic):
         1 without rewards and with all other values 0. If every target is bootstrapped in such cells alone (mean b = 1),
         w is undetermined and set to 0.
         """
-        value_C, seen_C = self._value_C, self._count_C > 0
-        unseen_C = (~seen_C).to(value_C)
+        seen_C = (self._count_C > 0).double()
         unrewarded = replace(rollout, reward_TB=torch.zeros_like(rollout.reward_TB))
-        a = self._targets(rollout, partial(self._read, value_C * seen_C))[rollout.alive_TB].mean()
-        b = self._targets(unrewarded, partial(self._read, unseen_C))[rollout.alive_TB].mean()
+        a = self._targets(rollout, self._value_C * seen_C).mean()
+        b = self._targets(unrewarded, 1 - seen_C).mean()
         return torch.where(b < 1, a / (1 - b), 0.0)
 
 
@@ -266,35 +260,6 @@ class RolloutCritic(Critic):
         )
         self._model_calls += num_steps
         return returns_B.view(self.options.samples, -1).mean(0)
-
-
-def lambda_returns(
-    rollout: Rollout,
-    bootstrap_TB: Float[Tensor, "T B"],
-    discount_TB: Float[Tensor, "T B"],
-    lambda_: float,
-) -> Float[Tensor, "T B"]:
-    """G_t = r_t + gamma_t ((1 - lambda) V(s_{t+1}) + lambda G_{t+1}), with G_{t+1} = V(s_{t+1}) at the last step.
-
-    Args:
-        rollout: B episodes.
-        bootstrap_TB: V(s_{t+1}).
-        discount_TB: gamma_t; 0 after a terminated step, so that nothing is bootstrapped there.
-        lambda_: in [0, 1]; 1 gives Monte-Carlo returns.
-    """
-    lambda_TB = lambda_ * rollout.follows_TB.float()
-    returns_TB = rollout.reward_TB + discount_TB * (1 - lambda_TB) * bootstrap_TB
-    # in numpy, where operations on a few numbers cost least
-    row_TB, later_TB = returns_TB.cpu().numpy(), (discount_TB * lambda_TB).cpu().numpy()
-    for t in reversed(range(len(row_TB) - 1)):
-        row_TB[t] += later_TB[t] * row_TB[t + 1]
-    return torch.from_numpy(row_TB).to(returns_TB.device)
-
-
-def check_targets(target_V: Float[Tensor, "V"]) -> None:
-    """NotFinite unless the sum of the targets is finite."""
-    if not math.isfinite(target_V.sum()):
-        raise NotFinite("a target of the critic is not finite; it has learned nothing from this rollout", what="value")
 
 
 def _fitted(learned: Learned | None) -> Learned:

@@ -9,14 +9,15 @@ from gymnasium.spaces import Space
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.agent.critics import Critic, check_targets, lambda_returns
+from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.networks import Network, Trunk, make_trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.returns import critic_targets
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import PgtsError, check_count
-from pgts_torch.options.critics import MonteCarlo, NetworkValues
+from pgts_torch.options.critics import NetworkValues
 from pgts_torch.options.fields import limit
 from pgts_torch.options.policies import CNN, MLP
 from pgts_torch.seeding import stream
@@ -159,7 +160,6 @@ class NetworkCritic(Critic):
         generator: torch.Generator,
     ) -> list[float]:
         """Fit the network to given targets. Return the norms of the gradients."""
-        check_targets(target_V)
         if self.options.normalize_returns:
             self._rescale(target_V)
         y_V = (target_V - self._mean) / self._scale if self._scale else torch.zeros_like(target_V)
@@ -237,9 +237,7 @@ class NetworkCritic(Critic):
             v_TB = next_v_TB = torch.zeros_like(rollout.reward_TB)
         else:
             v_TB, next_v_TB = rollout.values(lambda observation_N: self._v(self._target_network, observation_N))
-        if isinstance(self.options.method, MonteCarlo):
-            return v_TB, lambda_returns(rollout, next_v_TB, rollout.survival_TB, 1.0)
-        return v_TB, lambda_returns(rollout, next_v_TB, rollout.discount_TB, self.options.method.lambda_)
+        return v_TB, critic_targets(rollout, next_v_TB, self.options.method)
 
     @torch.no_grad()
     def _rescale(self, target_V: Float[Tensor, "V"]) -> None:
