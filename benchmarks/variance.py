@@ -31,10 +31,9 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pgts_torch.agent.advantages import gae, score_function
+from pgts_torch.agent.advantages import gae, lambda_returns, score_function
 from pgts_torch.agent.critics import TabularCritic
 from pgts_torch.agent.policies import SoftmaxPolicy
-from pgts_torch.agent.returns import lambda_returns
 from pgts_torch.agent.rollout import Rollout, rollout
 from pgts_torch.agent.world import TabularWorld
 from pgts_torch.bellman import backup

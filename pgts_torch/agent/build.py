@@ -84,11 +84,11 @@ def make_search(options: Kind, world: World) -> Search:
     return _made(_SEARCHES, options)(world.model, options)
 
 
-def make_policy(options: Part, world: World, *, seed: int) -> Policy:
+def make_policy(options: Any, world: World, *, seed: int) -> Policy:
     """Make a policy, a table or a network."""
     if isinstance(options, Network):
         return NetworkPolicy(world.observation_space, world.num_actions, options, seed=seed, device=world.device)
-    S, A = _tabular(world, f"the policy {_type(options)!r}").mdp_shape
+    S, A = _tabular(world, f"the policy {options.type!r}").mdp_shape
     return _made(_TABLES, options)(S, A, options, seed=seed, device=world.device)
 
 
@@ -100,7 +100,7 @@ def make_update(options: Part, policy: Policy) -> Update:
 
 
 def make_critic(
-    options: Part,
+    options: Any,
     world: World,
     policy: Policy,
     estimator: Estimator = LookaheadAdvantages(),  # noqa: B008 - frozen
@@ -122,7 +122,7 @@ def make_critic(
             seed=seed,
             device=world.device,
         )
-    tabular = _tabular(world, f"the critic {_type(options)!r}")
+    tabular = _tabular(world, f"the critic {options.type!r}")
     if isinstance(options, TabularValues):
         return TabularCritic(*tabular.mdp_shape, options, device=world.device)
     if isinstance(options, RolloutValues):
@@ -153,10 +153,6 @@ def plain(arguments: Mapping[str, Any], options: Training) -> dict[str, Any]:
 
 def _made(choices: _Choices, options: Part) -> Callable[..., Any]:
     return next(make for kind, make in choices.items() if isinstance(options, kind))
-
-
-def _type(options: Any) -> str:
-    return options.type
 
 
 def _tabular(world: World, what: str) -> TabularWorld:

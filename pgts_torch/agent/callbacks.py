@@ -74,7 +74,10 @@ class EvalCallback:
         now = algorithm.num_env_steps
         if now // self.every == (now - iteration.experience.num_steps) // self.every:
             return True
-        evaluation = algorithm.ranks.first("an evaluation", lambda: self._evaluated(algorithm))
+        evaluation = algorithm.ranks.first(
+            "an evaluation",
+            lambda: evaluate(algorithm, episodes=self.episodes, deterministic=self.deterministic, seed=self.seed),
+        )
         latest = Evaluated(now, evaluation)
         self.history.append(latest)
         if self.best is None or latest.mean > self.best.mean:
@@ -83,10 +86,7 @@ class EvalCallback:
                 algorithm.save(self.best_path)
         return self.stop_at_return is None or latest.mean < self.stop_at_return
 
-    def _evaluated(self, algorithm: PGTS) -> Evaluation:
-        return evaluate(algorithm, episodes=self.episodes, deterministic=self.deterministic, seed=self.seed)
-
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Remove all evaluations so far, so that the next one is the best."""
         self.history, self.best = [], None
 

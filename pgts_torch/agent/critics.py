@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.agent.advantages import critic_targets
 from pgts_torch.agent.policies import Policy, exact_probs, fitting
-from pgts_torch.agent.returns import critic_targets
 from pgts_torch.agent.rollout import Rollout, simulated_returns
 from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import PgtsError

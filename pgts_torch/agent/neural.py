@@ -9,11 +9,11 @@ from gymnasium.spaces import Space
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.agent.advantages import critic_targets
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.networks import Network, Trunk, make_trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.returns import critic_targets
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import PgtsError, check_count

@@ -249,7 +249,7 @@ class _Recorder:
         self._saved_at = notes.env_steps
         if start.lost_best:
             best = self._evaluations["deterministic"]
-            best.forget()
+            best.reset()
             assert best.best_path is not None
             self.algorithm.save(best.best_path)
 

@@ -49,6 +49,20 @@ def made_in(
     return rollout(world, policy, horizon, seed=seed, names=names, generator=generator)
 
 
+def by_hand(reward: float = 1.0, shows: Tensor | None = None) -> Rollout:
+    """Three episodes of rewards 1, 2, 4 (times `reward`) with discounts 0.5: the first is cut after three steps, the
+    second terminates in its third, the third is cut after two. States 0, 1, 2, 3 follow each other, and show rows of
+    `shows`, or their number."""
+    column = reward * torch.tensor([[1.0], [2.0], [4.0]], dtype=torch.float64).expand(3, 3)
+    discount_TB = torch.full((3, 3), 0.5, dtype=torch.float64)
+    discount_TB[2, 1] = 0.0
+    alive_TB = torch.tensor([[1, 1, 1], [1, 1, 1], [1, 1, 0]], dtype=torch.bool)
+    survival_TB = torch.tensor([[1, 1, 1], [1, 1, 0], [1, 0, 0]], dtype=torch.float64)
+    state_UB = torch.arange(4)[:, None].expand(4, 3)
+    observation_UB = state_UB if shows is None else shows[state_UB]
+    return Rollout(observation_UB, state_UB[:-1] % 2, column, discount_TB, alive_TB, column, survival_TB)
+
+
 def transitions(made: Rollout) -> list[tuple[int, int, float, float, int]]:
     """The distinct (state, action, reward, discount, next state) that happened."""
     columns = (made.state_TB, made.action_TB, made.reward_TB, made.discount_TB, made.next_state_TB)

@@ -130,7 +130,7 @@ def test_with_sampled_advantages_the_gradient_update_steps_along_the_gradient_of
     assert max(float(step.abs().max()) for step in steps.values()) > 0.01
 
 
-def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo():
+def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo(monkeypatch):
     # One state; the actions 0, 1, 0, 1 were taken with probability 1/2 each, and now have 0.7 and 0.3: rho is 1.4, 0.6.
     # min(rho A, clip(rho, 0.8, 1.2) A) by hand: 1.2 * 1 (clipped), 0.6 * 2, 1.4 * -1, 0.8 * -3 (clipped).
     policy = NetworkPolicy(spaces.Discrete(1), 2, MLP(hidden=()))
@@ -140,19 +140,14 @@ def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo():
     advantage_NA = score_function(action_N, advantage_N, policy.probs(states))
     seen = []
 
-    class Step:
+    def step(optimiser, parameters, loss, name, *, through):
         """The first step takes the policy to 0.7 and 0.3; the second is looked at."""
+        seen.append((float(loss), torch.autograd.grad(through[0], parameters, through[1])[1]))
+        policy.network.head.bias.data.copy_(torch.tensor([0.7, 0.3]).log())
+        return 0.0
 
-        def step(self, parameters, loss, name, *, through):
-            seen.append((float(loss), torch.autograd.grad(through[0], parameters, through[1])[1]))
-            policy.network.head.bias.data.copy_(torch.tensor([0.7, 0.3]).log())
-            return 0.0
-
-        def state_dict(self):
-            return {}
-
+    monkeypatch.setattr(Optimiser, "step", step)
     update = PPOUpdate(PPO(num_epochs=2, minibatch_size=4, clip_range=0.2, normalize_advantage=False))
-    update._optimiser = Step()
     losses = update(policy, Batch(states, advantage_NA, torch.full((4,), 0.25)), generator=stream(0, "update"))
     assert seen[0][0] == pytest.approx(-(1 + 2 - 1 - 3) / 4)
     assert seen[1][0] == pytest.approx(-(1.2 + 1.2 - 1.4 - 2.4) / 4)
@@ -164,7 +159,9 @@ def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo():
     assert losses["policy"] == pytest.approx((seen[0][0] + seen[1][0]) / 2)
 
 
-def test_the_clip_fraction_is_the_share_of_actions_whose_ratio_is_out_of_range_by_weight_and_by_the_old_policy():
+def test_the_clip_fraction_is_the_old_probability_of_actions_whose_ratio_is_out_of_range(
+    monkeypatch,
+):
     # Two states of weight 1 and 3, three actions of old probability 0.5, 0.25, 0.25. By hand: in the first state rho
     # is 0.7, 1.3, 1.3, all out of the range 0.8 to 1.2; in the second 0.8995, 1, 1.201: the last one, 0.25.
     policy = NetworkPolicy(spaces.Discrete(2), 3, MLP(hidden=()))
@@ -172,16 +169,12 @@ def test_the_clip_fraction_is_the_share_of_actions_whose_ratio_is_out_of_range_b
     new_NA = old_NA * torch.tensor([[0.7, 1.3, 1.3], [0.8995, 1.0, 1.201]])
     policy.load_state_dict({"head.weight": old_NA.log().T, "head.bias": torch.zeros(3)})
 
-    class Step:
-        def step(self, parameters, loss, name, *, through):
-            policy.network.head.weight.data.copy_(new_NA.log().T)
-            return 0.0
+    def step(optimiser, parameters, loss, name, *, through):
+        policy.network.head.weight.data.copy_(new_NA.log().T)
+        return 0.0
 
-        def state_dict(self):
-            return {}
-
+    monkeypatch.setattr(Optimiser, "step", step)
     update = PPOUpdate(PPO(num_epochs=1, minibatch_size=2, clip_range=0.2))
-    update._optimiser = Step()
     advantage_NA = torch.tensor([[1.0, -1.0, -1.0], [1.0, 0.0, -2.0]], dtype=torch.float64)
     weight_N = torch.tensor([1.0, 3.0], dtype=torch.float64)
     losses = update(policy, Batch(torch.arange(2), advantage_NA, weight_N), generator=stream(0, "update"))
