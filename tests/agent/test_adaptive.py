@@ -29,7 +29,7 @@ def test_a_small_tolerance_takes_the_smallest_depth_at_which_always_left_is_not_
     assert model.iterate().depth == stationary_sets.escape_depth(model.mdp, left_SA) == 8
 
 
-def test_by_default_an_adaptive_depth_is_the_first_that_sees_most_of_what_is_missing():
+def test_by_default_an_adaptive_depth_is_the_first_whose_gap_is_most_of_the_bound():
     model = always_left(depth="adaptive")
     missing_S = exact.optimal(model.mdp).v_S - exact.evaluate(model.mdp, model.policy.table()).v_S
     iteration = model.iterate()
@@ -69,7 +69,7 @@ def test_without_stop_at_nothing_ends_early():
 
 @pytest.mark.parametrize("target", ["v", "q"])
 @pytest.mark.parametrize("depth", [0, 1, 3, 8, 40])
-def test_with_the_exact_critic_the_certificate_is_above_what_is_missing(depth, target):
+def test_with_the_exact_critic_the_certificate_is_above_the_optimality_gap(depth, target):
     model = PGTS("pgts/Random-v0", depth=depth, critic={"type": "exact", "target": target}, num_envs=4)
     for _ in range(3):
         missing = optimality_gap(model)
@@ -78,7 +78,7 @@ def test_with_the_exact_critic_the_certificate_is_above_what_is_missing(depth, t
         assert model.iterate().certificate < optimality_gap(model) + 0.2
 
 
-def test_the_certificate_asks_the_model_nothing_that_the_lookahead_does_not():
+def test_the_certificate_costs_no_model_calls():
     calls = []
     for depth in (0, 3):
         for target in ("v", "q"):

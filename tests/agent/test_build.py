@@ -63,7 +63,7 @@ def test_a_word_and_a_mapping_stand_for_options_with_their_defaults():
     assert given(estimator="sampled", depth=0).estimator == SampledAdvantages()
 
 
-def test_what_is_given_reaches_the_options():
+def test_arguments_reach_the_options():
     critic = {"type": "tabular", "target": "q", "method": {"type": "td_lambda", "lambda": 0.4}, "step_size": "mean"}
     same = TabularValues(target="q", method=TDLambda(lambda_=0.4), step_size="mean")
     assert given(critic=critic).critic == given(critic=same).critic == same
@@ -180,12 +180,12 @@ def test_the_environment_chooses_what_is_left_out():
         ),
     ],
 )
-def test_what_describes_no_part_is_refused_by_name(arguments, message):
+def test_an_invalid_description_of_a_part_is_refused_by_name(arguments, message):
     with pytest.raises(PgtsError, match=message):
         given(**arguments)
 
 
-def test_all_mistakes_are_told_at_once():
+def test_all_mistakes_are_reported_at_once():
     with pytest.raises(PgtsError) as caught:
         given(
             num_envs=0, update={"type": "ppo", "clip_range": -1, "num_epochs": 0}, search={"type": "mcts", "merge": 3}
@@ -200,7 +200,7 @@ def test_all_mistakes_are_told_at_once():
         PPO(num_epochs=0, clip_range=-1)
 
 
-def test_what_was_chosen_by_the_environment_and_does_not_fit_is_one_clear_line():
+def test_a_choice_of_the_environment_that_does_not_fit_is_one_clear_line():
     for update in ({"type": "mirror", "step_size": 0.5}, Mirror(step_size=0.5)):
         with pytest.raises(PgtsError) as caught:
             PGTS("CartPole-v1", update=update, num_envs=1, depth=0)

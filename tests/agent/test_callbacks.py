@@ -39,7 +39,7 @@ def test_an_evaluation_follows_the_iteration_that_completes_the_steps(every, mar
     assert [made.env_steps for made in callback.history] == [mark * STEPS for mark in marks]
 
 
-def test_the_marks_of_a_training_that_is_taken_up_again_are_the_same(tmp_path):
+def test_a_continued_training_is_evaluated_at_the_same_steps(tmp_path):
     whole, first, second = (EvalCallback(every=100, episodes=2) for _ in range(3))
     make().learn(5 * STEPS, callback=whole)
     model = make().learn(2 * STEPS, callback=first)
@@ -141,7 +141,7 @@ def test_an_evaluation_without_a_time_limit_ends_at_our_own(monkeypatch):
     assert evaluate(model, episodes=2, deterministic=True).episodic_length.mean == 30
 
 
-def test_an_environment_given_as_an_object_is_evaluated_in_copies_of_its_own():
+def test_an_environment_given_as_an_object_is_evaluated_in_new_ones_of_its_kind():
     given = [
         gymnasium.make("FrozenLake-v1", is_slippery=False),
         lambda: gymnasium.make("FrozenLake-v1", is_slippery=False),

@@ -74,7 +74,7 @@ def false_proofs(seeds: range, iterations: int) -> tuple[int, int, int]:
 
 @pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.fault("an episode that begins in one of several states")
-def test_no_certificate_of_an_exact_critic_is_below_what_is_missing_and_a_mean_over_drawn_starts_is():
+def test_no_certificate_of_an_exact_critic_is_below_the_gap_but_a_mean_over_sampled_starts_is():
     wrong, wrong_of_drawn, ended = false_proofs(range(12), iterations=5)
     assert wrong == 0
     assert wrong_of_drawn > 10
@@ -92,7 +92,7 @@ def test_none_of_a_thousand_runs_proves_something_false():
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
-def test_a_policy_that_is_bad_from_a_start_that_was_not_drawn_is_not_proved():
+def test_a_policy_that_is_bad_from_a_start_that_was_not_sampled_is_not_proved():
     model = PGTS(
         "pgts/Tightrope-v0", env_kwargs={"start": None}, critic="exact", depth=200, stop_at=20.0, num_envs=1, seed=0
     )
@@ -110,7 +110,7 @@ def test_taxi_ends_by_its_certificate_and_is_within_it(critic):
     assert exact.optimal(model.mdp).J - exact.evaluate(model.mdp, model.policy_table()).J <= 0.05
 
 
-def test_a_start_that_no_search_has_met_counts_as_the_highest_value():
+def test_a_start_that_no_search_has_expanded_counts_as_the_highest_value():
     apart = TabularMDP.from_dense(
         np.eye(2)[:, None].repeat(2, 1), np.array([[1.0, 0.0], [0.0, 1.0]]), 0.5, start=None, order="SAS"
     )
@@ -147,7 +147,7 @@ def test_starts_that_are_known_from_resets_only_prove_nothing(monkeypatch):
     assert model.iterate().certificate == math.inf  # two starts say too little
 
 
-def test_an_estimate_over_drawn_starts_is_above_what_is_missing_and_narrows_with_their_number():
+def test_an_estimate_over_sampled_starts_is_above_the_gap_and_narrows_with_their_number():
     """Hoeffding: by exactly span sqrt(ln(1 / alpha) / 2n) above the mean, alpha = 0.05 * 6 / pi^2 in iteration 1."""
     mdp = TabularMDP.from_dense(
         np.eye(2)[:, None].repeat(2, 1), np.array([[1.0, 0.0], [0.0, 1.0]]), 0.5, start=None, order="SAS"
@@ -159,7 +159,7 @@ def test_an_estimate_over_drawn_starts_is_above_what_is_missing_and_narrows_with
         assert model.iterate().certificate == pytest.approx(1 + width, abs=1e-5)
 
 
-def test_a_lookahead_that_left_out_nodes_says_nothing_of_starts_that_were_not_drawn():
+def test_a_pruned_lookahead_has_no_certificate_where_starts_are_sampled():
     mdp = random_mdp(30, 3, branching=2, seed=0, gamma=0.5, start=None)
     for width, is_known in ((None, True), (3, False)):
         model = PGTS(copies(mdp, 3_200), critic="exact", depth=3, search={"type": "expectimax", "max_width": width})
@@ -186,7 +186,7 @@ def test_a_loaded_model_has_the_certificates_of_the_one_that_went_on(env, argume
 
 
 @pytest.mark.parametrize("damaged", [lambda x: x[:-1], lambda x: x * math.nan, lambda x: None])
-def test_saved_bounds_that_are_none_are_refused(damaged):
+def test_invalid_saved_bounds_are_refused(damaged):
     model = PGTS("pgts/Ladder-v0", num_envs=2, depth=0)
     model.iterate()
     state = model.state_dict()
@@ -196,7 +196,7 @@ def test_saved_bounds_that_are_none_are_refused(damaged):
         model.load_state_dict(state)
 
 
-def test_what_an_exact_critic_may_be_off_by_covers_its_rounding():
+def test_the_error_of_an_exact_critic_covers_its_rounding():
     """Held to the same equation in fractions of arbitrary precision."""
     for seed in range(5):
         mdp = random_mdp(6, 2, branching=2, seed=seed, gamma=0.99)

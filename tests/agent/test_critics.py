@@ -136,7 +136,7 @@ def test_a_terminal_outcome_is_not_bootstrapped(method):
 
 
 @pytest.mark.parametrize("target", ["v", "q"])
-def test_what_was_never_visited_keeps_an_initial_number(target):
+def test_an_unvisited_cell_keeps_the_initial_value(target):
     mdp = ladder(5)
     pi_SA = right_with(0.5, 0.0, 0.5, 0.5, 0.5)
     for initial in (0.0, 7.5):
@@ -149,7 +149,7 @@ def test_what_was_never_visited_keeps_an_initial_number(target):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("target", ["v", "q"])
-def test_what_was_never_visited_is_worth_the_mean_of_the_targets(target, method):
+def test_an_unvisited_cell_has_the_mean_of_the_targets(target, method):
     mdp = random_mdp(30, 2, branching=2, seed=4, gamma=0.9)
     critic = TabularCritic(30, 2, TabularValues(target=target, method=method, step_size=1.0))
     made = experience(mdp, uniform_policy(mdp), FixedHorizon(length=3), episodes=6)
@@ -164,7 +164,7 @@ def test_what_was_never_visited_is_worth_the_mean_of_the_targets(target, method)
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("target", ["v", "q"])
-def test_a_constant_in_all_rewards_adds_the_same_to_all_values_seen_or_not(target, method):
+def test_a_constant_in_all_rewards_adds_the_same_to_all_values_visited_or_not(target, method):
     mdp = random_mdp(30, 2, branching=2, seed=4, gamma=0.9)
 
     def values(factor: float, constant: float) -> torch.Tensor:
@@ -181,7 +181,7 @@ def test_a_constant_in_all_rewards_adds_the_same_to_all_values_seen_or_not(targe
     assert torch.equal(values(2.0**-17, 0.0), 2.0**-17 * unseen)
 
 
-def test_where_nothing_is_known_of_the_end_what_was_never_visited_is_worth_0():
+def test_unvisited_cells_are_0_where_all_targets_are_bootstrapped_in_them():
     mdp = ladder(5, gamma=1.0)
     critic = TabularCritic(5, 2, TabularValues(method=TDLambda(lambda_=0.0)))
     fit(critic, mdp, right_with(*[1.0] * 5), FixedHorizon(length=1), episodes=2)
@@ -189,12 +189,12 @@ def test_where_nothing_is_known_of_the_end_what_was_never_visited_is_worth_0():
 
 
 @pytest.mark.parametrize("initial", [float("nan"), float("inf"), "median"])
-def test_an_initial_value_that_is_none_is_refused(initial):
+def test_an_invalid_initial_value_is_refused(initial):
     with pytest.raises(PgtsError, match="it must be a number or mean"):
         TabularValues(initial=initial)
 
 
-def test_a_step_moves_each_value_by_its_share_toward_the_mean_of_its_targets():
+def test_a_step_moves_each_value_toward_the_mean_of_its_targets():
     made = by_hand()
     critic = TabularCritic(4, 1, TabularValues(method=TDLambda(lambda_=0.0), step_size=0.25, initial=0.0))
     value_S = torch.tensor([8.0, 10.0, 10.0, 10.0], dtype=torch.float64)
@@ -217,7 +217,7 @@ def test_targets_that_are_not_finite_leave_the_table_as_it_is(initial):
     assert all(torch.equal(value, before[name]) for name, value in critic.state_dict().items())
 
 
-def test_a_q_critic_answers_v_as_the_mean_over_the_policy():
+def test_v_of_a_q_critic_is_the_mean_of_q_under_the_policy():
     mdp = ladder(3)
     pi_SA = right_with(0.2, 0.5, 0.9)
     critic = TabularCritic(3, 2, TabularValues(target="q"))
@@ -242,7 +242,7 @@ def test_the_rollout_critic_is_unbiased_also_where_the_policy_never_goes():
     assert z_scores(q_BX, exact.bellman(mdp, truth.q_SA).reshape(-1)).abs().max() > 2 * FAR
 
 
-def test_a_short_fixed_horizon_leaves_out_what_comes_after_it():
+def test_a_short_fixed_horizon_leaves_out_later_rewards():
     mdp = random_mdp(6, 2, gamma=0.7)
     pi_SA = random_policy(mdp, seed=1)
     critic = RolloutCritic(TabularModel(mdp), RolloutValues(samples=4, horizon=FixedHorizon(length=3)))
@@ -252,7 +252,7 @@ def test_a_short_fixed_horizon_leaves_out_what_comes_after_it():
     assert z_scores(v_BS, exact.evaluate(mdp, pi_SA).v_S).abs().min() > 2 * FAR
 
 
-def test_the_rollout_critic_counts_what_it_asks_of_its_model():
+def test_the_rollout_critic_counts_its_model_calls():
     mdp = grid(4, traps=(5,))
     critic = RolloutCritic(TabularModel(mdp), RolloutValues(samples=3, horizon=FixedHorizon(length=7)))
     critic.fit(following(uniform_policy(mdp)), by_hand(), generator=stream(0, "critic"))
@@ -269,7 +269,7 @@ def test_the_rollout_critic_counts_what_it_asks_of_its_model():
 
 
 @pytest.mark.parametrize("target", ["v", "q"])
-def test_what_a_tabular_critic_learned_survives_the_round_trip(target):
+def test_a_loaded_tabular_critic_continues_like_the_saved_one(target):
     mdp = ladder(4)
     pi_SA = uniform_policy(mdp)
     critic, other = (TabularCritic(4, 2, TabularValues(target=target, step_size="mean")) for _ in range(2))
@@ -283,7 +283,7 @@ def test_what_a_tabular_critic_learned_survives_the_round_trip(target):
     assert not torch.equal(state["value_C"], critic.state_dict()["value_C"])
 
 
-def test_what_does_not_fit_a_critic_is_refused():
+def test_a_state_that_does_not_fit_a_critic_is_refused():
     critic = TabularCritic(4, 2)
     state = critic.state_dict()
     for wrong in [
@@ -300,7 +300,7 @@ def test_what_does_not_fit_a_critic_is_refused():
             forgetful.load_state_dict(state)
 
 
-def test_a_critic_that_knows_no_policy_yet_says_so():
+def test_a_critic_that_is_queried_before_its_first_fit_says_so():
     states = torch.arange(3)
     for critic in (
         ExactCritic(ladder()),

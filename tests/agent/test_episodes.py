@@ -49,7 +49,7 @@ def made(env: VectorEnv, horizon: Horizon = FixedHorizon(length=100)) -> Rollout
     return rollout(world, policy, horizon, seed=0, names=("test",), generator=stream(0, "test"))
 
 
-def test_copies_whose_episode_is_over_are_not_stepped():
+def test_environments_whose_episode_is_over_are_not_stepped():
     env, together = copies(), copies()
     experience = made(env)
     assert sum(copy.num_steps for copy in env.envs) == experience.num_steps < experience.alive_TB.numel()
@@ -59,7 +59,7 @@ def test_copies_whose_episode_is_over_are_not_stepped():
 
 
 @pytest.mark.parametrize("horizon", [FixedHorizon(length=100), FixedHorizon(length=7), GeometricHorizon()], ids=str)
-def test_what_copies_do_that_step_one_by_one_is_what_they_do_together(horizon):
+def test_stepping_one_by_one_gives_the_episodes_of_stepping_together(horizon):
     alone, together = made(copies(), horizon), made(VectorWrapper(copies()), horizon)
     alive_TB = alone.alive_TB
     assert torch.equal(alive_TB, together.alive_TB)
@@ -71,11 +71,11 @@ def test_what_copies_do_that_step_one_by_one_is_what_they_do_together(horizon):
 
 
 @pytest.mark.parametrize("together", [False, True])
-def test_a_discount_of_its_own_belongs_to_the_copy_that_names_it(together):
+def test_a_discount_in_info_is_that_of_its_environment(together):
     experience = made(VectorWrapper(copies()) if together else copies(), FixedHorizon(length=7))
     named_TB = (torch.arange(1, 8)[:, None] + torch.arange(6)) % 3 == 0
     assert torch.equal(experience.discount_TB, torch.from_numpy(np.where(named_TB, 0.5, 0.9)))
 
 
-def test_a_vector_environment_with_a_step_of_its_own_is_asked_for_it():
+def test_a_vector_environment_with_its_own_step_method_is_stepped_by_it():
     assert float(made(copies(Halved)).returns()[0]) == float(made(copies()).returns()[0]) / 2

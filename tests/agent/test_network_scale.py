@@ -80,7 +80,7 @@ def test_rewards_times_a_power_of_two_leave_every_bit_of_the_policy(depth: int, 
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "FrozenLake-v1"])
-def test_dynamics_and_tables_behind_a_wrapper_of_rewards_know_no_unit_either(env_id: str):
+def test_dynamics_and_tables_behind_a_wrapper_of_rewards_do_not_depend_on_their_unit(env_id: str):
     def scaled(unit: float) -> PGTS:
         return trained(lambda: TransformReward(gymnasium.make(env_id), lambda r: unit * float(r)), depth=2)
 
@@ -106,7 +106,7 @@ def test_a_policy_stays_where_actions_do_nothing(depth: int, constant: bool):
     assert after.num_iterations == 3
 
 
-def test_rewards_of_nothing_at_all_are_no_error_and_what_comes_later_is_learned():
+def test_rewards_of_0_are_no_error():
     model = trained(lambda: Cart(unit=0.0), depth=2, iterations=2)
     assert same(model, trained(Cart, depth=2, iterations=0))
     assert model.critic.v(torch.zeros(1, 2)).tolist() == [0.0]

@@ -66,7 +66,7 @@ def test_weights_start_orthogonal_with_gain_sqrt_2_and_the_last_layer_with_its_o
 
 
 @pytest.mark.parametrize(("description", "space"), [(MLP(), VECTORS), (CNN(), VIEWS)])
-def test_weights_are_drawn_from_the_given_stream_and_torch_s_own_generator_is_left_alone(description, space):
+def test_weights_are_sampled_from_the_given_stream_and_not_from_torchs_own_generator(description, space):
     before = torch.get_rng_state()
     first, same, other = (network(description, space, seed=seed).plain_state() for seed in (0, 0, 1))
     assert torch.equal(torch.get_rng_state(), before)
@@ -74,7 +74,7 @@ def test_weights_are_drawn_from_the_given_stream_and_torch_s_own_generator_is_le
     assert not any(torch.equal(value, other[name]) for name, value in first.items() if name.endswith("weight"))
 
 
-def test_states_are_seen_as_one_hot_rows():
+def test_states_are_encoded_as_one_hot_rows():
     net = network(MLP(hidden=()), STATES)
     output_ND = net.outputs(torch.tensor([4, 0, 4]))
     expected_ND = net.head.weight.T[[4, 0, 4]] + net.head.bias
@@ -102,7 +102,7 @@ def test_the_default_convolutions_of_a_minigrid_view_leave_4_by_4_by_64():
     assert wide.trunk.layers[:5](torch.zeros(1, 1, 40, 30)).shape == (1, 8 * 8 * 6)
 
 
-def test_what_a_network_says_of_a_row_does_not_depend_on_how_many_are_asked_at_once(monkeypatch):
+def test_outputs_do_not_depend_on_the_size_of_the_batch(monkeypatch):
     net, x_ND = network(MLP(), VECTORS), torch.randn(10, 3, generator=stream(0, "x"))
     whole_ND = net.outputs(x_ND)
     monkeypatch.setattr(networks, "_MOST_INPUTS", 3 * 64)
@@ -146,7 +146,7 @@ def test_each_channel_of_an_image_has_statistics_of_its_own():
     torch.testing.assert_close(input_N.std((0, 2, 3)), torch.ones(3), atol=1e-3, rtol=0)
 
 
-def test_asking_a_network_changes_no_statistics():
+def test_computing_outputs_changes_no_statistics():
     net = network(MLP(normalize=True), VECTORS)
     x_ND = torch.randn(10, 3, generator=stream(0, "x"))
     before = net.plain_state()
@@ -194,11 +194,11 @@ def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_cha
         (lambda: network(MLP(), VECTORS).outputs(torch.zeros(2, 4)), r"shape \(4,\); it must be \(3,\)"),
     ],
 )
-def test_what_no_network_can_be_made_of_or_see_is_refused(make, message):
+def test_invalid_networks_and_observation_spaces_are_refused(make, message):
     with pytest.raises(PgtsError, match=message):
         make()
 
 
-def test_lists_of_sizes_are_taken_as_they_stand_in_a_configuration():
+def test_sizes_may_be_lists():
     assert MLP(hidden=[64, 64]) == MLP(hidden=(64, 64)) == MLP()
     assert CNN(channels=[16, 32, 64], hidden=[128]) == CNN()

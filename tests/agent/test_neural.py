@@ -74,7 +74,7 @@ def test_a_policy_is_the_softmax_of_its_network_and_nearly_uniform_at_first():
     assert (probs_NA != 0.2).any()
 
 
-def test_a_policy_starts_from_its_seed_alone_and_torch_s_own_generator_is_left_alone():
+def test_a_policy_starts_from_its_seed_and_torchs_own_generator_is_not_used():
     before = torch.get_rng_state()
     first, same, other = (NetworkPolicy(VECTORS, 5, seed=seed) for seed in (1, 1, 2))
     critic = NetworkCritic(VECTORS, 5, seed=1)
@@ -194,7 +194,7 @@ def test_a_target_network_lags_behind(polyak, target_period):
 
 
 @pytest.mark.parametrize(("polyak", "asks"), [(1.0, 1), (0.5, 2)])
-def test_values_that_were_asked_for_before_a_fit_are_not_asked_for_again(polyak, asks, monkeypatch):
+def test_values_queried_before_a_fit_are_reused(polyak, asks, monkeypatch):
     values, options = [0.5, -1.0, 2.0, 0.0], {"learning_rate": 0.1, "polyak": polyak}
     asking, silent = (fitted(tabular_critic(values, **options)) for _ in range(2))
     counted, outputs = [], asking.network.outputs
@@ -211,7 +211,7 @@ def test_values_that_were_asked_for_before_a_fit_are_not_asked_for_again(polyak,
 
 
 @pytest.mark.parametrize("asked", ["of another rollout", "of another policy", "before a fit already"])
-def test_values_are_not_taken_for_what_they_are_not(asked):
+def test_values_of_another_rollout_or_policy_are_not_reused(asked):
     asking, silent = (tabular_critic(torch.eye(4)[:, :2], target="q", learning_rate=0.1) for _ in range(2))
     made = by_hand()
     first, second = following(torch.tensor([[0.9, 0.1]] * 4)), following(torch.tensor([[0.1, 0.9]] * 4))
@@ -298,7 +298,7 @@ def test_options_that_make_no_sense_are_refused(options, message):
         NetworkCritic(VECTORS, 2, NetworkValues(**options))
 
 
-def test_a_critic_that_lacks_what_it_is_asked_for_says_so():
+def test_a_critic_without_q_or_without_values_says_so():
     with pytest.raises(PgtsError, match="learns v"):
         NetworkCritic(VECTORS, 2).q(POINTS_SD)
     with pytest.raises(PgtsError, match="has no values yet"):

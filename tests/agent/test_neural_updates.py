@@ -315,7 +315,7 @@ def test_a_state_that_does_not_fit_an_optimiser_is_refused():
 
 @pytest.mark.parametrize("update", UPDATES)
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_what_is_not_finite_moves_nothing_and_is_named(update, value):
+def test_a_number_that_is_not_finite_changes_nothing_and_is_named(update, value):
     policy = NetworkPolicy(VECTORS, 4)
     observation_ND, _, _ = sampled(policy, 5)
     advantage_NA, weight_N = question(5)
@@ -334,7 +334,7 @@ def test_what_is_not_finite_moves_nothing_and_is_named(update, value):
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
 
 
-def test_a_gradient_that_is_not_finite_moves_nothing_and_is_named():
+def test_a_gradient_that_is_not_finite_changes_nothing_and_is_named():
     parameter = torch.nn.Parameter(torch.tensor([0.0, 1.0]))
     optimiser = Optimiser(learning_rate=0.1, max_grad_norm=None)
     with pytest.raises(PgtsError, match="the gradient of the test loss is inf"):
@@ -359,7 +359,7 @@ def test_adam_is_that_of_torch_and_gradients_are_clipped_as_torch_does():
     assert (ours[0] - 1).abs().max() > 0.1
 
 
-def test_observations_are_seen_after_the_steps_but_for_the_first_batch():
+def test_statistics_of_observations_change_after_the_steps_but_for_the_first_batch():
     policy = NetworkPolicy(VECTORS, 4, MLP(normalize=True))
     observation_ND, _, _ = sampled(policy, 50)
     encoder, update = policy.network.trunk.encoder, GradientUpdate(Gradient(learning_rate=1e-12))

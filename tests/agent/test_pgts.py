@@ -117,7 +117,7 @@ def test_a_callback_sees_every_iteration_and_ends_the_training_by_returning_fals
     assert model.num_iterations == 5
 
 
-def test_predict_answers_in_the_shape_it_is_asked():
+def test_predict_returns_actions_in_the_shape_of_the_observations():
     policy = SimplexPolicy(5, 2)
     policy.load_state_dict({"probs_SA": right_with(0.9, 0.1, 0.5, 0.0, 1.0)})
     model = PGTS(copies(ladder(), 2), policy=policy)
@@ -131,7 +131,7 @@ def test_predict_answers_in_the_shape_it_is_asked():
     env.step(PGTS("FrozenLake-v1").predict(observation))
 
 
-def test_predict_draws_from_the_policy_where_it_is_asked_to():
+def test_predict_samples_from_the_policy_unless_deterministic():
     # 5 standard errors of 4,000 draws: fails by chance with probability 6e-7, here and call by call.
     policy = SimplexPolicy(5, 2)
     policy.load_state_dict({"probs_SA": right_with(0.7, 0.0, 0.0, 0.0, 1.0)})
@@ -174,7 +174,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_others(env):
 @pytest.mark.parametrize(
     "critic", ["tabular", {"type": "tabular", "target": "q"}, {"type": "rollout", "samples": 2}, "exact"]
 )
-def test_asking_for_lookaheads_and_actions_does_not_move_the_training(critic):
+def test_lookaheads_and_predictions_do_not_change_the_training(critic):
     quiet, asked = make(critic=critic), make(critic=critic)
     for _ in range(4):
         first, second = quiet.iterate(), asked.iterate()
@@ -186,7 +186,7 @@ def test_asking_for_lookaheads_and_actions_does_not_move_the_training(critic):
     assert same(bits(quiet), bits(asked))
 
 
-def test_no_global_generator_is_drawn_from_and_none_matters():
+def test_global_generators_are_neither_used_nor_changed():
     first, second = make("FrozenLake-v1"), make("FrozenLake-v1")
     torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
     first.learn(100)
@@ -214,7 +214,7 @@ def test_gymnasiums_tabular_environments_can_be_learned_from(env):
 
 
 @pytest.mark.parametrize("env", ["pgts/Ladder-v0", "pgts/Grid-v0", "FrozenLake-v1"])
-def test_a_whole_training_asks_the_model_at_most_once_for_each_state_and_action(env):
+def test_a_training_queries_the_model_at_most_once_for_each_state_and_action(env):
     total = 0
 
     def count(model, iteration):
@@ -226,7 +226,7 @@ def test_a_whole_training_asks_the_model_at_most_once_for_each_state_and_action(
 
 
 @pytest.mark.parametrize(("depth", "looks"), [(0, [0]), (3, [0, 3])])
-def test_an_iteration_looks_once_at_depth_0_and_once_at_its_own(depth, looks, monkeypatch):
+def test_an_iteration_searches_once_at_depth_0_and_once_at_its_own_depth(depth, looks, monkeypatch):
     model, made = make(depth=depth), []
     look_ahead = model.search.look_ahead
     monkeypatch.setattr(
@@ -249,7 +249,7 @@ def test_with_sampled_advantages_a_critic_values_each_visit_and_each_end_once_an
     assert rows == [experience.num_steps + experience.num_episodes]
 
 
-def test_what_the_rollout_critic_asks_is_counted_too():
+def test_model_calls_of_the_rollout_critic_are_counted():
     model = make(critic={"type": "rollout", "samples": 2, "horizon": {"type": "fixed", "length": 3}})
     seen = model.iterate()
     assert seen.model_calls == model.search.model_calls + model.critic.model_calls == model.num_model_calls
@@ -306,7 +306,7 @@ def test_arguments_that_do_not_fit_are_refused(kwargs, message):
         ({"critic": {"type": "network", "target": "q"}}, "critic.type is network of target q; sampled advantages"),
     ],
 )
-def test_sampled_advantages_are_refused_where_they_mean_nothing(options, message):
+def test_sampled_advantages_are_refused_with_parts_that_they_do_not_fit(options, message):
     sampled = {"depth": 0, "estimator": "sampled", "policy": "mlp", "update": "ppo"}
     make(**sampled).iterate()
     with pytest.raises(PgtsError, match=message):
@@ -331,7 +331,7 @@ def test_the_defaults_update_every_kind_of_policy():
     assert type(make(policy="simplex").update).__name__ == "ProjectedUpdate"
 
 
-def test_the_device_and_the_node_budget_reach_their_places():
+def test_the_device_and_max_nodes_are_passed_on():
     assert make(device="cpu").world.model.device == torch.device("cpu")
     with pytest.raises(PgtsError, match="max_nodes is 3"):
         make(search={"type": "expectimax", "max_nodes": 3}).iterate()

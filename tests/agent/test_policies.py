@@ -14,7 +14,7 @@ KINDS = list(OPTIONS)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_named_initialisations_are_what_they_say(kind):
+def test_initial_policies_are_those_documented(kind):
     np.testing.assert_allclose(kind(3, 4, OPTIONS[kind](init=Uniform())).table(), np.full((3, 4), 0.25))
     biased = kind(3, 4, OPTIONS[kind](init=Biased(action=1, probability=0.7))).table()
     np.testing.assert_allclose(biased, np.tile([0.1, 0.7, 0.1, 0.1], (3, 1)))
@@ -77,7 +77,7 @@ def test_parameters_that_do_not_fit_are_refused(kind, shape):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_actions_are_drawn_as_often_as_the_policy_says(kind):
+def test_actions_are_sampled_with_the_probabilities_of_the_policy(kind):
     # 4.5 standard errors for each of 12 cells: fails by chance with probability below 1e-4.
     policy = kind(4, 3, OPTIONS[kind](init=Random()), seed=2)
     n = 20_000
@@ -90,7 +90,7 @@ def test_actions_are_drawn_as_often_as_the_policy_says(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_only_the_given_generator_is_drawn_from(kind):
+def test_only_the_given_generator_is_used(kind):
     torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
     policy = kind(4, 3, OPTIONS[kind](init=Random()))
     first = policy.sample(torch.zeros(50, dtype=torch.int64), generator=stream(0, "test"))
@@ -112,7 +112,7 @@ def test_where_there_is_one_action_it_is_taken(kind, init):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_actions_are_those_that_multinomial_draws(dtype):
+def test_sampled_actions_are_those_of_multinomial(dtype):
     pi_NA = torch.rand(500, 4, dtype=dtype, generator=stream(0, "rows"))
     pi_NA[::3, 1] = 0
     policy, state_N = SimplexPolicy(500, 4), torch.arange(500)
@@ -122,7 +122,7 @@ def test_actions_are_those_that_multinomial_draws(dtype):
     assert drawn_N.tolist() != policy.sample(state_N, generator=stream(2, "actions")).tolist()
 
 
-def test_a_policy_without_probabilities_draws_no_action():
+def test_a_policy_whose_probabilities_are_not_finite_samples_no_action():
     policy = SoftmaxPolicy(3, 2)
     policy.logits_SA[1, 0] = torch.nan
     assert len(policy.sample(torch.tensor([0, 2]), generator=stream(0, "actions"))) == 2

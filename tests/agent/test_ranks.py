@@ -203,7 +203,7 @@ def test_fewer_episodes_than_ranks_are_refused():
     assert on_ranks(2, mistake) == ["num_envs is 1; 2 ranks need at least as many"] * 2
 
 
-def test_what_fails_in_one_rank_fails_in_all_with_its_number():
+def test_an_error_in_one_rank_is_raised_in_all_with_its_number():
     def mistake() -> tuple[str, str, int | None]:
         ranks = present_ranks()
 
@@ -219,7 +219,7 @@ def test_what_fails_in_one_rank_fails_in_all_with_its_number():
     assert on_ranks(2, mistake) == [("the reward is nan", "reward", 1)] * 2
 
 
-def test_a_rank_that_is_gone_is_missed():
+def test_a_lost_rank_is_an_error():
     def missed() -> str:
         ranks = present_ranks()
         ranks.gather("a test", lambda: None)
@@ -232,7 +232,7 @@ def test_a_rank_that_is_gone_is_missed():
     assert on_ranks(2, missed) == ["rank 0 of 2 has lost another one, asking for a test", "gone"]
 
 
-def test_ranks_that_ask_for_different_things_say_so():
+def test_ranks_at_different_exchanges_say_so():
     def mistake() -> str:
         ranks = present_ranks()
         with pytest.raises(PgtsError) as caught:
@@ -259,7 +259,7 @@ def test_an_evaluation_is_made_once_for_all(tmp_path):
     assert first == second
 
 
-def test_a_critic_that_draws_when_it_is_asked_draws_differently_in_each_rank():
+def test_a_critic_that_samples_when_queried_samples_differently_in_each_rank():
     def values() -> list[float]:
         model = PGTS(
             "pgts/Random-v0", depth=0, num_envs=2, critic={"type": "rollout", "samples": 1}, horizon="geometric"
@@ -271,7 +271,7 @@ def test_a_critic_that_draws_when_it_is_asked_draws_differently_in_each_rank():
     assert first != second
 
 
-def test_parts_make_the_whole():
+def test_the_parts_of_all_ranks_are_the_whole():
     things = torch.arange(7)
     for size in range(1, 10):
         ranks = [Ranks(rank, size) for rank in range(size)]

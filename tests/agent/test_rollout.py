@@ -83,7 +83,7 @@ def by_hand() -> Rollout:
     )
 
 
-def test_the_values_before_and_after_each_step_are_asked_once_for_each_visit_and_each_end():
+def test_values_are_queried_once_for_each_visit_and_each_end():
     made, asked = by_hand(), []
     v_TB, next_v_TB = made.values(lambda seen_N: asked.append(seen_N) or 2.0 * seen_N)
     alive_TB = made.alive_TB
@@ -93,7 +93,7 @@ def test_the_values_before_and_after_each_step_are_asked_once_for_each_visit_and
     assert [len(seen_N) for seen_N in asked] == [made.num_steps + made.num_episodes] == [7]
 
 
-def test_of_each_distinct_state_the_first_visit_says_what_was_seen():
+def test_the_observation_of_a_distinct_state_is_that_of_its_first_visit():
     made = by_hand()
     assert made.observation_V.tolist() == [3, 1, 11, 12, 23]
     assert made.visits("visits")[0].tolist() == [1, 2, 3]
@@ -245,7 +245,7 @@ def test_our_environments_make_the_same_kind_of_rollout_together_and_one_by_one(
             assert reward == mdp.outcomes.reward_NA[s, a]
 
 
-def test_the_environments_own_discount_goes_before_the_given_one():
+def test_the_environments_own_discount_overrides_gamma():
     assert TabularVectorEnv(ladder(gamma=0.7), 1).mdp.outcomes.discount_NAK.unique().tolist() == [0.7]
     made = experience(ladder(gamma=0.7), uniform_policy(ladder()), FixedHorizon(length=3), episodes=4, gamma=0.2)
     assert made.discount_TB.unique().tolist() == [0.7]
@@ -274,7 +274,7 @@ def test_a_time_limit_cuts_an_episode_without_terminating_it(name):
     assert EnvSource.of(name, gamma=0.9).make(2).reset(seed=[0, 1])[0].shape == (2,)
 
 
-def test_a_copy_that_is_cut_earlier_than_the_others_counts_no_longer():
+def test_an_environment_that_is_truncated_early_counts_no_longer():
     class FirstCopyIsCut(VectorWrapper):
         def step(self, actions):
             *answer, truncated, info = super().step(actions)
@@ -295,7 +295,7 @@ def test_a_copy_that_is_cut_earlier_than_the_others_counts_no_longer():
     assert made.discount_TB[0].tolist() == [0.9] * 3
 
 
-def test_without_being_asked_an_environment_has_no_time_limit_but_ours():
+def test_the_environments_own_time_limit_is_off_in_training():
     for name in ("pgts/Ladder-v0", "FrozenLake-v1"):
         env = EnvSource.of(name, gamma=0.9, kwargs={"is_slippery": False} if name == "FrozenLake-v1" else {}).make(1)
         num_states, num_actions = int(env.single_observation_space.n), int(env.single_action_space.n)
@@ -408,7 +408,7 @@ def test_a_process_that_never_ends_is_stopped_by_the_guard_of_the_geometric_hori
     assert made.num_steps == 10
 
 
-def test_simulated_episodes_earn_what_was_computed_by_hand():
+def test_simulated_returns_are_those_computed_by_hand():
     model, policy = TabularModel(chain()), following(torch.ones(3, 1, dtype=torch.float64))
     returns_B, num_steps = simulated_returns(
         model, policy, torch.tensor([0, 1, 2]), FixedHorizon(length=3), generator=stream(0, "test")

@@ -126,7 +126,7 @@ def nested(depth: int) -> State:
 
 @pytest.mark.fault("saved state that no model can be in")
 @pytest.mark.parametrize("kind", WRONG)
-def test_a_state_that_no_model_can_be_in_is_refused_by_the_name_of_its_part(kind, states, tmp_path):
+def test_an_impossible_state_is_refused_by_the_name_of_its_part(kind, states, tmp_path):
     made, part, change = WRONG[kind]
     model = MADE[made]()
     model.load_state_dict(copy.deepcopy(states[made]))
@@ -165,7 +165,7 @@ def test_arguments_that_make_no_model_are_refused(arguments, message, states, tm
 
 
 @pytest.mark.parametrize("kind", MADE)
-def test_the_state_of_a_model_is_taken_over_in_every_bit(kind, states, tmp_path):
+def test_a_loaded_state_is_the_saved_one_bit_for_bit(kind, states, tmp_path):
     model = MADE[kind]()
     model.load_state_dict(copy.deepcopy(states[kind]))
     assert same_values(model.state_dict(), states[kind])

@@ -232,7 +232,7 @@ def test_a_model_with_a_part_that_no_file_can_describe_is_not_saved(name, part, 
     assert not list(tmp_path.iterdir())
 
 
-def test_what_could_not_be_read_again_does_not_replace_what_can(tmp_path):
+def test_a_model_that_cannot_be_saved_leaves_the_file_as_it_was(tmp_path):
     path = tmp_path / "model.pt"
     make().save(path)
     whole = path.read_bytes()

@@ -54,7 +54,7 @@ def test_a_power_of_two_on_all_rewards_leaves_every_policy_bit_for_bit(name, dep
 
 
 @pytest.mark.parametrize("options", OPTIONS)
-def test_so_it_does_with_other_critics_searches_and_policies(options):
+def test_a_power_of_two_leaves_every_bit_with_other_critics_searches_and_policies(options):
     mdp = MDPS["random"]()
     plain, scaled = (trained(rewarded(mdp, factor=f), depth=3, **OPTIONS[options]) for f in (1.0, 2.0**-20))
     assert all(torch.equal(one, other) for one, other in zip(plain, scaled, strict=True))

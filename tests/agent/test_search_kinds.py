@@ -140,7 +140,7 @@ def test_samples_prove_nothing_but_a_narrow_search_does():
 
 @pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize("share", ["level", "search"])
-def test_training_knows_how_noisy_a_sampled_lookahead_is(share):
+def test_a_sampled_lookahead_tells_its_standard_error(share):
     model = PGTS("FrozenLake-v1", depth=2, search={"type": "sampled", "samples": 4, "share": share}, seed=5)
     assert model.iterate().noise > 0
     v_S = torch.linspace(0, 1, 16, dtype=torch.float64)
@@ -163,6 +163,6 @@ def test_training_knows_how_noisy_a_sampled_lookahead_is(share):
         ({"type": "expectimax", "prior": "policy"}, "search.prior does not belong to search.kind expectimax"),
     ],
 )
-def test_a_search_that_does_not_exist_or_an_option_that_it_does_not_heed_is_refused(search, message):
+def test_an_unknown_search_or_option_is_refused(search, message):
     with pytest.raises(PgtsError, match=message):
         PGTS("pgts/Ladder-v0", search=search)

@@ -70,7 +70,7 @@ def trained(make: Any, **options: Any) -> tuple[list[float], float]:
 @pytest.mark.fault("environment that draws from global generators")
 @pytest.mark.parametrize("module", DRAWS)
 @pytest.mark.parametrize("where", ["step", "reset", "init"])
-def test_one_seed_gives_the_same_bits_the_users_generators_go_on_and_it_is_said_once(module, where):
+def test_one_seed_gives_the_same_bits_and_a_single_warning_and_the_users_generators_go_on(module, where):
     found, said = [], []
     for other_state in (0, 1):
         random.seed(other_state), np.random.seed(other_state), torch.manual_seed(other_state)  # noqa: NPY002
@@ -87,7 +87,7 @@ def test_one_seed_gives_the_same_bits_the_users_generators_go_on_and_it_is_said_
         assert all(len(each) == 1 and f"uses the generator of {module}, which" in each[0] for each in said)
 
 
-def test_an_environment_that_draws_its_own_is_not_accused():
+def test_an_environment_that_uses_its_own_generator_causes_no_warning():
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         trained("CartPole-v1")
@@ -95,7 +95,7 @@ def test_an_environment_that_draws_its_own_is_not_accused():
 
 
 @pytest.mark.parametrize("module", DRAWS)
-def test_a_step_that_draws_from_a_global_generator_is_no_model(module):
+def test_a_step_that_uses_a_global_generator_is_no_model(module):
     before = states()
     with pytest.raises(MissingModel, match=f"step draws from the global generator of {module}: draw from"):
         PGTS(lambda: Windy(module), depth=1, **SMALL)
@@ -103,7 +103,7 @@ def test_a_step_that_draws_from_a_global_generator_is_no_model(module):
 
 
 @pytest.mark.parametrize("module", DRAWS)
-def test_a_simulator_notices_later_too_that_a_step_draws_from_a_global_generator(module):
+def test_a_simulator_notices_later_too_that_a_step_uses_a_global_generator(module):
     model, env = SimulatorModel(lambda: Windy(module, "later"), gamma=0.9), Windy(module, "later")
     env.reset(seed=0)
     state_N, action_N = torch.tensor([model.root(env)] * 2), torch.tensor([0, 1])
@@ -130,7 +130,7 @@ def test_an_error_leaves_the_users_generators_as_they_were():
     assert states() == before
 
 
-def test_the_context_gives_a_stream_of_its_own_to_each_name_and_says_what_was_drawn_from():
+def test_the_context_has_a_stream_for_each_name_and_tells_which_generators_were_used():
     def draws(*names: str) -> list[float]:
         with SharedGenerators(*names):
             return [draw() for draw in DRAWS.values()]

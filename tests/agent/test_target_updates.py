@@ -63,7 +63,7 @@ def test_a_factor_of_a_power_of_two_leaves_every_bit(power):
     assert not torch.equal(after(advantage_NA * 3, weight_N * torch.arange(4)), after(advantage_NA, weight_N))
 
 
-def test_what_is_smaller_than_the_noise_moves_little_and_nothing_where_all_actions_are_alike():
+def test_advantages_below_the_noise_make_small_steps_and_equal_ones_none():
     advantage_NA, weight_N = question()
     before_NA = policy().probs(torch.arange(4))
     assert torch.equal(after(torch.zeros(4, 3, dtype=torch.float64), weight_N), before_NA)

@@ -60,7 +60,7 @@ def test_an_update_is_the_exact_formula_at_the_visited_states(update, kind, step
 
 
 @pytest.mark.parametrize(("update", "kind", "step"), CASES)
-def test_an_update_is_one_step_and_draws_nothing(update, kind, step):
+def test_an_update_is_one_step_and_uses_no_random_numbers(update, kind, step):
     called, stepped = random_policy(kind), random_policy(kind)
     generator = stream(0, "untouched")
     assert update()(called, Batch(STATES, *question()), generator=generator) == {}
@@ -124,13 +124,13 @@ def test_the_softmax_update_is_the_gradient_of_the_weighted_mean_value():
         (SoftmaxUpdate, SimplexPolicy, "SoftmaxPolicy"),
     ],
 )
-def test_a_policy_that_an_update_cannot_move_is_refused(update, kind, fits):
+def test_a_policy_that_an_update_cannot_change_is_refused(update, kind, fits):
     with pytest.raises(PgtsError, match=f"{update.__name__} updates a {fits}, not a {kind.__name__}"):
         update().check(kind(3, 2))
 
 
 @pytest.mark.parametrize(("update", "kind", "step"), CASES)
-def test_a_policy_that_an_update_can_move_is_taken(update, kind, step):
+def test_a_policy_that_an_update_can_change_is_accepted(update, kind, step):
     policy = kind(3, 2)
     update().check(policy)
     assert isinstance(policy, update().policies)
