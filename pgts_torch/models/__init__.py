@@ -3,6 +3,7 @@
 from pgts_torch.models.actions import with_torques
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.classic import Acrobot, CartPole, MountainCar, Pendulum
+from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.fidelity import check_model
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.state_index import StateIndex
@@ -12,6 +13,7 @@ from pgts_torch.models.tensor import TensorModel
 __all__ = [
     "Acrobot",
     "CartPole",
+    "CountsModel",
     "EnumeratingModel",
     "MountainCar",
     "Pendulum",

@@ -17,6 +17,7 @@ from pgts_torch.options.critics import (
     TabularValues,
     TDLambda,
 )
+from pgts_torch.options.models import Counts
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, Random, Simplex, Softmax, Uniform
 from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, LookaheadAdvantages, SampledAdvantages
@@ -34,6 +35,7 @@ __all__ = [
     "AutoPolicy",
     "AutoUpdate",
     "Biased",
+    "Counts",
     "ExactValues",
     "Expectimax",
     "FixedHorizon",
