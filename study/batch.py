@@ -4,8 +4,8 @@
 makes whole maps of settings affordable. A test holds the two to each other.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
@@ -32,10 +32,6 @@ class Cells:
     def rows(self, row_N: Tensor) -> Self:
         """Some of the settings, by number or by mask."""
         return type(self)(self.depth_B[row_N], self.step_B[row_N], self.pi_BSA[row_N])
-
-    def moved_to(self, pi_BSA: Float[Tensor, "B S A"]) -> Self:
-        """The same settings with other policies."""
-        return type(self)(self.depth_B, self.step_B, pi_BSA)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +75,7 @@ class Batch:
         d_BS = torch.where(visited_BS, d_BS.clamp(min=torch.finfo(torch.float64).tiny), 0.0)
         iterate = Iterate(cells.pi_BSA, v_BS @ self._start_S, d_BS)
         moved_BSA = self._moved(cells, self._lookahead(cells.depth_B, v_BS), d_BS)
-        return iterate, cells.moved_to(torch.where(visited_BS[..., None], moved_BSA, cells.pi_BSA))
-
-    def iterates(self, cells: Cells) -> Iterator[Iterate]:
-        """pi_0, pi_1, ... without an end."""
-        while True:
-            iterate, cells = self.advance(cells)
-            yield iterate
+        return iterate, replace(cells, pi_BSA=torch.where(visited_BS[..., None], moved_BSA, cells.pi_BSA))
 
     def _lookahead(self, depth_B: Tensor, v_BS: Tensor) -> Tensor:
         """T^m Q^pi, with an m for each setting."""

@@ -25,8 +25,6 @@ DOTS_PER_INCH = 110
 WIDTH = 79
 
 CURVES = {one.FIGURE.name: one.FIGURE for one in (ladder, random_mdp, tightrope, grid)}
-PICTURES = {"depth": ("depth", "mirage")}
-"""By part, where they are not named as the part is."""
 OTHERS = {"stationary": sets.compute, "depth": depth.compute}
 
 
@@ -44,7 +42,7 @@ def run(*, only: str | None, effort: Effort, out: Path) -> dict[str, Any]:
     before = stored(folder)  # what cannot be read is better known now than after all the work
     page = files.target(out / "reproduction.md", is_document, "a document of python -m study")
     for name in PARTS if only is None else (only,):
-        for picture in PICTURES.get(name, (name,)):
+        for picture in pictures(name):
             files.target(folder / f"{picture}.png", lambda _: name in before, f"a picture of figures/{name}.json")  # noqa: B023
     started = time.perf_counter()
 
@@ -57,9 +55,9 @@ def run(*, only: str | None, effort: Effort, out: Path) -> dict[str, Any]:
         text = json.dumps(data, separators=(",", ":"))
         made[name] = json.loads(text)
         files.replace(folder / f"{name}.json", f"{text}\n".encode())
-        for picture, drawn in pictures(made[name]).items():
+        for picture, draw in pictures(name).items():
             png = io.BytesIO()
-            drawn.savefig(png, dpi=DOTS_PER_INCH)
+            draw(made[name]).savefig(png, dpi=DOTS_PER_INCH)
             files.replace(folder / f"{picture}.png", png.getvalue())
         files.replace(page, document(stored(folder)).encode())
     report(f"wrote {out / 'reproduction.md'}")

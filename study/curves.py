@@ -94,8 +94,9 @@ def trace(
     """Algorithm 1 from one policy with every depth and every step size, by (depth, step size)."""
     settings = list(itertools.product(depths, steps))
     J_optimal, batch = exact.optimal(mdp).J, Batch(mdp, step=update)
-    J_KB, watched_KB = [], []
-    for iterate in itertools.islice(batch.iterates(cells(settings, pi_SA)), iterations + 1):
+    J_KB, watched_KB, running = [], [], cells(settings, pi_SA)
+    for _ in range(iterations + 1):
+        iterate, running = batch.advance(running)
         J_KB.append(iterate.J_B)
         watched_KB.append(watch(iterate) if watch else {})
     J_BK = torch.stack(J_KB, -1)

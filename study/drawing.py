@@ -24,16 +24,10 @@ START_TITLES = {"s0": "start in s0", "uniform": "uniform start"}
 UPDATE_TITLES = {"projected": "simplex policy, projected update", "softmax": "softmax policy"}
 
 
-def pictures(data: Data) -> dict[str, Figure]:
-    """The pictures of a part, by file name without its ending."""
-    drawn: dict[str, Callable[[Data], Figure]]
-    if data["part"] == "depth":
-        drawn = {"depth": depth_maps, "mirage": mirage_curves}
-    elif data["part"] == "stationary":
-        drawn = {"stationary": sufficient_depths}
-    else:
-        drawn = {data["part"]: curves}
-    return {name: draw(data) for name, draw in drawn.items()}
+def pictures(part: str) -> Mapping[str, Callable[[Data], Figure]]:
+    """What draws the pictures of a part from its data, by file name without its ending."""
+    several = {"depth": {"depth": depth_maps, "mirage": mirage_curves}, "stationary": {"stationary": sufficient_depths}}
+    return several.get(part, {part: curves})
 
 
 def curves(data: Data) -> Figure:

@@ -57,8 +57,9 @@ class TabularEnv(gymnasium.Env):
 
     @state.setter
     def state(self, state: int) -> None:
-        self._state = check_state(state, self.mdp.num_states)
-        self._ended = False
+        if isinstance(state, bool) or not isinstance(state, int | np.integer) or not 0 <= state < self.mdp.num_states:
+            raise PgtsError(f"state {state!r} does not exist; states are 0 to {self.mdp.num_states - 1}")
+        self._state, self._ended = int(state), False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
         """Start an episode in a state sampled from the start distribution, or in `options["state"]`."""
@@ -114,10 +115,3 @@ def check_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> Non
     for name in options or {}:
         if name not in known:
             raise PgtsError(f"reset has no option {name!r}; it has {', '.join(known)}")
-
-
-def check_state(state: Any, num_states: int) -> int:
-    """The state as an int; PgtsError unless it exists."""
-    if isinstance(state, bool) or not isinstance(state, int | np.integer) or not 0 <= state < num_states:
-        raise PgtsError(f"state {state!r} does not exist; states are 0 to {num_states - 1}")
-    return int(state)

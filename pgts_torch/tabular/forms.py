@@ -65,11 +65,11 @@ def outcomes_from(P: Any, R: Any, gamma: float, order: Order | None) -> tuple[Ou
     where those of one (s, a) differ.
 
     Args:
-        order: which axis comes first; None: the one that the shape tells.
+        order: which axis comes first; None: as the shape says.
 
     Raises:
-        PgtsError: no such form; an order that the shape does not tell or contradicts; a probability that is none; or
-            rewards that do not fit.
+        PgtsError: no such form; an order that the shape leaves open or contradicts; no probability; or rewards that do
+            not fit.
     """
     if order not in ("SAS", "ASS", None):
         raise PgtsError(f"order is {order!r}; it must be 'SAS' or 'ASS'")
@@ -82,7 +82,7 @@ def outcomes_from(P: Any, R: Any, gamma: float, order: Order | None) -> tuple[Ou
     else:
         P = np.asarray(P, dtype=np.float64)
         for name, array in (("P_SAS", P), ("R_SA", R)):
-            _check_told(name, array, order)
+            _check_order_is_clear(name, array, order)
         P, order = _state_first(P, order)
         table = _from_dense(P)
     table = table._replace(prob_SAK=normalised(table.prob_SAK))
@@ -125,8 +125,8 @@ def _state_first(P: np.ndarray, order: Order | None) -> tuple[np.ndarray, Order]
     return (P if found == "SAS" else P.swapaxes(0, 1)), found
 
 
-def _check_told(name: str, array: Any, order: Order | None) -> None:
-    """PgtsError if nothing tells the states of this array from its actions."""
+def _check_order_is_clear(name: str, array: Any, order: Order | None) -> None:
+    """PgtsError if no order is given and the shape of the array leaves it open: as many states as actions."""
     shape = np.shape(array) if order is None and not _is_sparse_list(array) else ()
     if len(shape) == 3 and len(set(shape)) == 1 and not np.array_equal(array, np.swapaxes(array, 0, 1), equal_nan=True):
         raise PgtsError(

@@ -91,7 +91,7 @@ class TabularMDP:
             order: "SAS" if P[s, a] is a distribution, "ASS" if P[a, s] is. Needed only where shapes do not tell.
 
         Raises:
-            PgtsError: as the class; or no such forms, or an order that nothing tells.
+            PgtsError: as the class; or there is no such form, or shapes leave the order open and it is not given.
         """
         check_gamma(gamma)
         outcomes, reward_SAK = outcomes_from(P, R, gamma, order)

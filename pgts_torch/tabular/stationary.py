@@ -154,10 +154,10 @@ def certificate(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -> flo
         reward_NA=torch.where(expanded_S[:, None], outcomes.reward_NA, w),
         discount_NAK=torch.where(expanded_S[:, None, None], outcomes.discount_NAK, 0.0),
     )
-    hopeful = replace(mdp, outcomes=granted, reward_SAK=None)
-    v_S = exact.optimal(hopeful).v_S
+    optimistic = replace(mdp, outcomes=granted, reward_SAK=None)
+    v_S = exact.optimal(optimistic).v_S
     if largest_discount(granted) < UNDISCOUNTED:
-        v_S = residual_bound(hopeful, v_S)  # policy iteration ends a rounding error below the optimum
+        v_S = residual_bound(optimistic, v_S)  # policy iteration ends a rounding error below the optimum
     return float(mdp.start_S @ (v_S - exact.policy_values(mdp, pi_SA)))
 
 

@@ -12,7 +12,6 @@ from study import PARTS, command, depth, families, sets, table1
 from study.__main__ import main
 from study.claims import Finding
 from study.document import document
-from study.drawing import pictures
 from study.figure import Effort
 from study.tests.made_up import smallest
 from tests.forks import PATIENCE
@@ -122,10 +121,7 @@ def test_the_study_replaces_its_own_files_and_nothing_else(name, tmp_path, capsy
     assert (tmp_path / name).read_text() == '{"mine": true}'
 
 
-def test_the_document_and_the_names_of_the_pictures_are_what_the_stored_data_make():
+def test_the_document_is_what_the_stored_data_make():
     parts = command.stored(ROOT / "docs" / "figures")
     assert tuple(parts) == PARTS
     assert (ROOT / "docs" / "reproduction.md").read_text() == document(parts)
-    assert set(command.PICTURES) <= parts.keys()
-    for name, data in parts.items():
-        assert tuple(pictures(data)) == command.PICTURES.get(name, (name,))
