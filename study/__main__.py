@@ -17,7 +17,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def reproduce(arguments: Sequence[str]) -> None:
     """Reproduce the figures and tables of the paper, and check what it says."""
-    parser = Parser("", reproduce, prog="python -m study")
+    parser = Parser(reproduce, prog="python -m study")
     parser.add_argument("--only", choices=PARTS, help="compute this part; keep the others as they are in --out")
     parser.add_argument(
         "--quick", action="store_true", help="minutes instead of half an hour: fewer seeds and readings"

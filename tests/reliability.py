@@ -97,8 +97,8 @@ FAULTS: dict[str, dict[str, str]] = {
         "rewards or actions that are all equal, tables": "rounding is no step: every bit of the policy stays",
         "rewards in another unit, networks": "times 2^k, every bit of the policy is the same",
         "a policy that hardly moves": "the summary says so, with what to change",
-        "a policy that does not come to rest": "the summary says so, with what to change",
-        "a greedy policy that is worse than drawn actions": "the summary says so",
+        "a policy that does not converge": "the summary says so, with what to change",
+        "a greedy policy that is worse than sampled actions": "the summary says so",
     },
     "Proofs": {
         "an episode that begins in one of several states": "a proof is over all start states, not over those drawn",

@@ -19,6 +19,7 @@ from pgts_torch.options.critics import (
     AutoCritic,
     ExactValues,
     NetworkValues,
+    OwnNetwork,
     RolloutValues,
     SharedNetwork,
     TabularValues,
@@ -70,7 +71,9 @@ def chosen(options: Training, world: World) -> Training:
     if isinstance(policy, AutoPolicy):
         policy = Softmax() if numbered else CNN() if len(world.observation_space.shape or ()) == 3 else MLP()
     if isinstance(critic, AutoCritic):
-        critic = TabularValues() if numbered else NetworkValues()
+        critic = NetworkValues() if isinstance(policy, Network) else TabularValues()
+    if isinstance(critic, NetworkValues) and isinstance(critic.network, OwnNetwork) and isinstance(policy, Network):
+        critic = critic.model_copy(update={"network": policy})
     if isinstance(update, AutoUpdate):
         neural = PPO() if isinstance(options.estimator, SampledAdvantages) else CMPO()
         update = neural if isinstance(policy, Network) else Projected() if isinstance(policy, Simplex) else Mirror()

@@ -1,11 +1,13 @@
 """The command line's parser, the types of its arguments, its help and its output."""
 
 import argparse
+import difflib
+import itertools
 import json
 import math
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,14 +22,9 @@ WIDTH = 79
 class Parser(argparse.ArgumentParser):
     """An argparse parser that raises PgtsError in one line and takes no abbreviations."""
 
-    def __init__(self, name: str, function: Callable[..., Any], **settings: Any) -> None:
-        settings.setdefault("prog", f"pgts {name}".strip())
-        super().__init__(
-            description=(function.__doc__ or "").partition("\n")[0],
-            allow_abbrev=False,
-            formatter_class=_Formatter,
-            **settings,
-        )
+    def __init__(self, function: Callable[..., Any], **settings: Any) -> None:
+        settings = {"prog": f"pgts {command_name(function)}", "description": summary(function)} | settings
+        super().__init__(allow_abbrev=False, formatter_class=_Formatter, **settings)
 
     def print_help(self, file: Any = None) -> None:
         """As argparse, but a broken pipe raises an error."""
@@ -35,6 +32,15 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise PgtsError(f"{message} (see {self.prog} --help)")
+
+
+def command_name(function: Callable[..., Any]) -> str:
+    return function.__name__.replace("_", "-")
+
+
+def summary(function: Callable[..., Any]) -> str:
+    """Return the first line of its docstring."""
+    return (function.__doc__ or "").partition("\n")[0]
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
@@ -52,16 +58,16 @@ def describe_options(options: Sequence[Option]) -> Iterator[str]:
         initial_indent="  ",
         subsequent_indent="  ",
     )
-    section, when = None, ""
-    for option in options:
-        name = option.key.partition(".")[0] if "." in option.key else "general"
-        if name != section:
-            yield from ("", name)
-            when = ""
-        if option.when != when and option.when:
-            yield f"  with {option.when}:"
-        section, when = name, option.when
-        yield from _describe_option(option, "    " if option.when else "  ")
+    sections = itertools.groupby(
+        options, lambda option: option.key.partition(".")[0] if "." in option.key else "general"
+    )
+    for section, in_section in sections:
+        yield from ("", section)
+        for when, group in itertools.groupby(in_section, lambda option: option.when):
+            if conditions := [f"{key} {'|'.join(values)}" for key, values in when]:
+                yield f"  with {' and '.join(conditions)}:"
+            for option in group:
+                yield from _describe_option(option, "    " if when else "  ")
 
 
 def _describe_option(option: Option, indent: str) -> Iterator[str]:
@@ -82,25 +88,30 @@ def _value(value: Any) -> str:
     return f"{value:_}" if type(value) is int else json.dumps(value)
 
 
-def whole(least: int) -> Callable[[str], int]:
-    """An argparse type: a whole number of at least `least`, below 2**63."""
+def whole(least: int, word: str | None = None) -> Callable[[str], Any]:
+    """An argparse type: a whole number of at least `least`, below 2**63; or the word."""
 
-    def convert(text: str) -> int:
+    def convert(text: str) -> int | str:
+        if text == word:
+            return text
         if not (text.isascii() and text.isdecimal() and len(text) < 20 and least <= int(text) <= INT64_MAX):
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number >= {least} and below 2**63")
+            kind = f"a whole number >= {least} and below 2**63"
+            must = f"not {kind}" if word is None else f"neither {kind} nor {word}"
+            raise argparse.ArgumentTypeError(f"{text!r} is {must}")
         return int(text)
 
     return convert
 
 
-def whole_list(text: str) -> tuple[int, ...]:
-    """An argparse type: whole numbers separated by commas."""
-    return tuple(whole(0)(part) for part in text.split(","))
+def listed(convert: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    """An argparse type: values separated by commas; each counts once."""
+    return lambda text: tuple(dict.fromkeys(map(convert, text.split(","))))
 
 
-def depth_list(text: str) -> tuple[int | str, ...]:
-    """An argparse type: depths separated by commas, each a whole number or the word adaptive."""
-    return tuple(dict.fromkeys(part if part == "adaptive" else whole(0)(part) for part in text.split(",")))
+def choice_of(text: str, known: Collection[str]) -> str:
+    """Return the end of a message about an unknown word: the likeliest one, or all."""
+    close = difflib.get_close_matches(text, known, n=1)
+    return f"did you mean {close[0]}?" if close else f"choose from {', '.join(known)}"
 
 
 def json_object(text: str) -> dict[str, Any]:
@@ -125,24 +136,12 @@ def unit_interval(text: str) -> float:
     return value
 
 
-def start(text: str) -> int | str:
-    """An argparse type: a state, or the word uniform."""
-    if text == "uniform":
-        return text
-    try:
-        return whole(0)(text)
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a state nor uniform") from None
-
-
 def path_kind(text: str) -> str | None:
     """Return what is at a path (`files.kind`); ArgumentTypeError where it cannot be looked up."""
     try:
-        text.encode()
+        with files.named(f"{text!a}"):
+            text.encode()  # bytes that the locale lacks were escaped, and can be looked up, but not written down
         return files.kind(text, follow=True)
-    except UnicodeEncodeError:
-        reason = "its name has characters that this locale lacks; set PYTHONUTF8=1, or LC_ALL to a UTF-8 locale"
-        raise argparse.ArgumentTypeError(f"{text!a}: {reason}") from None
     except PgtsError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 

@@ -1,7 +1,6 @@
 """The subcommands of `pgts`, a function each."""
 
 import argparse
-import difflib
 import json
 import sys
 from collections.abc import Callable, Sequence
@@ -9,23 +8,23 @@ from dataclasses import asdict
 
 from pgts_torch.cli.arguments import (
     Parser,
-    depth_list,
+    choice_of,
+    command_name,
     describe_options,
     html_file,
     json_object,
+    listed,
     output_folder,
     path_kind,
     print_values,
     run_folder,
-    start,
     unit_interval,
     whole,
-    whole_list,
 )
 from pgts_torch.cli.terminal import print_kept, rank
 from pgts_torch.config import Config, dump, load
 from pgts_torch.experiment.ownership import SUMMARY_FILE
-from pgts_torch.options.schema import Schema
+from pgts_torch.options.schema import schema_of
 from pgts_torch.trust import check_imports
 
 CHECK_FAILED = 1
@@ -37,7 +36,7 @@ COMMANDS: dict[str, Callable[[Arguments], None]] = {}
 
 def command(function: Callable[[Arguments], None]) -> Callable[[Arguments], None]:
     """Register a subcommand under the function's name, with dashes for underscores."""
-    COMMANDS[function.__name__.replace("_", "-")] = function
+    COMMANDS[command_name(function)] = function
     return function
 
 
@@ -45,7 +44,7 @@ def command(function: Callable[[Arguments], None]) -> Callable[[Arguments], None
 def train(arguments: Arguments) -> None:
     """Train a policy with tree search."""
     usage = "%(prog)s [--config FILE | --resume RUN_DIR] [--KEY VALUE ...]"
-    parser = Parser("train", train, usage=usage)
+    parser = Parser(train, usage=usage)
     parser.add_argument("--config", metavar="FILE", help="YAML file with any of the keys below; none: the defaults")
     parser.add_argument("--resume", metavar="RUN_DIR", type=run_folder, help="go on with an unfinished run")
     parser.add_argument("--overwrite", action="store_true", help="start from the beginning, as --run.overwrite")
@@ -59,7 +58,7 @@ def train(arguments: Arguments) -> None:
     parser.add_argument("--print-config", action="store_true", help="print the whole configuration as YAML and stop")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     if {"-h", "--help"} & set(arguments):
-        parser.epilog = "\n".join(describe_options(Schema(Config).options()))
+        parser.epilog = "\n".join(describe_options(schema_of(Config).options()))
     fixed, overrides = parser.parse_known_args(arguments)
     overrides += ["--run.overwrite"] if fixed.overwrite else []
     if fixed.resume is not None:
@@ -90,11 +89,13 @@ def train(arguments: Arguments) -> None:
 @command
 def sweep(arguments: Arguments) -> None:
     """Train with several seeds at several depths, and compare."""
-    parser = Parser("sweep", sweep, usage="%(prog)s --out DIR [--config FILE] [--KEY VALUE ...]")
+    parser = Parser(sweep, usage="%(prog)s --out DIR [--config FILE] [--KEY VALUE ...]")
     parser.add_argument("--out", metavar="DIR", type=output_folder, help="for DIR/depth-D/seed-S, a table, a picture")
     parser.add_argument("--config", metavar="FILE", help="as for pgts train; none: the defaults")
     parser.add_argument("--seeds", metavar="N", type=whole(1), default=5, help="0 to N - 1 (default: %(default)s)")
-    parser.add_argument("--depths", metavar="LIST", type=depth_list, default=(), help="as in 0,2,4 (default: its own)")
+    parser.add_argument(
+        "--depths", metavar="LIST", type=listed(whole(0, "adaptive")), default=(), help="as in 0,2,4 (default: its own)"
+    )
     parser.add_argument("--jobs", metavar="N", type=whole(1), default=1, help="runs at once (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the table as one JSON object")
     parser.epilog = SWEEP_HELP
@@ -123,7 +124,7 @@ code is 1. SIGTERM or Ctrl-C lets the runs finish their iterations and save."""
 @command
 def evaluate(arguments: Arguments) -> None:
     """Evaluate the last checkpoint of a run, in new episodes."""
-    parser = Parser("evaluate", evaluate)
+    parser = Parser(evaluate)
     parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run")
     parser.add_argument("--episodes", metavar="N", type=whole(1), default=100, help="how many (default: %(default)s)")
     parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the episodes (default: %(default)s)")
@@ -140,7 +141,7 @@ def evaluate(arguments: Arguments) -> None:
 @command
 def report(arguments: Arguments) -> None:
     """Write one HTML page about a run, finished or not."""
-    parser = Parser("report", report)
+    parser = Parser(report)
     parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run, finished or not")
     parser.add_argument("--out", metavar="FILE", type=html_file, help="where to write (default: RUN_DIR/report.html)")
     parser.add_argument("--json", action="store_true", help="print what the page shows as one JSON object")
@@ -166,7 +167,7 @@ STATIONARY_OPTIONS = {
 @command
 def stationary(arguments: Arguments) -> None:
     """Count the policies that tree search cannot improve, depth by depth."""
-    parser = Parser("stationary", stationary, usage="%(prog)s WHAT [--OPTION VALUE ...]")
+    parser = Parser(stationary, usage="%(prog)s WHAT [--OPTION VALUE ...]")
     parser.add_argument("what", metavar="WHAT", type=_mdp_name, help=", ".join(STATIONARY_OPTIONS))
     for name, kind, meaning in [
         ("n", whole(1), "size: ladder (default 5), grid (3), deep_sea (3)"),
@@ -174,9 +175,9 @@ def stationary(arguments: Arguments) -> None:
         ("actions", whole(1), "of random (default 2)"),
         ("branching", whole(1), "successors of each state and action of random (default: all states)"),
         ("mdp-seed", whole(0), "of random (default 0)"),
-        ("traps", whole_list, "states of the grid that cost 10, as in 1,5 (default: none)"),
+        ("traps", listed(whole(0)), "states of the grid that cost 10, as in 1,5 (default: none)"),
         ("gamma", unit_interval, "discount (default 0.9; deep_sea 0.99; a file has its own)"),
-        ("start", start, "a state, or uniform over all states (default: state 0; a file has its own)"),
+        ("start", whole(0, "uniform"), "a state, or uniform over all states (default: state 0; a file has its own)"),
     ]:
         parser.add_argument(f"--{name}", metavar="N", type=kind, help=meaning)
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
@@ -206,7 +207,7 @@ A terminal state is one that leads to itself and earns 0."""
 @command
 def check_model(arguments: Arguments) -> None:
     """Try out whether an environment can serve as a model of itself."""
-    parser = Parser("check-model", check_model)
+    parser = Parser(check_model)
     parser.add_argument("env_id", metavar="ENV_ID", help="as in gymnasium.make; MODULE:ID imports MODULE first")
     parser.add_argument(
         "--kwargs", metavar="JSON", type=json_object, default={}, help='for gymnasium.make, as {"is_slippery": false}'
@@ -243,13 +244,10 @@ def _add_trust(parser: Parser, when: str = "") -> None:
 
 def _mdp_name(text: str) -> str:
     """An argparse type: the name of an MDP, or the path of a file that ends in .npz."""
-    names = [name for name in STATIONARY_OPTIONS if not name.endswith(".npz")]
-    if text in names:
-        return text
     if not text.endswith(".npz"):
-        close = difflib.get_close_matches(text, names, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(STATIONARY_OPTIONS)}"
-        raise argparse.ArgumentTypeError(f"{text!r} is not an MDP; {hint}")
+        if text in STATIONARY_OPTIONS:
+            return text
+        raise argparse.ArgumentTypeError(f"{text!r} is not an MDP; {choice_of(text, STATIONARY_OPTIONS)}")
     if path_kind(text) != "file":
         raise argparse.ArgumentTypeError(f"{text!r} is not a file")
     return text

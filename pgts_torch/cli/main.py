@@ -1,12 +1,11 @@
 """Run a subcommand of `pgts`, and turn what happens into an exit code."""
 
 import argparse
-import difflib
 import importlib.metadata
 import sys
 from collections.abc import Callable
 
-from pgts_torch.cli.arguments import Parser
+from pgts_torch.cli.arguments import Parser, choice_of, summary
 from pgts_torch.cli.commands import COMMANDS, Arguments
 from pgts_torch.cli.terminal import plain_warnings, rank, safe_output
 from pgts_torch.errors import NotFinite, PgtsError, RankLost, Stopped
@@ -26,22 +25,18 @@ def main(arguments: Arguments | None = None) -> int:
     return exit_code(_run_command, sys.argv[1:] if arguments is None else arguments)
 
 
+@safe_output()
+@plain_warnings()
 def exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> int:
     """Run a command and return its exit code, as `main` says; mistakes and failures go to stderr, a line each."""
-    with safe_output(), plain_warnings():
-        return _exit_code(function, arguments)
-
-
-def _exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> int:
     try:
-        code = _dispatch(function, arguments)
+        code = _call(function, arguments)
         sys.stdout.flush()  # so that a broken pipe is noticed here, not while the interpreter shuts down
         return code
     except PgtsError as error:
-        own = rank()
-        if own == (error.rank or 0):  # an error that all processes raise is printed by the first
+        if rank() == (error.rank or 0):  # an error that all processes raise is printed by the first
             for line in str(error).splitlines():
-                print(f"error: {f'[rank {own}] ' if own else ''}{line}", file=sys.stderr)
+                print(f"error: {f'[rank {rank()}] ' if rank() else ''}{line}", file=sys.stderr)
         return TRAINING_FAILED if isinstance(error, NotFinite | RankLost) else USAGE_ERROR
     except BrokenPipeError:
         return BROKEN_PIPE
@@ -54,7 +49,7 @@ def _exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> i
         return INTERRUPTED
 
 
-def _dispatch(function: Callable[[Arguments], None], arguments: Arguments) -> int:
+def _call(function: Callable[[Arguments], None], arguments: Arguments) -> int:
     """Run a command and return its exit code; argparse raises SystemExit after --help."""
     try:
         function(arguments)
@@ -65,9 +60,9 @@ def _dispatch(function: Callable[[Arguments], None], arguments: Arguments) -> in
 
 def _run_command(arguments: Arguments) -> None:
     """Call the function of a subcommand with the arguments after it."""
-    summaries = [f"  {name:<12}{(function.__doc__ or '').partition(chr(10))[0]}" for name, function in COMMANDS.items()]
-    parser = Parser("", main, usage="pgts [-h] [--version] COMMAND ...")
-    parser.description = "Policy gradient with tree search."
+    summaries = [f"  {name:<12}{summary(function)}" for name, function in COMMANDS.items()]
+    usage = "pgts [-h] [--version] COMMAND ..."
+    parser = Parser(main, prog="pgts", usage=usage, description="Policy gradient with tree search.")
     parser.epilog = "\n".join(["commands:", *summaries, "", "pgts COMMAND --help explains each."])
     parser.add_argument("--version", action="store_true", help="print the version and stop")
     parser.add_argument("command", metavar="COMMAND", nargs="?", help="what to do")
@@ -80,8 +75,6 @@ def _run_command(arguments: Arguments) -> None:
     elif given.command == "figures":
         parser.error("'figures' is no longer a command of pgts; run python -m study in a checkout of the repository")
     elif given.command not in COMMANDS:
-        close = difflib.get_close_matches(given.command, COMMANDS, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(COMMANDS)}"
-        parser.error(f"{given.command!r} is not a command; {hint}")
+        parser.error(f"{given.command!r} is not a command; {choice_of(given.command, COMMANDS)}")
     else:
         COMMANDS[given.command](given.arguments)

@@ -1,6 +1,6 @@
 """Load a `Config` from a file and command-line overrides, and report all mistakes at once."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,11 +9,11 @@ from pydantic import ValidationError
 
 from pgts_torch import files
 from pgts_torch.config import strict_yaml
-from pgts_torch.config.config import Config, with_types
-from pgts_torch.config.strict_yaml import Document, YamlMistake
+from pgts_torch.config.config import Config
+from pgts_torch.config.strict_yaml import Document, Place, YamlMistake
 from pgts_torch.errors import PgtsError
-from pgts_torch.options.mistakes import Mistake, escape, explain, quote, schema_of, show, what
-from pgts_torch.options.schema import KeyPath, Node, Schema, is_nullable, is_text
+from pgts_torch.options.mistakes import escape, explain, quote, show, what
+from pgts_torch.options.schema import KeyPath, Node, is_nullable, is_text, schema_of
 
 MAX_BYTES = 2**15
 """A larger configuration file is refused."""
@@ -41,144 +41,136 @@ def load(path: str | Path | None = None, arguments: Sequence[str] = ()) -> Confi
     Raises:
         ConfigError: with every mistake in the file and in the arguments.
     """
-    return _Loader().load(path, arguments)
+    given = _Given()
+    is_read = path is None or given.read_file(Path(path))
+    given.read_arguments(arguments)
+    config = given.validated(is_whole=is_read)
+    if given.mistakes or config is None:
+        raise ConfigError(given.lines())
+    return config
 
 
 @dataclass(frozen=True)
-class _Origin:
-    """The place where a value was given, its line if that is a file, and the text of a scalar as it was written."""
+class _Source:
+    """Where a value was given.
 
-    where: str
+    Args:
+        name: of the file with the line, or of the flag.
+        line: in the file; 0 for a flag.
+        text: a scalar as it was written.
+    """
+
+    name: str
     line: int = 0
     text: str | None = None
 
 
-@dataclass(frozen=True)
-class _Mistake:
-    message: str
-    origin: _Origin
-
-    def __str__(self) -> str:
-        return f"{self.origin.where}: {self.message}" if self.origin.where else self.message
-
-
 @dataclass
-class _Loader:
-    """Collects values with their origins, and mistakes."""
+class _Given:
+    """The values that were given so far, where each of them was, and the mistakes that were found.
 
-    schema: Schema = field(default_factory=lambda: schema_of(Config))
+    Args:
+        mistakes: (line in the file, or 0; message).
+    """
+
     data: dict[str, Any] = field(default_factory=dict)
-    origins: dict[KeyPath, _Origin] = field(default_factory=dict)
-    mistakes: list[_Mistake] = field(default_factory=list)
+    sources: dict[KeyPath, _Source] = field(default_factory=dict)
+    mistakes: list[tuple[int, str]] = field(default_factory=list)
 
-    def load(self, path: str | Path | None, arguments: Sequence[str]) -> Config:
-        file_is_read = path is None or self._read_file(Path(path))
-        for key, text in self._flags(arguments):
-            self._override(key, text)
-        self.data = with_types(self.data)
-        self.data = self.schema.with_tags(self.schema.root, self.data)
-        config = self._validate(file_is_read)
-        if self.mistakes or config is None:
-            raise ConfigError(self._lines())
-        return config
-
-    def _refuse(self, message: str, where: str, line: int | None = None) -> None:
-        self.mistakes.append(_Mistake(message, _Origin(f"{where}:{line}" if line else where, line or 0)))
-
-    def _lines(self) -> list[str]:
-        """The mistakes in the order of the file's lines, then those of the command line."""
-        in_order = sorted(self.mistakes, key=lambda mistake: (not mistake.origin.line, mistake.origin.line))
-        lines = list(dict.fromkeys(map(str, in_order)))
-        rest = len(lines) - MAX_MISTAKES
-        return lines if rest <= 0 else [*lines[:MAX_MISTAKES], f"and {rest} more"]
-
-    def _read_file(self, path: Path) -> bool:
-        """Whether the file could be read as YAML; what is in it goes to `data`."""
+    def read_file(self, path: Path) -> bool:
+        """Add the values in a file. Whether it could be read as YAML."""
         try:
             document = strict_yaml.parse(_read(path))
             self.data = _mapping(document.value)
         except YamlMistake as mistake:
-            self._refuse(mistake.reason, str(path), mistake.line)
+            where = f"{path}:{mistake.line}" if mistake.line else path
+            self.mistakes.append((mistake.line or 0, f"{where}: {mistake.reason}"))
             return False
-        for line, reason in document.mistakes:
-            self._refuse(reason, str(path), line)
-        for key, line in document.line.items():
-            self.origins[key] = _Origin(f"{path}:{line}", line, document.text.get(key))
+        self.mistakes += [(line, f"{path}:{line}: {reason}") for line, reason in document.mistakes]
+        self.sources = {key: _Source(f"{path}:{at.line}", at.line, at.text) for key, at in document.places.items()}
         return True
 
-    def _flags(self, arguments: Sequence[str]) -> Iterator[tuple[str, str | None]]:
-        """(key, value) of each flag; a flag without a value has None."""
-        waiting: str | None = None
-        for argument in arguments:
-            is_flag = argument.startswith("--")
-            if waiting is not None:
-                yield waiting, None if is_flag else argument
-            elif not is_flag:
-                self._refuse(f"{quote(argument)} belongs to no option; write --KEY VALUE", "")
-            key, equals, text = argument.removeprefix("--").partition("=")
-            if is_flag and equals:
-                yield key, text
-            waiting = key if is_flag and not equals else None
-        if waiting is not None:
-            yield waiting, None
+    def read_arguments(self, arguments: Sequence[str]) -> None:
+        """Add the values of flags, `--KEY VALUE` or `--KEY=VALUE`."""
+        left = list(arguments)
+        while left:
+            flag = left.pop(0)
+            key, equals, text = flag.removeprefix("--").partition("=")
+            if not flag.startswith("--"):
+                self._report(f"{quote(flag)} belongs to no option; write --KEY VALUE")
+            elif equals:
+                self._read_flag(key, text)
+            else:
+                self._read_flag(key, left.pop(0) if left and not left[0].startswith("--") else None)
 
-    def _override(self, key: str, text: str | None) -> None:
-        path = tuple(key.split("."))
-        nodes = self.schema.find(path)
+    def _read_flag(self, key: str, text: str | None) -> None:
+        schema, path = schema_of(Config), tuple(key.split("."))
+        nodes = schema.find(path)
         if not all(path) or not nodes:
-            return self._refuse(f"--{escape(key)} is unknown{self.schema.hint(key, '--')}", "")
+            return self._report(f"--{escape(key)} is unknown{schema.hint(key, '--')}")
         if text is None and nodes[0].get("type") == "boolean":
             text = "true"
         if text is None:
-            return self._refuse(f"--{key} needs a value: {what(nodes[0])}", "")
+            return self._report(f"--{key} needs a value: {what(nodes[0])}")
         try:
-            document = _argument(text, nodes)
+            document = _value(text, nodes)
         except YamlMistake as mistake:
-            return self._refuse(f"{quote(text)}: {mistake.reason}", f"--{key}")
+            return self._report(f"--{key}: {quote(text)}: {mistake.reason}")
         for _, reason in document.mistakes:
-            self._refuse(reason, f"--{key}")
-        self._put(path, document)
+            self._report(f"--{key}: {reason}")
+        self._set(path, document)
 
-    def _put(self, path: KeyPath, document: Document) -> None:
-        """Set one key, and where it and what is below it come from."""
+    def _set(self, path: KeyPath, document: Document) -> None:
+        """Replace the value of one key, and where it and what is below it come from."""
         section: Any = self.data
         for part in path[:-1]:
             section = section.setdefault(part, {})
             if not isinstance(section, dict):
                 return  # the file has something else than a section here, which is reported by itself
         section[path[-1]] = document.value
-        where = f"--{'.'.join(path)}"
-        self.origins = {known: origin for known, origin in self.origins.items() if known[: len(path)] != path}
-        for key in ((), *document.line):
-            self.origins[(*path, *key)] = _Origin(where, text=document.text.get(key))
+        self.sources = {key: source for key, source in self.sources.items() if key[: len(path)] != path}
+        flag = f"--{'.'.join(path)}"
+        self.sources |= {path: _Source(flag)}
+        self.sources |= {(*path, *key): _Source(flag, text=at.text) for key, at in document.places.items()}
 
-    def _validate(self, file_is_read: bool) -> Config | None:
+    def validated(self, *, is_whole: bool) -> Config | None:
+        """Return the configuration; None after mistakes.
+
+        Args:
+            is_whole: whether all that the user gave is known; otherwise only single values can be refused.
+        """
         try:
             return Config.model_validate(self.data)
         except ValidationError as error:
-            for each in explain(Config, error, lambda key: self._origin(key).text):
-                depends_on_file = each.kind in ("conflict", "extra_forbidden")
-                if file_is_read or not depends_on_file:
-                    self.mistakes.append(self._located(each))
+            for mistake in explain(Config, error, lambda key: self._source(key).text):
+                if not is_whole and mistake.kind in ("conflict", "extra_forbidden"):
+                    continue
+                exact = [self.sources[key] for key in mistake.keys if key in self.sources]
+                source = exact[0] if exact else self._source(mistake.keys[0])
+                flag = f"--{'.'.join(mistake.keys[0])}"
+                if mistake.is_value and source.name == flag:
+                    self._report(f"--{mistake.message}")
+                else:
+                    self._report(f"{source.name}: {mistake.message}" if source.name else mistake.message, source.line)
         return None
 
-    def _located(self, mistake: Mistake) -> _Mistake:
-        """With the place where it was made."""
-        given = [self.origins[key] for key in mistake.keys if key in self.origins]
-        origin = given[0] if given else self._origin(mistake.keys[0])
-        if mistake.is_value and origin.where == f"--{'.'.join(mistake.keys[0])}":
-            return _Mistake(f"--{mistake.message}", _Origin(""))
-        return _Mistake(mistake.message, origin)
-
-    def _origin(self, path: KeyPath) -> _Origin:
-        """The origin of a key, or of what was given below it, or of the nearest section around it that was given."""
-        below = [origin for key, origin in self.origins.items() if key[: len(path)] == path]
-        if path and path not in self.origins and below:
+    def _source(self, path: KeyPath) -> _Source:
+        """Return where a key was given, or what is below it, or the nearest section around it."""
+        below = [source for key, source in self.sources.items() if key[: len(path)] == path]
+        if path and path not in self.sources and below:
             return below[0]
-        for end in range(len(path), -1, -1):
-            if path[:end] in self.origins:
-                return self.origins[path[:end]]
-        return _Origin("")
+        around = (self.sources.get(path[:end]) for end in range(len(path), -1, -1))
+        return next(filter(None, around), _Source(""))
+
+    def _report(self, message: str, line: int = 0) -> None:
+        self.mistakes.append((line, message))
+
+    def lines(self) -> list[str]:
+        """Return the mistakes in the order of the file's lines, then those of the command line."""
+        in_order = sorted(self.mistakes, key=lambda mistake: (not mistake[0], mistake[0]))
+        lines = list(dict.fromkeys(message for _, message in in_order))
+        rest = len(lines) - MAX_MISTAKES
+        return lines if rest <= 0 else [*lines[:MAX_MISTAKES], f"and {rest} more"]
 
 
 def _read(path: Path) -> str:
@@ -195,16 +187,15 @@ def _read(path: Path) -> str:
 
 
 def _mapping(value: Any) -> dict[str, Any]:
-    if value is None:
-        raise YamlMistake("the configuration is empty; it must be a mapping of keys to values", None)
-    if not isinstance(value, dict):
-        raise YamlMistake(f"the configuration is {show(value)}; it must be a mapping of keys to values", None)
-    return value
+    if isinstance(value, dict):
+        return value
+    given = "empty" if value is None else show(value)
+    raise YamlMistake(f"the configuration is {given}; it must be a mapping of keys to values", None)
 
 
-def _argument(text: str, nodes: Sequence[Node]) -> Document:
-    """The value of a flag: text where the key asks for text, else YAML."""
-    if all(is_text(node) for node in nodes):
-        is_null = text == "null" and all(is_nullable(node) for node in nodes)
-        return Document(None if is_null else text, text={(): text})
-    return strict_yaml.parse(text) if text else Document(None, text={(): ""})
+def _value(text: str, nodes: Sequence[Node]) -> Document:
+    """Return the value of a flag: text where the key asks for text, else YAML."""
+    if not all(is_text(node) for node in nodes):
+        return strict_yaml.parse(text) if text else Document(None, {(): Place(1, "")})
+    is_null = text == "null" and all(is_nullable(node) for node in nodes)
+    return Document(None if is_null else text, {(): Place(1, text)})

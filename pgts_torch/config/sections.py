@@ -1,12 +1,31 @@
-"""The sections of a configuration about logging, evaluation and the run folder."""
+"""The options of a run beside those of its training."""
 
 import json
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
-from pgts_torch.options.fields import Count, Folder, Natural, conflict
+from pgts_torch.options.fields import Count, Device, Folder, Name, Natural, conflict
 from pgts_torch.options.part import Part
+
+
+class General(Part):
+    """Options of the whole run."""
+
+    name: Name = "run"
+    """The beginning of the name of the run's folder."""
+
+    seed: Natural = 0
+    """The seed of all random numbers."""
+
+    total_steps: Count = 50_000
+    """Environment steps to train for."""
+
+    device: Device = "cpu"
+    """The device of policy, critic and model."""
+
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1
+    """The number of threads of torch."""
 
 
 class LogConfig(Part):
@@ -43,14 +62,8 @@ class EvalConfig(Part):
     @classmethod
     def _only_during_training(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and value is not False and info.data.get("every", 1) is None:
-            name = str(info.field_name)
-            raise conflict(
-                "eval.{name} is {value}, which needs evaluations during training; eval.every is null",
-                f"eval.{name}",
-                "eval.every",
-                name=name,
-                value=json.dumps(value),
-            )
+            key = f"eval.{info.field_name}"
+            raise conflict(f"{key} is {json.dumps(value)}, which needs evaluations during training; eval.every is null")
         return value
 
 

@@ -6,9 +6,9 @@ needs none of them, and each can be misread or make parsing take for ever.
 
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -16,15 +16,12 @@ from ruamel.yaml.events import (
     AliasEvent,
     CollectionEndEvent,
     CollectionStartEvent,
-    DocumentEndEvent,
     DocumentStartEvent,
     Event,
-    MappingStartEvent,
     NodeEvent,
     ScalarEvent,
-    SequenceStartEvent,
 )
-from ruamel.yaml.nodes import ScalarNode
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 MAX_DEPTH = 32
 """The largest depth to which mappings and sequences may nest."""
@@ -44,20 +41,25 @@ class YamlMistake(Exception):
         self.reason, self.line = reason, line
 
 
+class Place(NamedTuple):
+    """The line of a key, counted from 1, and the text of its value as it was written; None: it is no scalar."""
+
+    line: int
+    text: str | None
+
+
 @dataclass(frozen=True)
 class Document:
     """One YAML document.
 
     Args:
         value: None, bool, int, float, str, and lists and dicts of them; the keys of dicts are text.
-        line: the line of each key, by its path; keys inside sequences are left out.
-        text: the text of each scalar as it was written, by its path.
+        places: of each key by its path, those within sequences left out; () is a document that is one scalar.
         mistakes: (line, reason) of each mistake after which the rest could still be read.
     """
 
     value: Any
-    line: Mapping[KeyPath, int] = field(default_factory=dict)
-    text: Mapping[KeyPath, str] = field(default_factory=dict)
+    places: Mapping[KeyPath, Place] = field(default_factory=dict)
     mistakes: tuple[tuple[int, str], ...] = ()
 
 
@@ -67,7 +69,20 @@ def parse(text: str) -> Document:
     Raises:
         YamlMistake: the text is not YAML, or uses features of YAML that are refused.
     """
-    return _Reader().document(text)
+    yaml = YAML(typ="safe", pure=True)
+    try:
+        _refuse(text, yaml.parse(text))
+        reader = _Reader(yaml)
+        node = yaml.compose(text)
+        value = None if node is None else reader.value(node, ())
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise YamlMistake(
+            f"this is not YAML: {_one_line(error.problem or error.context)}", mark and mark.line + 1
+        ) from None
+    except (YAMLError, ValueError, OverflowError, RecursionError) as error:
+        raise YamlMistake(f"this is not YAML: {_one_line(str(error))}", None) from None
+    return Document(value, reader.places, tuple(reader.mistakes))
 
 
 def dump(value: Any) -> str:
@@ -82,120 +97,87 @@ def dump(value: Any) -> str:
     return stream.getvalue()
 
 
+def _refuse(text: str, events: Iterable[Event]) -> None:
+    """YamlMistake at the first feature of YAML that is refused.
+
+    The parser makes its events without recursion and expands no aliases, so that neither deep nesting nor a bomb of
+    aliases gets further.
+    """
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.startswith("%"):
+            raise YamlMistake("directives (%) are not allowed; the text is read as YAML 1.2", number)
+    if nested := _DEEP.search(text):
+        raise YamlMistake(_TOO_DEEP, 1 + text.count("\n", 0, nested.end()))
+    documents = depth = 0
+    for event in events:
+        line = event.start_mark.line + 1
+        documents += isinstance(event, DocumentStartEvent)
+        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        if documents > 1:
+            raise YamlMistake("a second document starts here; only one is allowed", line)
+        if depth > MAX_DEPTH:
+            raise YamlMistake(_TOO_DEEP, line)
+        if isinstance(event, AliasEvent) or (isinstance(event, NodeEvent) and event.anchor is not None):
+            raise YamlMistake("anchors (&) and aliases (*) are not allowed; write the value out", line)
+        if isinstance(event, ScalarEvent | CollectionStartEvent) and event.tag is not None:
+            raise YamlMistake(f"tags are not allowed, here {_one_line(event.tag)}; write plain values", line)
+        if isinstance(event, ScalarEvent) and any("\ud800" <= character <= "\udfff" for character in event.value):
+            raise YamlMistake("text holds half of a surrogate pair, which is no character", line)
+
+
 class _Reader:
-    """Builds a document from the parser's events, which expand no aliases and are made without recursion."""
+    """Makes plain values of nodes, and remembers their places."""
 
-    def __init__(self) -> None:
-        self._yaml = YAML(typ="safe", pure=True)
-        self._line: dict[KeyPath, int] = {}
-        self._text: dict[KeyPath, str] = {}
-        self._mistakes: list[tuple[int, str]] = []
+    def __init__(self, yaml: YAML) -> None:
+        self._constructor = yaml.constructor
+        self.places: dict[KeyPath, Place] = {}
+        self.mistakes: list[tuple[int, str]] = []
 
-    def document(self, text: str) -> Document:
-        try:
-            value = self._documents(self._events(text))
-        except MarkedYAMLError as error:
-            mark = error.problem_mark or error.context_mark
-            raise YamlMistake(
-                f"this is not YAML: {_one_line(error.problem or error.context)}", mark and mark.line + 1
-            ) from None
-        except (YAMLError, ValueError, OverflowError, RecursionError) as error:
-            raise YamlMistake(f"this is not YAML: {_one_line(str(error))}", None) from None
-        return Document(value, self._line, self._text, tuple(self._mistakes))
+    def value(self, node: Node, path: KeyPath | None) -> Any:
+        """Return the value of a node. `path` is None within sequences."""
+        if isinstance(node, SequenceNode):
+            return [self.value(item, None) for item in node.value]
+        if isinstance(node, MappingNode):
+            return self._mapping(node, path)
+        assert isinstance(node, ScalarNode)
+        if path == ():
+            self.places[path] = Place(_line(node), node.value)
+        return self._scalar(node)
 
-    def _events(self, text: str) -> Iterator[Event]:
-        """Yield the parser's events; YamlMistake at the first feature of YAML that is refused."""
-        for number, line in enumerate(text.splitlines(), start=1):
-            if line.startswith("%"):
-                raise YamlMistake("directives (%) are not allowed; the text is read as YAML 1.2", number)
-        if nested := _DEEP.search(text):
-            raise YamlMistake(_TOO_DEEP, 1 + text.count("\n", 0, nested.end()))
-        for event in self._yaml.parse(text):
-            if isinstance(event, AliasEvent) or (isinstance(event, NodeEvent) and event.anchor is not None):
-                raise YamlMistake("anchors (&) and aliases (*) are not allowed; write the value out", _line_of(event))
-            if isinstance(event, ScalarEvent | CollectionStartEvent) and event.tag is not None:
-                raise YamlMistake(
-                    f"tags are not allowed, here {_one_line(event.tag)}; write plain values", _line_of(event)
-                )
-            if isinstance(event, ScalarEvent) and not _is_unicode(event.value):
-                raise YamlMistake("text holds half of a surrogate pair, which is no character", _line_of(event))
-            yield event
-
-    def _documents(self, events: Iterator[Event]) -> Any:
-        value, count = None, 0
-        for event in events:
-            if isinstance(event, DocumentStartEvent):
-                count += 1
-                if count > 1:
-                    raise YamlMistake("a second document starts here; only one is allowed", _line_of(event))
-            elif isinstance(event, NodeEvent):
-                value = self._value(event, events, (), 0)
-            else:
-                assert not isinstance(event, CollectionEndEvent | DocumentEndEvent) or count == 1
-        return value
-
-    def _value(self, event: Event, events: Iterator[Event], path: KeyPath | None, depth: int) -> Any:
-        """Return the value that starts with `event`. `path` is None inside sequences."""
-        if isinstance(event, ScalarEvent):
-            if path is not None:
-                self._text[path] = event.value
-            return self._scalar(event)
-        if depth == MAX_DEPTH:
-            raise YamlMistake(_TOO_DEEP, _line_of(event))
-        if isinstance(event, SequenceStartEvent):
-            return [self._value(item, events, None, depth + 1) for item in _until_end(events)]
-        assert isinstance(event, MappingStartEvent)
-        return self._mapping(events, path, depth)
-
-    def _mapping(self, events: Iterator[Event], path: KeyPath | None, depth: int) -> dict[str, Any]:
+    def _mapping(self, node: MappingNode, path: KeyPath | None) -> dict[str, Any]:
         mapping: dict[str, Any] = {}
-        for key_event in _until_end(events):
-            if not isinstance(key_event, ScalarEvent):
-                raise YamlMistake("a key must be a word, not a mapping or a sequence", _line_of(key_event))
-            key, line = key_event.value, _line_of(key_event)
+        for key_node, child in node.value:
+            key, line = key_node.value, _line(key_node)
+            if not isinstance(key_node, ScalarNode):
+                raise YamlMistake("a key must be a word, not a mapping or a sequence", line)
             if key in mapping:
-                self._mistakes.append((line, f"the key {'.'.join((*(path or ()), key))} is given twice"))
-                self._value(next(events), events, None, depth + 1)
+                self.mistakes.append((line, f"the key {'.'.join((*(path or ()), key))} is given twice"))
                 continue
-            child = None if path is None else (*path, key)
-            if child is not None:
-                self._line[child] = line
-            mapping[key] = self._value(next(events), events, child, depth + 1)
+            below = None if path is None else (*path, key)
+            if below is not None:
+                self.places[below] = Place(line, child.value if isinstance(child, ScalarNode) else None)
+            mapping[key] = self.value(child, below)
         return mapping
 
-    def _scalar(self, event: ScalarEvent) -> Any:
+    def _scalar(self, node: ScalarNode) -> Any:
         """Return None, bool, int or float by the rules of YAML 1.2, else the text; dates stay text."""
-        tag = str(self._yaml.resolver.resolve(ScalarNode, event.value, event.implicit)).rpartition(":")[2]
-        node = ScalarNode(tag, event.value)
         try:
-            match tag:
+            match str(node.tag).rpartition(":")[2]:
                 case "null":
                     return None
                 case "bool":
-                    return event.value.lower() == "true"
+                    return node.value.lower() == "true"
                 case "int":
-                    return self._yaml.constructor.construct_yaml_int(node)
+                    return self._constructor.construct_yaml_int(node)
                 case "float":
-                    return self._yaml.constructor.construct_yaml_float(node)
+                    return self._constructor.construct_yaml_float(node)
         except ValueError:
-            raise YamlMistake(f"a number cannot be read: {_one_line(event.value)}", _line_of(event)) from None
-        return event.value
+            raise YamlMistake(f"a number cannot be read: {_one_line(node.value)}", _line(node)) from None
+        return node.value
 
 
-def _until_end(events: Iterator[Event]) -> Iterator[Event]:
-    """Yield the events up to the end of the current collection."""
-    for event in events:
-        if isinstance(event, CollectionEndEvent):
-            return
-        yield event
-
-
-def _is_unicode(text: str) -> bool:
-    return not any("\ud800" <= character <= "\udfff" for character in text)
-
-
-def _line_of(event: Event) -> int:
-    return event.start_mark.line + 1
+def _line(node: Node) -> int:
+    return node.start_mark.line + 1
 
 
 def _one_line(text: str, length: int = 60) -> str:

@@ -19,8 +19,8 @@ from pgts_torch.errors import PgtsError
 HARDLY = 0.05
 """A policy whose total variation distance from the initial one is smaller has hardly moved."""
 
-RESTLESS = 0.05
-"""A policy that still moves by a larger total variation distance per iteration at the end has not come to rest."""
+UNSTEADY = 0.05
+"""A policy that still moves by a larger total variation distance per iteration at the end has not converged."""
 
 LARGE = 0.1
 """An optimality gap is large if it is more than this share of max_a q - min_a q."""
@@ -50,7 +50,7 @@ class Movement:
         Of tabular policies only, where it costs next to nothing.
         """
         if isinstance(algorithm.policy, TabularPolicy):
-            moved = self._distance(algorithm, iteration, iteration.pi_NA)
+            moved = _distance(algorithm, iteration, iteration.pi_NA)
             self.pace = moved if self.pace is None else _DECAY * self.pace + (1 - _DECAY) * moved
 
     def measure(self, algorithm: PGTS, iteration: Iteration) -> None:
@@ -58,21 +58,11 @@ class Movement:
 
         moved = mean of 1/2 sum_a |pi - pi_first|, in [0, 1];   gap_share = mean g_m / mean (max_a q - min_a q)
         """
-        share_N = _shares(iteration)
-        first_NA = self.first.probs(iteration.observation_N)
-        self.moved = self._distance(algorithm, iteration, first_NA)
+        self.moved = _distance(algorithm, iteration, self.first.probs(iteration.observation_N))
         self.gap_share = None
         if iteration.look is not None:
-            span = float(span_of(iteration.look.q_BA) @ share_N.to(iteration.look.q_BA.dtype))
-            gap = float(iteration.gap_N @ share_N.to(iteration.gap_N.dtype))
+            span, gap = _mean(iteration, span_of(iteration.look.q_BA)), _mean(iteration, iteration.gap_N)
             self.gap_share = gap / span if 0 < span < math.inf else None
-
-    @staticmethod
-    def _distance(algorithm: PGTS, iteration: Iteration, other_NA: Tensor) -> float:
-        """Mean total variation distance between the policy and another one at the states of an iteration."""
-        probs_NA = algorithm.policy.probs(iteration.observation_N)
-        share_N = _shares(iteration)
-        return float((probs_NA - other_NA).abs().sum(-1).to(share_N.dtype) @ share_N) / 2
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -86,9 +76,16 @@ class Movement:
         self.moved, self.gap_share, self.pace = state["moved"], state["gap_share"], state["pace"]
 
 
-def _shares(iteration: Iteration) -> Float[Tensor, "N"]:
-    """The weights of the states, normalised to sum 1."""
-    return iteration.weight_N / iteration.weight_N.sum()
+def _distance(algorithm: PGTS, iteration: Iteration, other_NA: Tensor) -> float:
+    """Return the mean total variation distance between the policy and another one."""
+    probs_NA = algorithm.policy.probs(iteration.observation_N)
+    return _mean(iteration, (probs_NA - other_NA).abs().sum(-1)) / 2
+
+
+def _mean(iteration: Iteration, value_N: Tensor) -> float:
+    """Return the mean over the states of an iteration, by their weights in the update."""
+    share_N = iteration.weight_N / iteration.weight_N.sum()
+    return float(value_N.to(share_N.dtype) @ share_N)
 
 
 def span_of(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
@@ -97,7 +94,7 @@ def span_of(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
     return q_NA.amax(-1) - least_NA.amin(-1)
 
 
-def hardly_moved(
+def learned_little(
     movement: Movement,
     update: Update,
     *,
@@ -105,7 +102,7 @@ def hardly_moved(
     missing_share: float | None,
     stationary_share: float | None,
 ) -> str | None:
-    """Advice where the policy hardly moved though its optimality gap is large; else None.
+    """Advice where the optimality gap is large though the policy hardly moved, or still moves at the end; else None.
 
     Args:
         depth: m, the largest of the run.
@@ -113,37 +110,32 @@ def hardly_moved(
             used instead.
         stationary_share: the largest exact g_m in the same unit, where the truth is known.
     """
-    if movement.moved is None or movement.moved >= HARDLY:
-        return None
     share = movement.gap_share if missing_share is None else missing_share
     if share is None or share <= LARGE:
         return None
-    told = f"the policy hardly moved: {movement.moved:.1%} of its probability is elsewhere than at the start, and " + (
-        f"a lookahead of depth {depth} still sees better actions" if missing_share is None else "J is far from J*"
-    )
-    if stationary_share is not None and stationary_share <= LARGE * share:
-        return f"{told}. Such a lookahead sees nothing better: set a deeper one, search.depth above {depth}"
-    return f"{told}. Set {_longer_steps(update)}, more total_steps, or a deeper lookahead, search.depth above {depth}"
-
-
-def not_converged(movement: Movement, update: Update, *, missing_share: float | None) -> str | None:
-    """Advice where a tabular policy still moves at the end though its optimality gap is large; else None.
-
-    It may cycle for ever, because its steps do not shrink, or need more steps.
-
-    Args:
-        missing_share: as in `stuck`.
-    """
-    share = movement.gap_share if missing_share is None else missing_share
-    if movement.pace is None or movement.pace < RESTLESS or share is None or share <= LARGE:
-        return None
-    smaller = ""
-    if isinstance(update, TabularUpdate):
-        smaller = f", or with a smaller update.step_size than {update.step_size:g}"
-    return (
-        f"the policy has not come to rest: the last iterations moved {movement.pace:.0%} of its probability each, and "
-        f"much is missing. Train for more total_steps; if J goes up and down, with more rollout.num_envs{smaller}"
-    )
+    if movement.moved is not None and movement.moved < HARDLY:
+        moved = f"the policy hardly moved: {movement.moved:.1%} of its probability is elsewhere than at the start, and"
+        if stationary_share is not None and stationary_share <= LARGE * share:
+            return (
+                f"{moved} J is far from J*. A lookahead of depth {depth} finds no better actions: set a deeper one, "
+                f"search.depth above {depth}"
+            )
+        seen = (
+            f"a lookahead of depth {depth} still finds better actions" if missing_share is None else "J is far from J*"
+        )
+        return (
+            f"{moved} {seen}. Set {_longer_steps(update)}, more total_steps, or a deeper lookahead, search.depth above "
+            f"{depth}"
+        )
+    if movement.pace is not None and movement.pace >= UNSTEADY:
+        step_size = update.step_size if isinstance(update, TabularUpdate) else None
+        smaller = "" if step_size is None else f", or with a smaller update.step_size than {step_size:g}"
+        return (
+            f"the policy has not converged: the last iterations moved {movement.pace:.0%} of its probability each, and "
+            "the optimality gap is large. Train for more total_steps; if J goes up and down, with more "
+            f"rollout.num_envs{smaller}"
+        )
+    return None
 
 
 def _longer_steps(update: Update) -> str:
@@ -153,12 +145,12 @@ def _longer_steps(update: Update) -> str:
     return f"{rate}, a smaller update.temperature" if isinstance(update, TargetUpdate) else rate
 
 
-def greedy_is_worse(greedy: Evaluation, drawn: Evaluation) -> str | None:
+def greedy_is_worse(greedy: Evaluation, sampled: Evaluation) -> str | None:
     """Advice where greedy episodes return less than sampled ones, beyond both confidence intervals; else None."""
-    one, other = greedy.episodic_return, drawn.episodic_return
+    one, other = greedy.episodic_return, sampled.episodic_return
     if one.half_width is None or other.half_width is None or one.mean + one.half_width >= other.mean - other.half_width:
         return None
     return (
-        "the most probable actions are worse than drawn ones, beyond the confidence intervals: act by drawn actions, "
-        "predict(..., deterministic=False), or train on until they agree"
+        "the most probable actions are worse than sampled ones, beyond the confidence intervals: act by sampled "
+        "actions, predict(..., deterministic=False), or train on until they agree"
     )

@@ -25,7 +25,7 @@ from pgts_torch.config import Config
 from pgts_torch.config.sections import EvalConfig
 from pgts_torch.errors import Failed, ModelMismatch, NotFinite, PgtsError, Stopped, check_count, failure
 from pgts_torch.experiment import checkpoint, diagnostics
-from pgts_torch.experiment.advice import Movement, greedy_is_worse, hardly_moved, not_converged, span_of
+from pgts_torch.experiment.advice import Movement, greedy_is_worse, learned_little, span_of
 from pgts_torch.experiment.checkpoint import Notes
 from pgts_torch.experiment.evaluate import KINDS
 from pgts_torch.experiment.locking import RunLock
@@ -337,16 +337,19 @@ class _Recorder:
         )
 
     def _advice(self, exactly: Mapping[str, float | None]) -> list[str]:
-        """Advice that the policy hardly moved or has not come to rest, where that is so."""
+        """Advice that the policy hardly moved or has not converged, where that is so."""
         missing = stationary_gap = None
         if self.truth is not None:
             span = float(span_of(self.truth.optimum.q_SA.reshape(1, -1)))
             J, best, gap = (exactly[name] or 0.0 for name in ("J", "J_optimal", "stationarity_gap"))
             missing, stationary_gap = ((best - J) / span, gap / span) if span > 0 else (0.0, 0.0)
-        movement, update = self.movement, self.algorithm.update
-        advice = hardly_moved(
-            movement, update, depth=self._deepest, missing_share=missing, stationary_share=stationary_gap
-        ) or not_converged(movement, update, missing_share=missing)
+        advice = learned_little(
+            self.movement,
+            self.algorithm.update,
+            depth=self._deepest,
+            missing_share=missing,
+            stationary_share=stationary_gap,
+        )
         return [] if advice is None else [advice]
 
 

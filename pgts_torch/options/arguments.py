@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.options.mistakes import explain, schema_of
+from pgts_torch.options.mistakes import explain
 from pgts_torch.options.part import Part
 from pgts_torch.options.rollouts import Rollouts
 from pgts_torch.options.search import Depth
@@ -35,11 +35,11 @@ def read(arguments: Mapping[str, Any]) -> Training:
         section: {name: flat[name] for name in names if name in flat} for section, names in _FLAT.items()
     }
     parts = {name: getattr(arguments[name], "options", arguments[name]) for name in _PARTS}
-    data |= {name: value for name, value in parts.items() if value is not None}
-    schema = schema_of(Training)
-    search = schema.with_tags(schema.fields(schema.root)["search"], _plain(arguments["search"]), words=True)
-    data["search"] |= search if isinstance(search, dict) else {"kind": search}
-    return checked(schema.with_tags(schema.root, data, words=True))
+    data |= {name: _with_never(value) for name, value in parts.items() if value is not None}
+    search = arguments["search"]
+    search = search.plain() if isinstance(search, Part) else search if isinstance(search, Mapping) else {"kind": search}
+    data["search"] |= {"kind" if name == "type" else name: value for name, value in search.items()}
+    return checked(data)
 
 
 def checked(options: Mapping[str, Any]) -> Training:
@@ -59,5 +59,8 @@ def described(options: Training) -> dict[str, Any]:
     return flat | {name: plain[name] for name in _PARTS} | {"search": kind, "horizon": plain["rollout"]["horizon"]}
 
 
-def _plain(value: Any) -> Any:
-    return value.plain() if isinstance(value, Part) else value
+def _with_never(value: Any) -> Any:
+    """Return a part with None replaced by never, where a plain mapping says so of a clip."""
+    if not isinstance(value, Mapping):
+        return value
+    return {key: "never" if item is None and key in ("floor", "max_grad_norm") else item for key, item in value.items()}

@@ -155,12 +155,7 @@ class NetworkValues(Values):
         if value and (polyak < 1 or period > 1):
             raise conflict(
                 "critic.fresh_targets is true, but there is a target network, which lags behind: critic.polyak is "
-                "{polyak} and critic.target_period {period}; take the one or the other",
-                "critic.fresh_targets",
-                "critic.polyak",
-                "critic.target_period",
-                polyak=str(polyak),
-                period=str(period),
+                f"{polyak} and critic.target_period {period}; take the one or the other"
             )
         return value
 

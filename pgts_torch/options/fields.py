@@ -1,6 +1,7 @@
 """The types of options: values with their ranges."""
 
 import math
+import re
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
@@ -56,23 +57,15 @@ RESERVED_KWARGS = {
 def _check_kwargs(kwargs: dict[str, Any]) -> dict[str, Any]:
     for name in kwargs:
         if not name.isidentifier():
-            raise conflict(
-                "env.kwargs has the key {key}, which cannot be the name of an argument",
-                f"env.kwargs.{name}",
-                key=repr(name),
-            )
+            reason = f"env.kwargs has the key {name!r}, which cannot be the name of an argument"
+            raise conflict(reason, f"env.kwargs.{name}")
         if name in RESERVED_KWARGS:
-            raise conflict(
-                "env.kwargs must not have the key {key}: {why}",
-                f"env.kwargs.{name}",
-                key=name,
-                why=RESERVED_KWARGS[name],
-            )
+            raise conflict(f"env.kwargs must not have the key {name}: {RESERVED_KWARGS[name]}", f"env.kwargs.{name}")
     for value in _plain_values(kwargs):
         if isinstance(value, float) and not math.isfinite(value):
-            raise conflict("env.kwargs holds {value}; numbers must be finite", value=str(value))
+            raise conflict(f"env.kwargs holds {value}; numbers must be finite")
         if not (value is None or isinstance(value, bool | int | float | str)):
-            raise conflict("env.kwargs holds {value}; values must be plain", value=repr(value))
+            raise conflict(f"env.kwargs holds {value!r}; values must be plain")
     return kwargs
 
 
@@ -84,9 +77,14 @@ def _plain_values(value: Any) -> Iterator[Any]:
         yield value
 
 
-def conflict(reason: str, *keys: str, **values: str) -> PydanticCustomError:
-    """An error whose message is a whole sentence; `keys` are the dotted keys that can be changed to solve it."""
-    return PydanticCustomError("conflict", "{reason}", {"reason": reason.format(**values), "keys": keys})
+def conflict(reason: str, *keys: str) -> PydanticCustomError:
+    """An error whose message is a whole sentence.
+
+    Args:
+        keys: the dotted keys that can be changed to solve it, the likeliest first; none: those in the sentence.
+    """
+    found = keys or re.findall(r"\b[a-z_]+(?:\.[a-z_]+)+", reason)
+    return PydanticCustomError("conflict", "{reason}", {"reason": reason, "keys": found})
 
 
 Kwargs = Annotated[dict[str, Any], AfterValidator(_check_kwargs)]
@@ -94,7 +92,7 @@ Kwargs = Annotated[dict[str, Any], AfterValidator(_check_kwargs)]
 
 def _check_ascending(pair: list[float]) -> list[float]:
     if pair[0] > pair[1]:
-        raise conflict("the lower number comes first; this is {value}", value=str(pair))
+        raise conflict(f"the lower number comes first; this is {pair}")
     return pair
 
 

@@ -1,6 +1,5 @@
 """Messages about invalid options."""
 
-import functools
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from pgts_torch.options.fields import INT64_MAX
-from pgts_torch.options.schema import KeyPath, Node, Place, Schema, is_text, requirement
+from pgts_torch.options.schema import KeyPath, Node, Schema, is_text, requirement, schema_of
 
 
 @dataclass(frozen=True)
@@ -30,11 +29,6 @@ class Mistake:
     is_value: bool = False
 
 
-@functools.cache
-def schema_of(model: type[BaseModel]) -> Schema:
-    return Schema(model)
-
-
 def explain(
     model: type[BaseModel],
     error: ValidationError,
@@ -46,44 +40,41 @@ def explain(
         written: returns the text of a scalar as it was written, where it was read from text.
     """
     for each in error.errors(include_url=False):
-        yield _Sentence(schema_of(model), written).of(each)
+        yield _mistake(schema_of(model), each, written)
 
 
-@dataclass(frozen=True)
-class _Sentence:
-    schema: Schema
-    written: Callable[[KeyPath], str | None]
+def _mistake(schema: Schema, error: ErrorDetails, written: Callable[[KeyPath], str | None]) -> Mistake:
+    path, node, section = schema.locate(error["loc"])
+    kind = error["type"]
+    if kind == "conflict":
+        keys = tuple(tuple(key.split(".")) for key in error["ctx"]["keys"])
+        return Mistake(error["ctx"]["reason"], kind, keys or (path,))
+    if node is None:
+        return Mistake(_unknown(schema, path, section), kind, (path,))
+    value, must = error["input"], what(node)
+    if kind == "union_tag_invalid":
+        tag = schema.tag(node)
+        path, must = (*path, tag), requirement(node)
+        value = value[tag] if isinstance(value, dict) else getattr(value, tag)
+    is_or_holds = "holds" if isinstance(error["loc"][-1], int) else "is"
+    sentence = f"{'.'.join(path)} {is_or_holds} {show(value, written(path))}; it must be {must}{_advice(node, value)}"
+    return Mistake(sentence, kind, (path,), is_value=True)
 
-    def of(self, error: ErrorDetails) -> Mistake:
-        place = self.schema.locate(error["loc"])
-        if error["type"] == "conflict":
-            keys = tuple(tuple(key.split(".")) for key in error["ctx"]["keys"]) or (place.path,)
-            return Mistake(error["ctx"]["reason"], "conflict", keys)
-        if place.node is None:
-            return Mistake(self._unknown(place), error["type"], (place.path,))
-        path, value = place.path, error["input"]
-        if error["type"] == "union_tag_invalid":
-            tag = self.schema.tag(place.node)
-            path, value = (*path, tag), value[tag] if isinstance(value, dict) else getattr(value, tag)
-        is_item = isinstance(error["loc"][-1], int)
-        must = what(place.node) if path == place.path else requirement(place.node)
-        shown = show(value, self.written(path))
-        sentence = f"{'.'.join(path)} {'holds' if is_item else 'is'} {shown}; it must be {must}"
-        return Mistake(sentence + _advice(place.node, value), error["type"], (path,), is_value=True)
 
-    def _unknown(self, place: Place) -> str:
-        key = ".".join(place.path)
-        if self.schema.find(place.path):
-            name, value = self.schema.tag_value(place.parent)
-            tag = ".".join((*place.path[:-1], name))
-            return f"{key} does not belong to {tag} {value}; it must be left out, or {tag} changed"
-        return f"{escape(key)} is unknown{self.schema.hint(key)}"
+def _unknown(schema: Schema, path: KeyPath, section: Node) -> str:
+    key = ".".join(path)
+    if not schema.find(path):
+        return f"{escape(key)} is unknown{schema.hint(key)}"
+    # Another variant has it. A variant is told by the one key that has a single value.
+    name, value = next((name, child["const"]) for name, child in section["properties"].items() if "const" in child)
+    tag = ".".join((*path[:-1], name))
+    return f"{key} does not belong to {tag} {value}; it must be left out, or {tag} changed"
 
 
 def what(node: Node) -> str:
     """Return what a value, or a section, must be, in words."""
     if "oneOf" in node:
-        return f"a mapping with the key {node['discriminator']['propertyName']} ({requirement(node)})"
+        return f"{requirement(node)}, or a mapping with such a {node['discriminator']['propertyName']}"
     return requirement(node)
 
 

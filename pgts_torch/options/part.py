@@ -1,8 +1,9 @@
 """The base class of all options."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.options.mistakes import explain
@@ -29,8 +30,6 @@ class Part(BaseModel):
     if not TYPE_CHECKING:  # type checkers see the fields
 
         def __init__(self, **options: Any) -> None:
-            if "lambda_" in options:  # because lambda is a keyword of Python
-                options["lambda"] = options.pop("lambda_")
             try:
                 super().__init__(**options)
             except ValidationError as error:
@@ -39,6 +38,22 @@ class Part(BaseModel):
 
         # Makes pydantic validate nested options at once, with the path of each mistake.
         __init__.__pydantic_base_init__ = True
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_shorthands(cls, data: Any) -> Any:
+        """Replace a word by a mapping with this type, and add a missing type, the default's."""
+        if not isinstance(data, Mapping):
+            return data
+        data = dict(data)
+        if "lambda_" in data and "lambda_" in cls.model_fields:  # because lambda is a keyword of Python
+            data["lambda"] = data.pop("lambda_")
+        for name, field in cls.model_fields.items():
+            tag, value = field.discriminator, data.get(name)
+            if isinstance(tag, str) and isinstance(value, str | Mapping):
+                given = {tag: value} if isinstance(value, str) else dict(value)
+                data[name] = {tag: getattr(field.default, tag)} | given
+        return data
 
     def plain(self) -> dict[str, Any]:
         """Return the options as plain values, without those that are null."""

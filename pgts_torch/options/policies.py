@@ -55,9 +55,7 @@ class Softmax(Part):
         if isinstance(init, Biased) and init.probability == 1:
             raise conflict(
                 "policy.init.probability is 1, which policy.type softmax cannot represent (infinite logits); "
-                "it must be below 1, or policy.type simplex",
-                "policy.init.probability",
-                "policy.type",
+                "it must be below 1, or policy.type simplex"
             )
         return init
 

@@ -4,10 +4,10 @@ All are read from the JSON schema of the pydantic model, so help and messages ag
 """
 
 import difflib
+import functools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 from pydantic import BaseModel
@@ -15,6 +15,8 @@ from pydantic import BaseModel
 from pgts_torch.options.fields import INT64_MAX
 
 Node = dict[str, Any]
+"""A JSON schema with its reference resolved."""
+
 KeyPath = tuple[str, ...]
 
 
@@ -28,7 +30,8 @@ class Option:
         default: its value where none is given.
         meaning: one sentence.
         choices: (value, meaning) for each value, where values have meanings.
-        when: the condition under which the key exists, for instance "critic.type tabular|rollout"; "" for always.
+        when: (key, values), for instance ("critic.type", ("tabular", "rollout")): the option exists only where each of
+            these keys has one of its values.
     """
 
     key: str
@@ -36,20 +39,15 @@ class Option:
     default: Any
     meaning: str
     choices: tuple[tuple[str, str], ...] = ()
-    when: str = ""
+    when: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
-
-@dataclass(frozen=True)
-class Place:
-    """The place of an error: its key, the node of that key (None: there is no such key) and the section around it."""
-
-    path: KeyPath
-    node: Node | None
-    parent: Node
+    def exists(self, values: Mapping[str, Any]) -> bool:
+        """Whether the option exists beside these values, by dotted keys."""
+        return all(values.get(key) in allowed for key, allowed in self.when)
 
 
 class Schema:
-    """The tree of keys of a model. A node is a JSON schema with its reference resolved."""
+    """The tree of keys of a model."""
 
     def __init__(self, model: type[BaseModel]) -> None:
         schema = model.model_json_schema(by_alias=True)
@@ -69,38 +67,6 @@ class Schema:
         """Return the key by which a node with variants chooses."""
         return node["discriminator"]["propertyName"]
 
-    def tag_value(self, variant: Node) -> tuple[str, str]:
-        """Return the tag of a variant and its value."""
-        return next((name, child["const"]) for name, child in variant["properties"].items() if "const" in child)
-
-    def with_tags(self, node: Node, data: Any, *, words: bool = False) -> Any:
-        """Return the data of a section, with the default's tag wherever a tag is missing.
-
-        Args:
-            words: also accept the shorthands of `PGTS`: a tag alone, as "ppo"; `type` for any tag; None for never.
-        """
-        variants = self.variants(node)
-        if words and variants and isinstance(data, str):
-            data = {self.tag(node): data}
-        if words and data is None and "never" in requirement(node).split():
-            return "never"
-        if not isinstance(data, Mapping):
-            return data
-        data = dict(data)
-        if variants:
-            tag = self.tag(node)
-            if words and "type" in data:
-                data[tag] = data.pop("type")
-            data.setdefault(tag, node["default"][tag])
-            node = variants.get(data[tag], {}) if isinstance(data[tag], str) else {}
-        fields = self.fields(node)
-        if words and "lambda" in fields and "lambda_" in data:
-            data["lambda"] = data.pop("lambda_")
-        return {
-            name: self.with_tags(fields[name], value, words=words) if name in fields else value
-            for name, value in data.items()
-        }
-
     def find(self, path: Sequence[str]) -> list[Node]:
         """Return the nodes of a path, one for each variant that has it. Below kwargs any path is valid, as node {}."""
         nodes = [self.root]
@@ -111,10 +77,14 @@ class Schema:
             nodes = [fields[part] for fields in map(self.fields, sections) if part in fields]
         return nodes
 
-    def locate(self, location: Sequence[str | int]) -> Place:
-        """Return the place of a pydantic error location, without the union tags and type names in it."""
+    def locate(self, location: Sequence[str | int]) -> tuple[KeyPath, Node | None, Node]:
+        """Find the place of a pydantic error, whose location also has union tags and type names.
+
+        Returns:
+            its key, the node of that key (None: there is no such key), and the section around it.
+        """
         path: KeyPath = ()
-        node = parent = self.root
+        node = section = self.root
         for part in location:
             if variants := self.variants(node):
                 node = variants[str(part)]
@@ -122,65 +92,57 @@ class Schema:
             fields = self.fields(node)
             if not fields:
                 break
-            path, parent = (*path, str(part)), node
+            path, section = (*path, str(part)), node
             if part not in fields:
-                return Place(path, None, parent)
+                return path, None, section
             node = fields[str(part)]
-        return Place(path, node, parent)
-
-    def options(self) -> list[Option]:
-        """Return all keys that have a value, in the order of the model."""
-        return list(self._options(self.root, ()))
-
-    def nearest(self, key: str) -> str | None:
-        """Return the key that was probably meant: one with the same last part, or with a similar spelling."""
-        same_end = [known for known in self._keys if known.rpartition(".")[2] == key.rpartition(".")[2]]
-        close = difflib.get_close_matches(key, same_end or self._keys, n=1, cutoff=0.0 if same_end else 0.7)
-        return close[0] if close else None
+        return path, node, section
 
     def hint(self, key: str, prefix: str = "") -> str:
-        """Return the end of the message about an unknown key."""
-        nearest = self.nearest(key)
-        return f"; did you mean {prefix}{nearest}?" if nearest else "; `pgts train --help` lists all keys"
+        """Return the end of the message about an unknown key, with the key that was probably meant: one with the same
+        last part, or with a similar spelling."""
+        same_end = [known for known in self._keys if known.rpartition(".")[2] == key.rpartition(".")[2]]
+        close = difflib.get_close_matches(key, same_end or self._keys, n=1, cutoff=0.0 if same_end else 0.7)
+        return f"; did you mean {prefix}{close[0]}?" if close else "; `pgts train --help` lists all keys"
 
-    @cached_property
+    @functools.cached_property
     def _keys(self) -> list[str]:
         """All dotted keys, also of sections."""
         parts = [option.key.split(".") for option in self.options()]
         return list(dict.fromkeys(".".join(part[:end]) for part in parts for end in range(1, len(part) + 1)))
 
+    def options(self) -> list[Option]:
+        """Return all keys that have a value, in the order of the model."""
+        return list(self._options(self.root, ()))
+
     def _options(self, section: Node, path: KeyPath) -> Iterator[Option]:
         for name, node in self.fields(section).items():
             child = (*path, name)
-            key = ".".join(child)
+            key, meaning = ".".join(child), _sentence(node)
             if variants := self.variants(node):
-                tag = f"{key}.{self.tag(node)}"
-                yield self._choice(node, tag, variants)
-                yield from self._options_of_variants(tag, variants, child)
+                tag = self.tag(node)
+                choices = tuple((value, _sentence(variant)) for value, variant in variants.items())
+                yield Option(f"{key}.{tag}", requirement(node), node["default"][tag], meaning, choices)
+                yield from self._options_of_variants(f"{key}.{tag}", variants, child)
             elif self.fields(node):
                 yield from self._options(node, child)
             else:
-                yield Option(key, requirement(node), node["default"], _sentence(node))
+                yield Option(key, requirement(node), node["default"], meaning)
 
-    def _options_of_variants(self, key: str, variants: dict[str, Node], path: KeyPath) -> list[Option]:
-        """Return the options of all variants, without duplicates, grouped by condition."""
+    def _options_of_variants(self, tag: str, variants: dict[str, Node], path: KeyPath) -> Iterator[Option]:
+        """Yield the options of all variants, without duplicates, grouped by condition."""
         distinct: dict[str, tuple[Option, list[str]]] = {}
-        for tag, variant in variants.items():
+        for value, variant in variants.items():
             for option in self._options(variant, path):
-                if option.key != key:
-                    distinct.setdefault(repr(option), (option, []))[1].append(tag)
-        options = [
-            replace(option, when=" and ".join(filter(None, [f"{key} {'|'.join(tags)}", option.when])))
-            if len(tags) < len(variants)
-            else option
-            for option, tags in distinct.values()
-        ]
-        first = {option.when: n for n, option in reversed(list(enumerate(options)))}
-        return sorted(options, key=lambda option: first[option.when])
-
-    def _choice(self, node: Node, key: str, variants: dict[str, Node]) -> Option:
-        choices = tuple((tag, _sentence(variant)) for tag, variant in variants.items())
-        return Option(key, requirement(node), node["default"][self.tag(node)], _sentence(node), choices)
+                if option.key != tag:
+                    distinct.setdefault(repr(option), (option, []))[1].append(value)
+        groups: dict[Any, list[Option]] = {}
+        for option, values in distinct.values():
+            condition = ((tag, tuple(values)),) if len(values) < len(variants) else ()
+            option = replace(option, when=condition + option.when)
+            groups.setdefault(option.when, []).append(option)
+        for group in groups.values():
+            yield from group
 
     def _follow(self, node: Node) -> Node:
         """Return the node with its reference resolved; keys beside the reference have precedence."""
@@ -190,6 +152,11 @@ class Schema:
         return self._definitions[inner["$ref"].rpartition("/")[2]] | {
             name: value for name, value in node.items() if name not in ("$ref", "allOf")
         }
+
+
+@functools.cache
+def schema_of(model: type[BaseModel]) -> Schema:
+    return Schema(model)
 
 
 def requirement(node: Node) -> str:

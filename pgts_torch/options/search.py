@@ -91,24 +91,14 @@ class MCTS(Budget):
     @classmethod
     def _has_exploration(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("rule") == "gumbel":
-            raise conflict(
-                "search.exploration is {value}; search.rule gumbel has none, it must be puct or uct",
-                "search.exploration",
-                "search.rule",
-                value=str(value),
-            )
+            raise conflict(f"search.exploration is {value}; search.rule gumbel has none, it must be puct or uct")
         return value
 
     @field_validator("prior")
     @classmethod
     def _is_used(cls, value: Any, info: ValidationInfo) -> Any:
         if value == "policy" and (info.data.get("root"), info.data.get("rule")) == ("rule", "uct"):
-            raise conflict(
-                "search.prior is policy, which search.rule uct with search.root rule does not use",
-                "search.prior",
-                "search.rule",
-                "search.root",
-            )
+            raise conflict("search.prior is policy, which search.rule uct with search.root rule does not use")
         return value
 
     @field_validator("merge")
@@ -117,9 +107,7 @@ class MCTS(Budget):
         if value and info.data.get("backup") == "mean":
             raise conflict(
                 "search.merge is true, which needs search.backup max: a node that several paths share has no return of "
-                "its own",
-                "search.merge",
-                "search.backup",
+                "its own"
             )
         return value
 
@@ -163,14 +151,8 @@ class Depth(Part):
     @classmethod
     def _only_adaptive(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("depth", "adaptive") != "adaptive":
-            raise conflict(
-                "search.{name} is {value}, which only search.depth adaptive uses; search.depth is {depth}",
-                f"search.{info.field_name}",
-                "search.depth",
-                name=str(info.field_name),
-                value=str(value),
-                depth=str(info.data["depth"]),
-            )
+            name, depth = info.field_name, info.data["depth"]
+            raise conflict(f"search.{name} is {value}, which only search.depth adaptive uses; search.depth is {depth}")
         return value
 
 

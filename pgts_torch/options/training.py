@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues, TabularValues
+from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues
 from pgts_torch.options.fields import Ascending, EnvId, Key, Kwargs, UnitInterval, conflict
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, Network, Simplex, Softmax, Table
@@ -60,51 +60,36 @@ class Training(Part):
     @field_validator("policy")
     @classmethod
     def _sees_observations(cls, policy: Any, info: ValidationInfo) -> Any:
-        env = info.data.get("env")
-        if env is not None and env.observation_key is not None and isinstance(policy, Table):
+        key = _observation_key(info)
+        if key is not None and isinstance(policy, Table):
             raise conflict(
-                "env.observation_key is {key}, a part of dictionary observations; policy.type {policy} is a table of "
-                "numbered states, it must be mlp or cnn",
-                "env.observation_key",
-                "policy.type",
-                key=env.observation_key,
-                policy=policy.type,
+                f"env.observation_key is {key}, a part of dictionary observations; policy.type {policy.type} is a "
+                "table of numbered states, it must be mlp or cnn"
             )
         return policy
 
     @field_validator("critic")
     @classmethod
     def _sees_what_the_policy_sees(cls, critic: Any, info: ValidationInfo) -> Any:
-        policy, env = info.data.get("policy"), info.data.get("env")
-        if policy is None or env is None or isinstance(critic, AutoCritic):
+        policy, observation_key = info.data.get("policy"), _observation_key(info)
+        if policy is None or isinstance(critic, AutoCritic):
             return critic
-        network = isinstance(critic, NetworkValues)
-        if not network and (policy.type == "cnn" or env.observation_key is not None):
-            key, value = (
-                ("policy.type", "cnn") if policy.type == "cnn" else ("env.observation_key", env.observation_key)
-            )
+        if not isinstance(critic, NetworkValues):
+            cause = "policy.type cnn" if policy.type == "cnn" else f"env.observation_key {observation_key}"
+            if policy.type == "cnn" or observation_key is not None:
+                raise conflict(
+                    f"critic.type is {critic.type}, which needs numbered states; with {cause} it must be network"
+                )
+            return critic
+        network = critic.network.type
+        if network == "shared" and isinstance(policy, Table):
             raise conflict(
-                "critic.type is {critic}, which needs numbered states; with {key} {value} it must be network",
-                "critic.type",
-                key,
-                critic=critic.type,
-                key=key,
-                value=value,
+                f"critic.network.type is shared; policy.type {policy.type} is a table, which has no network to share"
             )
-        if network and critic.network.type == "shared" and isinstance(policy, Table):
+        if {network, policy.type} in ({"cnn", kind} for kind in ("mlp", "softmax", "simplex")):
             raise conflict(
-                "critic.network.type is shared; policy.type {policy} is a table, which has no network to share",
-                "critic.network.type",
-                "policy.type",
-                policy=policy.type,
-            )
-        if network and {critic.network.type, policy.type} in ({"cnn", kind} for kind in ("mlp", "softmax", "simplex")):
-            raise conflict(
-                "critic.network.type is {critic} and policy.type is {policy}; a cnn takes images, the others do not",
-                "critic.network.type",
-                "policy.type",
-                critic=critic.network.type,
-                policy=policy.type,
+                f"critic.network.type is {network} and policy.type is {policy.type}; a cnn takes images, the others do "
+                "not"
             )
         return critic
 
@@ -114,36 +99,21 @@ class Training(Part):
         search, policy, critic = (info.data.get(name) for name in ("search", "policy", "critic"))
         if isinstance(estimator, LookaheadAdvantages):
             return estimator
-        idle = AutoSearch(depth=0)
-        for name in AutoSearch.model_fields if search is not None else ():
-            value, needed = getattr(search, name), getattr(idle, name)
-            if value != needed:
+        for name, needed in AutoSearch(depth=0) if search is not None else ():
+            if (value := getattr(search, name)) != needed:
                 raise conflict(
-                    "search.{name} is {value}; with estimator.type sampled there is no lookahead, it must be {needed}",
-                    f"search.{name}",
-                    "estimator.type",
-                    name=name,
-                    value=str(value),
-                    needed="null" if needed is None else str(needed),
+                    f"search.{name} is {value}; with estimator.type sampled there is no lookahead, it must be "
+                    f"{'null' if needed is None else needed}"
                 )
         if isinstance(policy, Table):
             raise conflict(
-                "estimator.type is sampled, which needs policy.type mlp or cnn; policy.type is {policy}",
-                "estimator.type",
-                "policy.type",
-                policy=policy.type,
+                f"estimator.type is sampled, which needs policy.type mlp or cnn; policy.type is {policy.type}"
             )
-        if isinstance(critic, Critic) and not (
-            isinstance(critic, TabularValues | NetworkValues) and critic.target == "v"
-        ):
+        if isinstance(critic, Critic) and (critic.type in ("exact", "rollout") or critic.target == "q"):
             raise conflict(
-                "critic.type is {critic} of target {target}; sampled advantages use values learned from earlier "
-                "episodes, so estimator.type sampled needs critic.type tabular or network, of target v",
-                "critic.type",
-                "critic.target",
-                "estimator.type",
-                critic=critic.type,
-                target=critic.target,
+                f"critic.type is {critic.type} and critic.target {critic.target}; sampled advantages use values "
+                "learned from earlier episodes, so estimator.type sampled needs critic.type tabular or network, and "
+                "critic.target v"
             )
         return estimator
 
@@ -153,24 +123,16 @@ class Training(Part):
         policy = info.data.get("policy")
         if policy is None or isinstance(update, AutoUpdate):
             return update
-        movable = MOVES[type(update)]
-        if not isinstance(policy, (AutoPolicy, *movable)):
+        if not isinstance(policy, (AutoPolicy, *MOVES[type(update)])):
+            needed = " or ".join(kind().type for kind in MOVES[type(update)])
             raise conflict(
-                "update.type is {update}, which needs policy.type {needed}; policy.type is {policy}",
-                "update.type",
-                "policy.type",
-                update=update.type,
-                needed=" or ".join(kind().type for kind in movable),
-                policy=policy.type,
+                f"update.type is {update.type}, which needs policy.type {needed}; policy.type is {policy.type}"
             )
         if isinstance(update, Mirror) and not isinstance(policy, AutoPolicy):
             _check_mirror(update, policy)
         if isinstance(info.data.get("estimator"), SampledAdvantages) and isinstance(update, Mirror | CMPO):
             raise conflict(
-                "update.type is {update}, which needs the advantages of all actions; estimator.type is sampled",
-                "update.type",
-                "estimator.type",
-                update=update.type,
+                f"update.type is {update.type}, which needs the advantages of all actions; estimator.type is sampled"
             )
         return update
 
@@ -186,25 +148,21 @@ MOVES: dict[type[Part], tuple[type[Table | Network], ...]] = {
 """The policies that each update can move."""
 
 
+def _observation_key(info: ValidationInfo) -> str | None:
+    """Return env.observation_key; None where `env` itself was refused."""
+    return info.data["env"].observation_key if "env" in info.data else None
+
+
 def _check_mirror(update: Mirror, policy: Any) -> None:
-    is_table = isinstance(policy, Table)
-    if is_table and update.floor == "never" and isinstance(policy.init, Biased) and policy.init.probability == 1:
+    kind = "table" if isinstance(policy, Table) else "network"
+    if kind == "table" and update.floor == "never" and isinstance(policy.init, Biased) and policy.init.probability == 1:
         raise conflict(
             "update.floor is never, so that a mirror step leaves probabilities of 0 at 0; a policy with "
-            "policy.init.probability 1 would never move",
-            "update.floor",
-            "policy.init.probability",
+            "policy.init.probability 1 would never move"
         )
-    used = {"type", *Mirror.standing("tables" if is_table else "networks")}
-    for name in Mirror.model_fields:
-        value = getattr(update, name)
-        if name not in used and value is not None:
+    for name, value in update:
+        if value is not None and name not in ("type", *Mirror.standing(f"{kind}s")):
             raise conflict(
-                "update.{name} is {value}, which the mirror update of a {kind} does not use; policy.type is {policy}",
-                f"update.{name}",
-                "policy.type",
-                name=name,
-                value=str(value),
-                kind="table" if is_table else "network",
-                policy=policy.type,
+                f"update.{name} is {value}, which the mirror update of a {kind} does not use; policy.type is "
+                f"{policy.type}"
             )

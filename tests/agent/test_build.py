@@ -132,6 +132,16 @@ def test_the_environment_chooses_what_is_left_out():
         chosen(given(update="ppo"), WORLD)
 
 
+def test_a_network_critic_has_a_network_like_the_policy_unless_told_otherwise():
+    for critic in (None, "network", NetworkValues(), {"type": "network", "network": "own"}):
+        assert chosen(given(policy=MLP(hidden=[3]), critic=critic), WORLD).critic == NetworkValues(
+            network=MLP(hidden=[3])
+        )
+    other = NetworkValues(network=MLP(hidden=[5]))
+    assert chosen(given(policy=MLP(hidden=[3]), critic=other), WORLD).critic == other
+    assert chosen(given(critic="network"), WORLD).critic == NetworkValues()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -147,12 +157,12 @@ def test_the_environment_chooses_what_is_left_out():
         ({"num_envs": 4.0}, r"^num_envs is 4.0; it must be a whole number >= 1 \(write 4\)$"),
         ({"depth": -1}, "^depth is -1; it must be a whole number >= 0 or adaptive$"),
         ({"depth": 2, "max_depth": 3}, "^max_depth is 3, which only depth adaptive uses; depth is 2$"),
-        ({"horizon": 7}, "horizon is 7; it must be a mapping with the key type"),
+        ({"horizon": 7}, "horizon is 7; it must be fixed or geometric, or a mapping with such a type"),
         (
             {"update": "adam"},
             "^update.type is 'adam'; it must be auto, cmpo, gradient, mirror, ppo, projected or softmax$",
         ),
-        ({"update": 3}, "update is 3; it must be a mapping"),
+        ({"update": 3}, "update is 3; it must be auto"),
         ({"update": MLP()}, "update.type is 'mlp'; it must be auto"),
         ({"update": {"type": "ppo", "clip_rang": 1}}, "^update.clip_rang is unknown; did you mean update.clip_range"),
         ({"policy": {"type": "softmax", "device": "cpu"}}, "policy.device is unknown"),

@@ -18,7 +18,7 @@ from pgts_torch.cli.main import main
 from pgts_torch.config import Config, dump, load, strict_yaml
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import summary
-from pgts_torch.options.schema import Schema
+from pgts_torch.options.schema import schema_of
 from tests.forks import PATIENCE, started
 
 ROOT = Path(__file__).parents[2]
@@ -218,11 +218,11 @@ def test_the_help_of_train_names_every_key_with_requirement_default_and_meaning_
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) < 80
     text = " ".join(out.split())
-    options = Schema(Config).options()
+    options = schema_of(Config).options()
     assert {"seed", "search.depth", "critic.method.lambda", "env.kwargs"} <= {option.key for option in options}
     for option in options:
         default = strict_yaml.parse(_default_in(text, option.key, option.requirement)).value
-        assert option.when == "" or f"with {option.when}:" in text
+        assert all(f"{key} {'|'.join(values)}" in text for key, values in option.when)
         assert default == option.default or option.when
         assert option.meaning, option.key
         assert option.meaning in text

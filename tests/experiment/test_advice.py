@@ -46,7 +46,7 @@ def test_a_policy_that_is_stationary_at_this_depth_is_told_to_look_deeper(tmp_pa
     stays = ["--policy.type", "simplex", "--policy.init", "{type: biased, action: 0, probability: 1}"]
     exact = ["--critic.type", "exact", "--search.depth", "0"]
     [note] = trained(tmp_path, "--env.id", "pgts/Ladder-v0", *stays, *exact).notes
-    assert note.endswith("Such a lookahead sees nothing better: set a deeper one, search.depth above 0")
+    assert note.endswith("A lookahead of depth 0 finds no better actions: set a deeper one, search.depth above 0")
 
 
 @pytest.mark.parametrize("critic", ["exact", "tabular"])
@@ -69,11 +69,11 @@ def test_a_network_that_hardly_moves_says_so_and_one_that_learns_does_not(tmp_pa
     assert not any("hardly moved" in note for note in moving.notes)
 
 
-@pytest.mark.fault("a policy that does not come to rest")
+@pytest.mark.fault("a policy that does not converge")
 def test_a_policy_that_still_moves_at_the_end_is_told_to_train_on_or_to_take_smaller_steps(tmp_path: Path):
     restless = trained(tmp_path / "a", "--env.id", "pgts/RiverSwim-v0")
     [note] = restless.notes
-    assert note.startswith("the policy has not come to rest: the last iterations moved ")
+    assert note.startswith("the policy has not converged: the last iterations moved ")
     assert "a smaller update.step_size than 1" in note
     arrived = trained(tmp_path / "b", "--env.id", "pgts/Ladder-v0", "--critic.type", "exact", "--total_steps", "3000")
     assert arrived.J == pytest.approx(arrived.J_optimal, rel=1e-3)
@@ -85,7 +85,7 @@ def evaluation(mean: float, half_width: float | None) -> Evaluation:
     return Evaluation(10, score, score, score)
 
 
-@pytest.mark.fault("a greedy policy that is worse than drawn actions")
+@pytest.mark.fault("a greedy policy that is worse than sampled actions")
 def test_greedy_episodes_that_are_worse_beyond_chance_are_pointed_out():
     worse = greedy_is_worse(evaluation(0.0, 0.0), evaluation(0.8, 0.3))
     assert worse is not None

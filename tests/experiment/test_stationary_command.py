@@ -158,7 +158,8 @@ MISTAKES = {
     "ladder --n 0": f"argument --n: '0' is not a whole number >= 1 and below 2**63 {HELP}",
     "ladder --gamma nan": f"argument --gamma: 'nan' is not a number in [0, 1] {HELP}",
     "ladder --gamma 1.5": f"argument --gamma: '1.5' is not a number in [0, 1] {HELP}",
-    "ladder --start first": f"argument --start: 'first' is neither a state nor uniform {HELP}",
+    "ladder --start first": "argument --start: 'first' is neither a whole number >= 0 and below 2**63 nor uniform "
+    f"{HELP}",
     "grid --traps 1,x": f"argument --traps: 'x' is not a whole number >= 0 and below 2**63 {HELP}",
     "ladder --start 5": "start state 5 does not exist; states are 0 to 4",
     "ladder --gamma 1": "gamma is 1 and from state 0 some policy never ends: it has no finite value; "

@@ -14,7 +14,7 @@ from pgts_torch.experiment.report.curves import panels
 from pgts_torch.experiment.resume import flat
 from pgts_torch.experiment.summary import Summary, from_json, rows
 from pgts_torch.files import PARTIAL
-from pgts_torch.options.schema import Schema
+from pgts_torch.options.schema import schema_of
 
 Values = Mapping[str, Any]
 
@@ -153,16 +153,10 @@ def _certificate(summary: Summary | None, latest: Values) -> Values:
 
 def _settings(config: Config) -> Iterator[Values]:
     values = flat(config)
-    defaults = {option.key: option.default for option in Schema(Config).options() if _applies(option.when, values)}
+    defaults = {option.key: option.default for option in schema_of(Config).options() if option.exists(values)}
     for key, value in values.items():
         is_default = key in defaults and value == defaults[key]
         yield {"key": key, "value": value, "default": defaults.get(key), "is_default": is_default}
-
-
-def _applies(when: str, values: Values) -> bool:
-    """Whether a condition of `Option.when` holds."""
-    conditions = (condition.split(" ") for condition in when.split(" and ") if condition)
-    return all(values.get(key) in choices.split("|") for key, choices in conditions)
 
 
 def _files(run: Path) -> Iterator[tuple[str, int]]:
