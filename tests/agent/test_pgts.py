@@ -285,7 +285,7 @@ def test_an_environment_without_a_model_is_refused_with_what_is_missing():
         ({"env": "pgts/Nowhere-v0"}, "pgts/Nowhere-v0 cannot be made"),
         ({"horizon": 3}, "horizon is 3"),
         ({"critic": 3}, "critic is 3"),
-        ({"env": copies(ladder(), 2), "gamma": 0.5}, "gamma is 0.5; the environment has its own, 0.9"),
+        ({"env": copies(ladder(), 4), "gamma": 0.5}, "gamma is 0.5; the environment has its own, 0.9"),
         ({"env": copies(ladder(), 2), "env_kwargs": {"n": 3}}, "takes none"),
     ],
 )

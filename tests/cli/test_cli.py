@@ -1,4 +1,4 @@
-"""The command `pgts`: help, exit codes, and what it hands on."""
+"""The command `pgts`: help, exit codes, and what it passes on."""
 
 import json
 import re
@@ -119,7 +119,7 @@ def test_several_mistakes_are_several_lines(here: Path, capsys: pytest.CaptureFi
     assert other.startswith("error: --threads is 0; ")
 
 
-def test_train_hands_on_the_file_with_its_overrides(
+def test_train_passes_on_the_file_with_its_overrides(
     run: FakeRun, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (here / "c.yaml").write_text("search: {depth: 2}\ncritic: {target: q}\n")
@@ -159,7 +159,7 @@ def test_print_config_prints_yaml_that_loads_to_the_same_configuration(
     assert (err, run.calls, list(here.iterdir())) == ("", [], [])
 
 
-def test_evaluate_hands_on_its_arguments_and_prints_for_people_or_programs(
+def test_evaluate_passes_on_its_arguments_and_prints_for_people_or_programs(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fake = FakeEvaluation()

@@ -1,5 +1,5 @@
-"""Output that goes nowhere, pipes in place of files, names that are too long or not of this locale, and signals that
-others hear."""
+"""Output that cannot be written, pipes in place of files, names that are too long or not of this locale, and signals
+that have a handler already."""
 
 import faulthandler
 import json
@@ -51,14 +51,14 @@ def test_an_answer_that_cannot_be_written_is_an_error_of_other_commands(tmp_path
     assert done.stderr.endswith("error: the answer cannot be written to stdout: No space left on device\n")
 
 
-def test_a_stream_escapes_what_its_encoding_lacks_and_falls_silent_once_it_fails(tmp_path):
-    with (tmp_path / "told").open("w", encoding="ascii") as file:
+def test_a_stream_escapes_what_its_encoding_lacks_and_discards_everything_once_it_fails(tmp_path):
+    with (tmp_path / "log").open("w", encoding="ascii") as file:
         print("run.dir ä日\udcc3", file=SafeStream(file, required=True))
-    assert (tmp_path / "told").read_text() == "run.dir \\xe4\\u65e5\\udcc3\n"
+    assert (tmp_path / "log").read_text() == "run.dir \\xe4\\u65e5\\udcc3\n"
     with Path("/dev/full").open("w") as full:
-        told = SafeStream(full, required=False)
-        print("x", file=told, flush=True)
-        print("x", file=told, flush=True)
+        stream = SafeStream(full, required=False)
+        print("x", file=stream, flush=True)
+        print("x", file=stream, flush=True)
     with Path("/dev/full").open("w") as full, pytest.raises(PgtsError, match="cannot be written to stdout: No space"):
         print("x", file=SafeStream(full, required=True), flush=True)
 
@@ -152,7 +152,7 @@ def test_a_warning_on_the_command_line_is_one_line_without_its_place_in_the_code
 
 
 @pytest.mark.parametrize(("number", "is_left"), [(signal.SIGHUP, True), (signal.SIGTERM, False)])
-def test_a_handler_that_is_not_of_python_keeps_a_hang_up_and_never_a_termination(number, is_left, tmp_path):
+def test_a_handler_outside_of_python_keeps_sighup_but_not_sigterm(number, is_left, tmp_path):
     before = signal.signal(number, signal.SIG_DFL)
     with (tmp_path / "traces").open("w+") as file:
         faulthandler.register(number, file, all_threads=False)

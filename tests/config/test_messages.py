@@ -290,7 +290,7 @@ def test_all_mistakes_are_reported_at_once_in_the_order_of_lines_then_flags(
     ]
 
 
-def test_flags_are_checked_even_if_the_file_cannot_be_read_but_not_against_what_it_might_say(
+def test_flags_are_checked_where_the_file_cannot_be_read_but_not_against_its_values(
     mistakes: Callable[..., list[str]],
 ) -> None:
     found = mistakes("[", "--threads", "0", "--update.type", "projected", "--critic.samples", "3")
@@ -299,7 +299,7 @@ def test_flags_are_checked_even_if_the_file_cannot_be_read_but_not_against_what_
     assert found[1] == "--threads is 0; it must be a whole number in [1, 1024]"
 
 
-def test_a_flood_of_mistakes_is_cut(mistakes: Callable[..., list[str]]) -> None:
+def test_a_long_list_of_mistakes_is_cut(mistakes: Callable[..., list[str]]) -> None:
     found = mistakes("\n".join(f"key_{n}: 1" for n in range(MAX_MISTAKES + 7)))
     assert len(found) == MAX_MISTAKES + 1
     assert found[-1] == "and 7 more"
