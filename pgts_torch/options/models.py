@@ -29,10 +29,5 @@ class Counts(Part):
     @classmethod
     def _has_optimism(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("optimism") == "none":
-            raise conflict(
-                "model.strength is {value}, which model.optimism none does not use",
-                "model.strength",
-                "model.optimism",
-                value=str(value),
-            )
+            raise conflict(f"model.strength is {value}, which model.optimism none does not use")
         return value
