@@ -77,7 +77,7 @@ def read(path: str | Path, *, most: int | None = None, name: str | None = None) 
 
 
 def replace(path: str | Path, raw: bytes) -> None:
-    """Write a file, to the disk; whoever reads `path` meanwhile finds the old file or the new one.
+    """Write a file, to the disk; a reader meanwhile finds the old file or the new one.
 
     Raises:
         PgtsError: it cannot be written; then nothing has changed.

@@ -150,7 +150,7 @@ class TabularMDP:
 
     def save_npz(self, path: str | Path) -> None:
         """Write the MDP as `load_npz` reads it, without names and shape of the picture. Only a file that `load_npz`
-        reads is replaced, and an empty one; whoever reads it meanwhile finds the old MDP or the new one.
+        reads is replaced, and an empty one; a reader meanwhile finds the old MDP or the new one.
 
         Raises:
             PgtsError: the outcomes have several discounts (some end an episode, for instance), another file is there,
@@ -160,7 +160,7 @@ class TabularMDP:
         happens_SAK = outcomes.prob_NAK > 0
         gamma = float(outcomes.discount_NAK[happens_SAK][0])
         other_SA = (happens_SAK & (outcomes.discount_NAK != gamma)).any(-1)
-        must = f"others have {gamma}, and an npz file holds one gamma: let an end lead to a state that earns 0 for ever"
+        must = f"others have {gamma}, and an npz file holds one gamma: let an end lead to a state that earns 0 forever"
         _refuse(other_SA, "the outcomes of ({}, {}) have discounts", outcomes.discount_NAK, must)
         P_SAS = torch.zeros(self.num_states, self.num_actions, self.num_states, dtype=torch.float64)
         P_SAS.scatter_add_(-1, outcomes.child_NAK, outcomes.prob_NAK)

@@ -46,7 +46,7 @@ def is_stationary(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int, *, t
     return bool((gap(mdp, pi_SA, depth) <= tolerance).all())
 
 
-# How bad a stationary policy can be: bounds on J* - J^pi that hold for every pi in Pi^m
+# How bad a stationary policy can be: bounds on J* - J^pi that hold forevery pi in Pi^m
 
 
 def closed_form_bound(mdp: TabularMDP, depth: int) -> float:
@@ -185,7 +185,7 @@ def _reward_bound(mdp: TabularMDP, depth: int, states_S: Bool[Tensor, "S"]) -> f
 def highest_value(outcomes: Outcomes) -> float:
     """The most that a state can be worth if only gamma, r_max and whether something ends are known.
 
-    r_max / (1 - gamma), from earning r_max for ever; but r_max, from ending at once, if that is more. Where gamma is 1
+    r_max / (1 - gamma), from earning r_max forever; but r_max, from ending at once, if that is more. Where gamma is 1
     it is infinite, unless no reward is positive: then it is r_max.
     """
     gamma, highest = largest_discount(outcomes), float(outcomes.reward_NA.max())

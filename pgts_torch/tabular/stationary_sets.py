@@ -32,7 +32,7 @@ NEVER = -1
 class StationarySets:
     """Pi^0, Pi^1, ... among the deterministic policies of an MDP.
 
-    A policy is in Pi^m for every m below its escape depth (Pi^m shrinks, [PGTS Thm. 1]). The worst return b^m over all
+    A policy is in Pi^m forevery m below its escape depth (Pi^m shrinks, [PGTS Thm. 1]). The worst return b^m over all
     policies, stochastic ones too, is attained by a deterministic one (docs/theory.md, Prop. 2).
 
     num_states, num_actions: of the MDP.
@@ -78,7 +78,7 @@ class StationarySets:
 def enumerate_sets(
     mdp: TabularMDP, *, max_policies: int = MAX_POLICIES, tolerance: float = TOLERANCE
 ) -> StationarySets:
-    """Decide for every deterministic policy at which depth it stops being stationary.
+    """Decide forevery deterministic policy at which depth it stops being stationary.
 
     Args:
         max_policies: more than these are refused.
@@ -217,7 +217,7 @@ def _dense_weight(outcomes: Outcomes) -> Float[Tensor, "S A S"]:
 
 
 def _check_all_end(outcomes: Outcomes) -> None:
-    """PgtsError if a policy may go on for ever undiscounted: then I - gamma P^pi is singular."""
+    """PgtsError if a policy may go on forever undiscounted: then I - gamma P^pi is singular."""
     ends_SA = exact.ends(outcomes)
     if ends_SA.all():
         return

@@ -235,7 +235,7 @@ def river_swim(n: int = 12, *, gamma: float = 0.99, start: Start = 0) -> Tabular
 def corridor(
     width: int = 3, length: int = 25, *, slip: float = 0.2, gamma: float = 0.99, start: Start = None
 ) -> TabularMDP:
-    """A slippery corridor without walls: whoever steps off its long sides is back at the start. Reaching the last
+    """A slippery corridor without walls: a step off its long sides leads back to the start. Reaching the last
     column earns 1 and ends the episode. State `length * row + column`; actions left, right, up, down.
 
     An action moves one cell as intended with probability 1 - slip, and to either side at right angles with slip / 2

@@ -1,4 +1,4 @@
-"""Runs of Algorithm 1 that nobody ran, and figures with next to nothing to compute."""
+"""Curves with given returns, to decide statements on; and figures with next to nothing to compute."""
 
 import dataclasses
 from typing import Any
@@ -13,7 +13,7 @@ from tests.support import zoo
 
 
 def made_up(*J: float, J_optimal: float = 10.0, **watched: list[float]) -> Trace:
-    """A run of Algorithm 1 that nobody ran."""
+    """A curve with these returns, as if Algorithm 1 had made it."""
     values = {name.replace("_", " "): torch.tensor(row).double() for name, row in watched.items()}
     return Trace(torch.tensor(J).double(), J_optimal, values)
 
