@@ -103,7 +103,8 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         check_options(options, ("reset_mask", "state"))
         options = options or {}
         mask_B = self._check_mask(options.get("reset_mask"))
-        state_B = self._check_states(options.get("state"))
+        given = options.get("state")
+        state_B = None if given is None else self._check_numbers("state", given, self.mdp.num_states)
         self._seed(seed)
         self._start_episodes(mask_B, state_B)
         self._was_reset = True
@@ -111,7 +112,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
 
     def step(self, actions: ArrayLike) -> tuple[States, Rewards, Flags, Flags, dict[str, Any]]:
         """Sample one outcome for every environment: states, rewards, terminated, truncated, info, each of shape [B]."""
-        action_B = self._check_actions(actions)
+        action_B = self._check_numbers("action", actions, self.mdp.num_actions)
         if not self._was_reset:
             raise ResetNeeded("Cannot call env.step() before calling env.reset()")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._over_B.any():
@@ -176,17 +177,21 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
             raise PgtsError(f"seed is {seed}; it must be an integer or {self.num_envs} integers of at least 0")
         self.np_random = np.random.default_rng(np.random.SeedSequence(seed))
 
-    def _check_actions(self, actions: ArrayLike) -> States:
-        action_B = np.asarray(actions)
-        if action_B.shape != (self.num_envs,) or not np.issubdtype(action_B.dtype, np.integer):
+    def _check_numbers(self, kind: str, given: ArrayLike, count: int) -> States:
+        """One number below `count` for each environment; a single state stands for all of them."""
+        number_B = np.asarray(given)
+        if number_B.shape == () and kind == "state":
+            number_B = np.broadcast_to(number_B, (self.num_envs,))
+        if number_B.shape != (self.num_envs,) or not np.issubdtype(number_B.dtype, np.integer):
             raise PgtsError(
-                f"actions have shape {action_B.shape} and dtype {action_B.dtype}; they must be {self.num_envs} integers"
+                f"{kind}s have shape {number_B.shape} and dtype {number_B.dtype}; they must be {self.num_envs} integers"
             )
-        last = self.mdp.num_actions - 1
-        if action_B.min() < 0 or action_B.max() > last:
-            index = int(((action_B < 0) | (action_B > last)).argmax())
-            raise PgtsError(f"action {action_B[index]} of environment {index} does not exist; actions are 0 to {last}")
-        return action_B
+        if number_B.min() < 0 or number_B.max() >= count:
+            index = int(((number_B < 0) | (number_B >= count)).argmax())
+            raise PgtsError(
+                f"{kind} {number_B[index]} of environment {index} does not exist; {kind}s are 0 to {count - 1}"
+            )
+        return number_B
 
     def _check_mask(self, mask: Any) -> Flags:
         if mask is None:
@@ -200,20 +205,6 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         if not self._was_reset and not mask_B.all():
             raise ResetNeeded("Cannot reset some environments before env.reset() has started all of them")
         return mask_B
-
-    def _check_states(self, states: Any) -> States | None:
-        if states is None:
-            return None
-        state_B = np.asarray(states)
-        if state_B.shape not in {(), (self.num_envs,)} or not np.issubdtype(state_B.dtype, np.integer):
-            raise PgtsError(
-                f"option state has shape {state_B.shape} and dtype {state_B.dtype}; "
-                f"it must be an integer or {self.num_envs} integers"
-            )
-        off_B = (state_B < 0) | (state_B >= self.mdp.num_states)
-        if off_B.any():
-            raise PgtsError(f"state {state_B[off_B][0]} does not exist; states are 0 to {self.mdp.num_states - 1}")
-        return np.broadcast_to(state_B, (self.num_envs,))
 
 
 def _check_mode(mode: AutoresetMode | str) -> AutoresetMode:
