@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from pgts_torch.agent.critics import Critic, ExactCritic, RolloutCritic, TabularCritic
+from pgts_torch.agent.networks import default_network
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate, PPOUpdate
 from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy, TabularPolicy
@@ -25,7 +26,7 @@ from pgts_torch.options.critics import (
     TabularValues,
 )
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Network, Simplex, Softmax
+from pgts_torch.options.policies import AutoPolicy, Network, Simplex, Softmax
 from pgts_torch.options.rollouts import Estimator, LookaheadAdvantages, SampledAdvantages
 from pgts_torch.options.search import MCTS, Auto, Expectimax, Kind, Sampled
 from pgts_torch.options.training import Training
@@ -69,7 +70,7 @@ def chosen(options: Training, world: World) -> Training:
     policy, critic, update = options.policy, options.critic, options.update
     numbered = isinstance(world, TabularWorld)
     if isinstance(policy, AutoPolicy):
-        policy = Softmax() if numbered else CNN() if len(world.observation_space.shape or ()) == 3 else MLP()
+        policy = Softmax() if numbered else default_network(world.observation_space)
     if isinstance(critic, AutoCritic):
         critic = NetworkValues() if isinstance(policy, Network) else TabularValues()
     if isinstance(critic, NetworkValues) and isinstance(critic.network, OwnNetwork) and isinstance(policy, Network):

@@ -13,7 +13,7 @@ from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import DynamicsWorld, TabularWorld, World
 from pgts_torch.errors import ModelMismatch, PgtsError
-from pgts_torch.models.base import CONTRADICTED, RANDOM, ExactModel, Happened
+from pgts_torch.models.exact_model import CONTRADICTED, RANDOM, ExactModel, Happened
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.seeding import numpy_stream

@@ -26,6 +26,9 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 _MOST_INPUTS = 2**24
 _CLIP = 10.0
 
+_LARGE_IMAGE = 32
+"""The height and width from which on images are large."""
+
 
 @final
 class RunningNorm(nn.Module):
@@ -131,11 +134,20 @@ class Trunk(nn.Module):
         self.encoder, self.layers, self.num_features = encoder, layers, num_features
 
 
+def default_network(space: Space[Any]) -> MLP | CNN:
+    """Return the network for such observations where none is given: for images a CNN, with strides where they are
+    large, or else the dense layer of Atari's (210, 160, 3) would have 266 million weights; for others an MLP."""
+    shape = space.shape or ()
+    if len(shape) != 3:
+        return MLP()
+    return CNN(kernel_size=3, stride=2) if min(shape[:2]) >= _LARGE_IMAGE else CNN()
+
+
 def make_trunk(network: MLP | CNN, observation_space: Space[Any], *, generator: torch.Generator) -> Trunk:
     """Make a trunk on the CPU, with orthogonal weights of gain sqrt(2) (Saxe et al. 2014) and biases 0.
 
     MLP: without hidden layers, and with one-hot states, the network is a table. CNN: convolutions without padding over
-    channels-last images; the default is the usual one for the 7x7x3 views of MiniGrid (Chevalier-Boisvert et al. 2023).
+    channels-last images; `CNN()` is the usual one for the 7x7x3 views of MiniGrid (Chevalier-Boisvert et al. 2023).
 
     Raises:
         PgtsError: the network does not take such observations.

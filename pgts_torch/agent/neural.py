@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pgts_torch.agent.advantages import critic_targets
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.networks import Network, Trunk, make_trunk
+from pgts_torch.agent.networks import Network, Trunk, default_network, make_trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
@@ -102,8 +102,8 @@ class NetworkCritic(Critic):
         self.target, self.num_actions = options.target, num_actions
         generator = stream(seed, "critic")
         if trunk is None:
-            own = CNN() if len(observation_space.shape or ()) == 3 else MLP()
-            network = options.network if isinstance(options.network, MLP | CNN) else own
+            own = options.network
+            network = own if isinstance(own, MLP | CNN) else default_network(observation_space)
             trunk = make_trunk(network, observation_space, generator=generator)
         outputs = 1 if self.target == "v" else num_actions
         self.network = Network(trunk, outputs, gain=1.0, generator=generator).to(device)

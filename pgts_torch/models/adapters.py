@@ -7,8 +7,7 @@ import inspect
 import pickle
 import struct
 import sys
-from collections.abc import Callable
-from typing import Any, Protocol, final, runtime_checkable
+from typing import Any, final
 
 import gymnasium
 import numpy as np
@@ -19,18 +18,9 @@ from pgts_torch.models.provenance import overridden
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
 
 
-@runtime_checkable
-class Restorable(Protocol):
-    """An environment that answers for its own state; see the head of this file."""
-
-    def get_state(self) -> Any: ...
-
-    def set_state(self, state: Any) -> None: ...
-
-
 @final
 class OwnState(SnapshotAdapter):
-    """For environments with the two methods of `Restorable`."""
+    """For environments with `get_state` and `set_state` of their own."""
 
     name = "get_state and set_state of its own"
 
@@ -183,7 +173,7 @@ def adapter_for(env: gymnasium.Env) -> SnapshotAdapter:
         MissingModel: it has neither; the message says what to implement.
     """
     base = env.unwrapped
-    if isinstance(base, Restorable) and _takes_one(base.set_state):
+    if callable(getattr(base, "get_state", None)) and _takes_one(getattr(base, "set_state", None)):
         return OwnState()
     for (module, name), make in ADAPTERS.items():
         if module in sys.modules and isinstance(base, getattr(sys.modules[module], name)):
@@ -206,8 +196,8 @@ def methods_for(base: Any) -> str:
     return words
 
 
-def _takes_one(method: Callable[..., Any]) -> bool:
-    """Whether a method can be called with one argument; `set_state` of MuJoCo's environments takes two."""
+def _takes_one(method: Any) -> bool:
+    """Whether it is a method that can be called with one argument; `set_state` of MuJoCo's environments takes two."""
     try:
         inspect.signature(method).bind(None)
     except TypeError:

@@ -43,6 +43,7 @@ class MiniGrid(SnapshotAdapter):
         for name in vars(env).keys() - state.keys() - _NO_STATE_OF_MINIGRID:
             delattr(env, name)
         vars(env).update(state)
+        # One object for neighbouring walls that are alike; see the class.
         cells, wall = env.grid.grid, None
         for i, cell in enumerate(cells):
             if cell is not None and cell is not wall and _is_plain_wall(cell):
@@ -82,7 +83,8 @@ def _spell(value: Any, parts: list[Any], seen: dict[int, int]) -> None:
         parts.append(value)
     elif kind is tuple or kind is list:
         parts += ("(", len(value))
-        wall = None  # most of a grid, and the same object again and again
+        # Most of a grid is one wall, the same object again and again: it is looked into once.
+        wall = None
         for item in value:
             if type(item) in _PLAIN:
                 parts.append(item)
@@ -106,6 +108,7 @@ def _spell(value: Any, parts: list[Any], seen: dict[int, int]) -> None:
         for name in sorted(value, key=repr):
             _spell(name, parts, seen)
             _spell(value[name], parts, seen)
+    # Objects that were met before: what they consist of is spelled already, and may lead back to themselves.
     elif id(value) in seen:
         parts += ("=", seen[id(value)])
     else:
@@ -149,7 +152,7 @@ class _Unpickler(pickle.Unpickler):
 class Ale(SnapshotAdapter):
     """Atari: the serialised emulator. Its frame numbers are in it.
 
-    What is serialised does not tell which action was taken last. Where actions stick, that decides what follows, so an
+    What is serialised lacks the action that was taken last. Where actions stick, that decides what follows, so an
     emulator whose actions stick cannot be restored, not even with its generator.
     """
 

@@ -60,7 +60,7 @@ class CartPole(DynamicsModel):
 class Acrobot(DynamicsModel):
     """Two angles and their velocities, by one Runge-Kutta step of order 4. The reward is -1, at the end 0.
 
-    Just after a reset the environment's state, and so what it shows, is float32: `observe` may differ in the last bit.
+    Just after a reset the environment's state and observation are float32: `observe` may differ in the last bit.
     """
 
     env_class, size = AcrobotEnv, 4

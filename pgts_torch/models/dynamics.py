@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.actions import base_actions
-from pgts_torch.models.base import ExactModel
+from pgts_torch.models.exact_model import ExactModel
 from pgts_torch.models.provenance import overridden
 from pgts_torch.models.rewards import value_range
 from pgts_torch.models.snapshots import env_name
@@ -138,7 +138,7 @@ class DynamicsModel(TensorModel, ExactModel):
 
     @abstractmethod
     def observe(self, state_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N O"]:
-        """What the environment shows in these states, float32."""
+        """The observations of the environment in these states, float32."""
 
     @abstractmethod
     def _effect(self, action: Any) -> tuple[float, ...]:

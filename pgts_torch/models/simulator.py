@@ -15,18 +15,9 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, check_count, failure
 from pgts_torch.models.answers import Answers, Step
-from pgts_torch.models.base import (
-    CONTRADICTED,
-    NOT_QUERIED,
-    RANDOM,
-    EnumeratingModel,
-    ExactModel,
-    Happened,
-    SamplingModel,
-    Transitions,
-    step_text,
-)
+from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.environments import Given
+from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, ExactModel, Happened, step_text
 from pgts_torch.models.provenance import draws_its_own
 from pgts_torch.models.snapshot_model import SnapshotModel
 from pgts_torch.models.snapshots import SnapshotAdapter, env_name
@@ -143,6 +134,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             RandomOutcomes: chance decides what follows.
             PgtsError: the environment fails, see `sample`.
         """
+        # One step for each pair, action by action, in the order of a table [N, A].
         steps = []
         with self._watched():
             for state, action in itertools.product(state_N.tolist(), range(self.num_actions)):
@@ -153,6 +145,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
                         "enumerated; search it by `sampled`, or make a TabularModel of it if it has a table P"
                     )
                 steps.append(step)
+        # K = 1: the one outcome of each action has probability 1.
         answer, shape = self._answer(steps), (len(state_N), self.num_actions, 1)
         certain_NAK = torch.ones(shape, dtype=self.dtype, device=self.device)
         reward_NA, discount_NAK = answer.reward_N.view(shape[:2]), answer.discount_N.view(shape)
@@ -197,6 +190,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             )
 
     def _answer(self, steps: Sequence[Step]) -> Transitions:
+        # By snapshot: a remembered step may be from before `clear`, when its child had another number.
         child = [self._number[step.child.name] for step in steps]
         return Transitions(
             torch.tensor([step.reward for step in steps], dtype=self.dtype, device=self.device),
@@ -207,6 +201,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
     def outcome_of(self, happened: Happened, *, query_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
         """0 where a step is, bit for bit, what the simulator gives: from memory where it was queried for that before,
         and where `query_N` says so by a step of the simulator."""
+        # Plain Python numbers: each step is compared by itself, and in numpy that would take ten times as long.
         columns = [column_N.tolist() for column_N in vars(happened).values()]
         query = itertools.repeat(True) if query_N is None else query_N.tolist()
         with self._watched():
@@ -222,9 +217,10 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=1)
             if step.random:
                 return RANDOM
-        # A truncated episode cannot have gone on.
+        # Bit for bit, because the same code has made both. A truncated episode cannot have gone on.
         if step.reward != reward or step.discount != discount or (step.child.cut and follows):
             return CONTRADICTED
+        # After an end the next state does not matter.
         return 0 if discount == 0 or self.adapter.same_state(step.child, self._snapshots[next_state]) else CONTRADICTED
 
     def outcomes_text(self, state: int, action: int) -> str:
@@ -256,6 +252,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         except BaseException as error:
             where = f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}"
             raise failure(where, error) from error
+        # The snapshot and observation by which the state is known, so that equal ones are kept in memory once.
         step = Step(total, discount, self._snapshots[child], self._observations[child], random)
         if not random:
             self._sure.add(query, step)

@@ -140,7 +140,7 @@ class StateIndex:
         found_L, slot_L = self._look_up(looking_L, hash_N[looking_L - first])
         new_N = torch.ones_like(fresh_N, dtype=torch.bool)
         new_N[looking_L - first] = found_L == looking_L
-        # New rows move together: their numbers are `first` and the next ones, and the table is told of it.
+        # New rows move together: their numbers are `first` and the next ones, and the table gets them.
         number_N = first - 1 + new_N.cumsum(0)
         own = torch.nonzero(found_L == looking_L).flatten()
         self._slots[slot_L[own]] = number_N[looking_L[own] - first]

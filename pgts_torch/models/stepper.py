@@ -67,6 +67,7 @@ class Stepper:
         Returns:
             The discounted sum of rewards, the product of discounts, the state reached, and whether chance was involved.
         """
+        # total, discount: sum_i gamma_0 ... gamma_{i-1} r_i and gamma_0 ... gamma_{k-1} of the k steps made so far.
         self.adapter.set_state(self.env, data)
         total, discount, random = 0.0, 1.0, False
         for _ in range(repeat):

@@ -11,15 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.models.base import (
-    CONTRADICTED,
-    EnumeratingModel,
-    ExactModel,
-    Happened,
-    SamplingModel,
-    Transitions,
-    step_text,
-)
+from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.exact_model import CONTRADICTED, ExactModel, Happened, step_text
 from pgts_torch.models.snapshots import each_of
 from pgts_torch.seeding import uniform
 from pgts_torch.tabular.mdp import TabularMDP
@@ -85,6 +78,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
     @cached_property
     def _looks_RK(self) -> Int[np.ndarray, "R K"]:
         """64 bits of each outcome of each row s * A + a by which it is told apart, 0 where it has no probability."""
+        # In float64, whatever the dtype of the model: the environment's numbers are compared with these.
         outcomes, K = self._mdp.outcomes, self.table.num_outcomes
         child_SAK, discount_SAK, paid_SAK = outcomes.child_NAK, outcomes.discount_NAK, self._mdp.outcome_reward_SAK
         looks_SAK = _looks(child_SAK.numpy(), discount_SAK.numpy(), paid_SAK.numpy())
@@ -100,6 +94,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
         same_NK = self._looks_RK.take(row_N, 0) == looks_N[:, None]
         first_N = same_NK.argmax(-1)
         if not (self._looks_RK.take(row_N * self._looks_RK.shape[1] + first_N) == looks_N).all():
+            # Some step looks like no outcome: compare number by number, with rewards rounded to float32.
             at = happened.state_N, happened.action_N
             outcomes, discount_NK = self._mdp.outcomes, self._mdp.outcomes.discount_NAK.numpy()[at]
             with np.errstate(over="ignore"):
@@ -119,8 +114,8 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
         """The outcomes of a row, the most probable first."""
         prob_K = self._mdp.outcomes.prob_NAK[state, action].tolist()
         likely = sorted((k for k, p in enumerate(prob_K) if p > 0), key=lambda k: -prob_K[k])
-        told = [f"{self.outcome_text(state, action, k)} (probability {prob_K[k]:.4g})" for k in likely[:_MOST_NAMED]]
-        return ", or ".join(told) + (f", or {len(likely) - _MOST_NAMED} others" if len(likely) > _MOST_NAMED else "")
+        named = [f"{self.outcome_text(state, action, k)} (probability {prob_K[k]:.4g})" for k in likely[:_MOST_NAMED]]
+        return ", or ".join(named) + (f", or {len(likely) - _MOST_NAMED} others" if len(likely) > _MOST_NAMED else "")
 
     def outcome_text(self, state: int, action: int, k: int) -> str:
         """One outcome of a row, in a message."""
@@ -148,8 +143,8 @@ def _looks(child: np.ndarray, discount: np.ndarray, reward: np.ndarray) -> np.nd
 
 
 def tabular_truth(env: gymnasium.Env | gymnasium.vector.VectorEnv, *, gamma: float) -> TabularMDP:
-    """The MDP that an environment publishes or its copies do, as it stands: its `mdp` if it has one, else its table P.
-    `published.table_of` holds it to what they do.
+    """The MDP that an environment publishes, or several that step together, as it stands: its `mdp` if it has one, else
+    its table P. `published.table_of` compares it with steps.
 
     Args:
         gamma: discount of a P table; ours carry their own.
@@ -162,5 +157,5 @@ def tabular_truth(env: gymnasium.Env | gymnasium.vector.VectorEnv, *, gamma: flo
     mdp = getattr(single.unwrapped, "mdp", None)
     if not isinstance(mdp, TabularMDP):
         return TabularMDP.from_gymnasium(single, gamma)
-    # Ours pay r(s, a), whichever outcome is drawn.
+    # In pgts/* the reward is r(s, a), whichever outcome is sampled.
     return mdp if mdp.reward_SAK is None else replace(mdp, reward_SAK=None)

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NotFinite, PgtsError, check_count
-from pgts_torch.models.base import CONTRADICTED, EnumeratingModel, Happened, SamplingModel, Transitions, step_text
+from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.exact_model import CONTRADICTED, Happened, step_text
 from pgts_torch.models.state_index import Merge, StateIndex
 
 _ROUNDING = 1e-12
@@ -110,6 +111,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
         Raises:
             PgtsError: `step` returns a wrong shape or dtype, a discount outside [0, 1], or NaN in a state that counts.
         """
+        # Rows n * A + a: every action in the first state, then in the second, ...
         A = self.num_actions
         action_NA = torch.arange(A, device=self.device).expand(len(state_N), A)
         reward_N, discount_N, next_N = self._followed(state_N.repeat_interleave(A), action_NA.reshape(-1))
@@ -157,6 +159,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
             reward_N = reward_N.index_add(0, on, weight_N * more_N[allowed_N])
             discount_N = discount_N.index_copy(0, on, weight_N * then_N[allowed_N])
             next_ND = next_ND.index_copy(0, on, ahead_ND[allowed_N])
+        # Next states that count get a number; a terminal one may be anything, and is no state of the model.
         next_N = state_N.clone()
         counts_N = (discount_N > 0) & (reward_N > -torch.inf)
         next_N[counts_N] = self.number(next_ND[counts_N])

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 
 from pgts_torch.errors import Failed, ModelMismatch, PgtsError, text_of
-from pgts_torch.models.base import CONTRADICTED, ExactModel, Happened
+from pgts_torch.models.exact_model import CONTRADICTED, ExactModel, Happened
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
 
 SECONDS = 0.3

@@ -16,7 +16,8 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import ModelMismatch, PgtsError
 from pgts_torch.experiment.diagnostics import metrics
 from pgts_torch.models import CartPole, SimulatorModel, TabularModel
-from pgts_torch.models.base import CONTRADICTED, NOT_QUERIED, RANDOM, Happened, Model
+from pgts_torch.models.base import Model
+from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, Happened
 from pgts_torch.tabular import TabularMDP
 from tests.forks import on_ranks
 from tests.support import same_values

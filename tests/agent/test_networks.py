@@ -8,7 +8,7 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch.agent import networks
-from pgts_torch.agent.networks import Encoder, Network, RunningNorm, make_trunk
+from pgts_torch.agent.networks import Encoder, Network, RunningNorm, default_network, make_trunk
 from pgts_torch.errors import PgtsError
 from pgts_torch.options import CNN, MLP
 from pgts_torch.seeding import stream
@@ -197,6 +197,13 @@ def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_cha
 def test_invalid_networks_and_observation_spaces_are_refused(make, message):
     with pytest.raises(PgtsError, match=message):
         make()
+
+
+def test_by_default_large_images_are_strided_so_that_a_network_stays_small():
+    assert default_network(VIEWS) == CNN()
+    assert default_network(VECTORS) == default_network(STATES) == MLP()
+    atari = spaces.Box(0, 255, (210, 160, 3), np.uint8)
+    assert sum(value.numel() for value in network(default_network(atari), atari).parameters()) < 5_000_000
 
 
 def test_sizes_may_be_lists():
