@@ -18,9 +18,9 @@ from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.search.upper import UpperBound
 
-Trust = Literal["proved", "critic", "drawn starts"]
+Trust = Literal["proved", "critic", "sampled starts"]
 """How far a certificate can be trusted. "proved": it is a proof. "critic": up to the critic's error at start states.
-"drawn starts": up to that error, and with 95 % confidence, because start states are known from episodes only."""
+"sampled starts": up to that error, and with 95 % confidence, because start states are known from episodes only."""
 
 CONFIDENCE = 0.95
 """The probability that all certificates of a run hold together, where start states are sampled."""
@@ -93,7 +93,7 @@ class Certificates:
     def trust(self) -> Trust:
         """How far the certificates can be trusted."""
         if self._world.start_S is None:
-            return "drawn starts"
+            return "sampled starts"
         return "proved" if self._critic.is_exact and self._search.model.exact else "critic"
 
     def check(self, wanted: str) -> None:

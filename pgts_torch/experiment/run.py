@@ -110,7 +110,7 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
 def _out_of_reach(config: Config, algorithm: PGTS) -> str:
     """Why search.stop_at cannot be reached by any certificate; empty where it can."""
     target, certificates, episodes = config.search.stop_at, algorithm.certificates, config.rollout.num_envs
-    if target is None or certificates is None or certificates.trust != "drawn starts":
+    if target is None or certificates is None or certificates.trust != "sampled starts":
         return ""
     if (least := certificates.width(episodes)) <= target:
         return ""
@@ -289,7 +289,7 @@ class _Recorder:
         return {
             "certificate": bound if math.isfinite(bound) else None,
             "certificate_is_proved": trust == "proved",
-            "certificate_confidence": CONFIDENCE if trust == "drawn starts" else 1.0,
+            "certificate_confidence": CONFIDENCE if trust == "sampled starts" else 1.0,
         }
 
     def _table(self) -> Tensor | None:

@@ -21,15 +21,15 @@ def following(pi_SA: Tensor) -> SimplexPolicy:
     return policy
 
 
-def copies(mdp: TabularMDP, num_envs: int, **kwargs) -> TabularVectorEnv:
+def vector_env(mdp: TabularMDP, num_envs: int, **kwargs) -> TabularVectorEnv:
     return TabularVectorEnv(mdp, num_envs, autoreset_mode=AutoresetMode.DISABLED, **kwargs)
 
 
 def experience(
     mdp: TabularMDP, pi_SA: Tensor, horizon: Horizon, *, episodes: int, seed: int = 0, gamma=np.nan
 ) -> Rollout:
-    """Episodes in copies of the MDP, which knows its own discounts: `gamma` must not be needed."""
-    return made_in(copies(mdp, episodes), following(pi_SA), horizon, gamma=gamma, seed=seed)
+    """Episodes in the MDP, which knows its own discounts: `gamma` must not be needed."""
+    return made_in(vector_env(mdp, episodes), following(pi_SA), horizon, gamma=gamma, seed=seed)
 
 
 def made_in(
@@ -42,7 +42,7 @@ def made_in(
     names: tuple[str | int, ...] = ("test",),
     generator: torch.Generator | None = None,
 ) -> Rollout:
-    """A rollout in the world of these copies; `gamma` is the discount of steps that name none."""
+    """A rollout in the world of these environments; `gamma` is the discount of steps that name none."""
     world = TabularWorld(env, tabular_truth(env, gamma=0.9))
     world.gamma = gamma
     generator = generator or stream(seed, *names)

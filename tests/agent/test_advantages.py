@@ -9,7 +9,7 @@ from pgts_torch import PGTS
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import random_mdp
 from pgts_torch.tabular.ascent import centred
-from tests.agent.helpers import copies
+from tests.agent.helpers import vector_env
 from tests.support import rewarded
 
 UPDATES = {"softmax": "mirror", "simplex": "projected", "mlp": "ppo"}
@@ -70,7 +70,7 @@ def test_a_constant_added_to_all_rewards_of_a_continuing_task_moves_no_policy(po
     mdp = random_mdp(6, 3, seed=2)
 
     def trained(constant: float) -> torch.Tensor:
-        env = copies(rewarded(mdp, constant=constant), 4)
+        env = vector_env(rewarded(mdp, constant=constant), 4)
         options = {"policy": policy, "critic": "exact", "update": UPDATES[policy]}
         model = PGTS(env, depth=depth, horizon={"type": "fixed", "length": 10}, **options)
         for _ in range(4):

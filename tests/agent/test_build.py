@@ -40,10 +40,10 @@ from pgts_torch.options import (
 )
 from pgts_torch.options.arguments import described, read
 from pgts_torch.options.training import Training
-from tests.agent.helpers import copies
+from tests.agent.helpers import vector_env
 from tests.support import zoo
 
-WORLD = TabularWorld(copies(zoo("ladder"), 2), zoo("ladder"))
+WORLD = TabularWorld(vector_env(zoo("ladder"), 2), zoo("ladder"))
 
 
 def given(**arguments) -> Training:

@@ -10,7 +10,7 @@ from pgts_torch import PGTS
 from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.evaluate import Score, evaluate
 from pgts_torch.errors import PgtsError
-from tests.agent.helpers import copies, same_bits
+from tests.agent.helpers import same_bits, vector_env
 from tests.agent.test_world import same_weights
 from tests.support import right_with
 
@@ -153,7 +153,7 @@ def test_an_environment_given_as_an_object_is_evaluated_in_new_ones_of_its_kind(
     lengths = [evaluate(PGTS(env, depth=0, num_envs=2), episodes=3).episodic_length.mean for env in given]
     assert lengths == [100.0] * 3  # always left, until the time limit
     with pytest.raises(PgtsError, match="VectorEnv of which no others can be made; give a SyncVectorEnv or an id"):
-        evaluate(PGTS(copies(short_lake().mdp, 2)), episodes=2)
+        evaluate(PGTS(vector_env(short_lake().mdp, 2)), episodes=2)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from pgts_torch.search.upper import UpperBound
 from pgts_torch.seeding import numpy_stream
 from pgts_torch.tabular import TabularMDP, exact, random_mdp
 from tests import reliability
-from tests.agent.helpers import copies
+from tests.agent.helpers import vector_env
 
 ROUNDING = 1e-11
 """In units of the largest value: of the optimum that the certificates are held to."""
@@ -55,7 +55,7 @@ def false_proofs(seeds: range, iterations: int) -> tuple[int, int, int]:
         mdp, arguments = random_case(seed)
         optimum = exact.optimal(mdp)
         slack = ROUNDING * float(optimum.q_SA.abs().max())
-        model = PGTS(copies(mdp, 1 + seed % 3), seed=seed, **arguments)
+        model = PGTS(vector_env(mdp, 1 + seed % 3), seed=seed, **arguments)
         assert model.certificates.trust == "proved"
         for _ in range(iterations):
             evaluation = exact.evaluate(mdp, model.policy.table())
@@ -114,7 +114,7 @@ def test_a_start_that_no_search_has_expanded_counts_as_the_highest_value():
     apart = TabularMDP.from_dense(
         np.eye(2)[:, None].repeat(2, 1), np.array([[1.0, 0.0], [0.0, 1.0]]), 0.5, start=None, order="SAS"
     )
-    model = PGTS(copies(apart, 1), critic="exact", depth=8, seed=1)
+    model = PGTS(vector_env(apart, 1), critic="exact", depth=8, seed=1)
     visited = model.iterate()
     assert visited.state_N.tolist() in ([0], [1])
     # It loses 1 of the 2 that are to be had in each state, and the other one is known to be worth at most 2.
@@ -143,7 +143,7 @@ def test_only_an_exact_critic_in_a_table_proves(arguments, trust):
 def test_starts_that_are_known_from_resets_only_prove_nothing(monkeypatch):
     model = PGTS("pgts/Ladder-v0", num_envs=2, critic="exact")
     monkeypatch.setattr(model.world, "start_S", None)
-    assert model.certificates.trust == "drawn starts"
+    assert model.certificates.trust == "sampled starts"
     assert model.iterate().certificate == math.inf  # two starts say too little
 
 
@@ -153,7 +153,7 @@ def test_an_estimate_over_sampled_starts_is_above_the_gap_and_narrows_with_their
         np.eye(2)[:, None].repeat(2, 1), np.array([[1.0, 0.0], [0.0, 1.0]]), 0.5, start=None, order="SAS"
     )
     for num_envs in (200, 3_200):
-        model = PGTS(copies(mdp, num_envs), critic="exact", depth=20)
+        model = PGTS(vector_env(mdp, num_envs), critic="exact", depth=20)
         model.world.start_S = None
         width = 2 * math.sqrt(math.log(math.pi**2 / 0.3) / (2 * num_envs))
         assert model.iterate().certificate == pytest.approx(1 + width, abs=1e-5)
@@ -162,7 +162,7 @@ def test_an_estimate_over_sampled_starts_is_above_the_gap_and_narrows_with_their
 def test_a_pruned_lookahead_has_no_certificate_where_starts_are_sampled():
     mdp = random_mdp(30, 3, branching=2, seed=0, gamma=0.5, start=None)
     for width, is_known in ((None, True), (3, False)):
-        model = PGTS(copies(mdp, 3_200), critic="exact", depth=3, search={"type": "expectimax", "max_width": width})
+        model = PGTS(vector_env(mdp, 3_200), critic="exact", depth=3, search={"type": "expectimax", "max_width": width})
         model.world.start_S = None
         assert math.isfinite(model.iterate().certificate) is is_known
 
@@ -200,7 +200,7 @@ def test_the_error_of_an_exact_critic_covers_its_rounding():
     """Held to the same equation in fractions of arbitrary precision."""
     for seed in range(5):
         mdp = random_mdp(6, 2, branching=2, seed=seed, gamma=0.99)
-        model = PGTS(copies(mdp, 1), critic="exact")
+        model = PGTS(vector_env(mdp, 1), critic="exact")
         pi_SA = model.policy.table()
         model.iterate()
         truth = float(sum(p * v for p, v in zip(map(Fraction, mdp.start_S.tolist()), solved(mdp, pi_SA), strict=True)))

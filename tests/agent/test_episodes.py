@@ -1,4 +1,4 @@
-"""Copies step one by one or together; what follows from their episodes is the same."""
+"""Environments are stepped one by one or together; their episodes are the same."""
 
 from functools import partial
 
@@ -17,7 +17,7 @@ from pgts_torch.seeding import stream
 
 
 class Counted(gymnasium.Wrapper):
-    """Counts its steps; every third one has a discount of its own, in each copy another one."""
+    """Counts its steps; every third one has a discount of its own, in each environment another one."""
 
     def __init__(self, env, phase):
         super().__init__(env)
@@ -38,7 +38,7 @@ class Halved(SyncVectorEnv):
         return observation, reward_B / 2, *rest
 
 
-def copies(kind: type[SyncVectorEnv] = SyncVectorEnv) -> SyncVectorEnv:
+def envs_of(kind: type[SyncVectorEnv] = SyncVectorEnv) -> SyncVectorEnv:
     make = lambda phase: Counted(gymnasium.make("CartPole-v1", max_episode_steps=-1), phase)  # noqa: E731
     return kind([partial(make, phase) for phase in range(6)], autoreset_mode=AutoresetMode.DISABLED)
 
@@ -50,17 +50,17 @@ def made(env: VectorEnv, horizon: Horizon = FixedHorizon(length=100)) -> Rollout
 
 
 def test_environments_whose_episode_is_over_are_not_stepped():
-    env, together = copies(), copies()
+    env, together = envs_of(), envs_of()
     experience = made(env)
-    assert sum(copy.num_steps for copy in env.envs) == experience.num_steps < experience.alive_TB.numel()
-    assert [copy.num_steps for copy in env.envs] == experience.alive_TB.sum(0).tolist()
+    assert sum(each.num_steps for each in env.envs) == experience.num_steps < experience.alive_TB.numel()
+    assert [each.num_steps for each in env.envs] == experience.alive_TB.sum(0).tolist()
     made(VectorWrapper(together))
-    assert sum(copy.num_steps for copy in together.envs) == experience.alive_TB.numel()
+    assert sum(each.num_steps for each in together.envs) == experience.alive_TB.numel()
 
 
 @pytest.mark.parametrize("horizon", [FixedHorizon(length=100), FixedHorizon(length=7), GeometricHorizon()], ids=str)
 def test_stepping_one_by_one_gives_the_episodes_of_stepping_together(horizon):
-    alone, together = made(copies(), horizon), made(VectorWrapper(copies()), horizon)
+    alone, together = made(envs_of(), horizon), made(VectorWrapper(envs_of()), horizon)
     alive_TB = alone.alive_TB
     assert torch.equal(alive_TB, together.alive_TB)
     for name in ("action_TB", "reward_TB", "weight_TB", "survival_TB"):
@@ -72,10 +72,10 @@ def test_stepping_one_by_one_gives_the_episodes_of_stepping_together(horizon):
 
 @pytest.mark.parametrize("together", [False, True])
 def test_a_discount_in_info_is_that_of_its_environment(together):
-    experience = made(VectorWrapper(copies()) if together else copies(), FixedHorizon(length=7))
+    experience = made(VectorWrapper(envs_of()) if together else envs_of(), FixedHorizon(length=7))
     named_TB = (torch.arange(1, 8)[:, None] + torch.arange(6)) % 3 == 0
     assert torch.equal(experience.discount_TB, torch.from_numpy(np.where(named_TB, 0.5, 0.9)))
 
 
 def test_a_vector_environment_with_its_own_step_method_is_stepped_by_it():
-    assert float(made(copies(Halved)).returns()[0]) == float(made(copies()).returns()[0]) / 2
+    assert float(made(envs_of(Halved)).returns()[0]) == float(made(envs_of()).returns()[0]) / 2

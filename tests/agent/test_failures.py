@@ -1,4 +1,4 @@
-"""A user's environment that fails: one error names the environment, the step and the seeds of its copies."""
+"""A user's environment that fails: one error names the environment, the step and the seeds of its episodes."""
 
 import re
 

@@ -17,7 +17,7 @@ from pgts_torch.search import expectimax
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, exact, ladder, random_mdp
 from pgts_torch.tabular.ascent import softmax_direction
-from tests.agent.helpers import copies, z_scores
+from tests.agent.helpers import vector_env, z_scores
 from tests.support import random_policy, right_with, uniform_policy
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")  # other tests check them; here they cost half the time
@@ -40,7 +40,7 @@ def sampled_directions(problem: str, depth: int, critic: str) -> Tensor:
     mdp, pi_SA = PROBLEMS[problem]
     policy = SoftmaxPolicy(mdp.num_states, mdp.num_actions)
     algorithm = PGTS(
-        copies(mdp, 150),
+        vector_env(mdp, 150),
         depth=depth,
         policy=policy,
         critic=critic if critic == "exact" else {"type": critic, "samples": 64},

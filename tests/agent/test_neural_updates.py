@@ -34,7 +34,7 @@ from pgts_torch.options import (
 )
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact, random_mdp
-from tests.agent.helpers import copies, made_in
+from tests.agent.helpers import made_in, vector_env
 
 
 def maker(kind: type[NetworkUpdate], options: type[Part], **given: Any) -> Callable[..., NetworkUpdate]:
@@ -379,7 +379,7 @@ def test_a_policy_and_a_critic_learn_from_sampled_actions_alone(update):
     critic = NetworkCritic(
         spaces.Discrete(6), 2, NetworkValues(network=MLP(hidden=(16,)), learning_rate=0.01, num_epochs=4)
     )
-    env, states, returns = copies(mdp, 16), torch.arange(6), []
+    env, states, returns = vector_env(mdp, 16), torch.arange(6), []
     for k in range(20):
         generator = stream(k, "learning")
         returns.append(exact.evaluate(mdp, policy.probs(states)).J)

@@ -57,7 +57,7 @@ def last_replaced(numbers: object, value: float) -> np.ndarray:
 
 
 def in_steps(patch: pytest.MonkeyPatch, model: PGTS, change: Callable[..., tuple]) -> None:
-    """Change what is answered by the last copy, or by all where copies step together."""
+    """Change what is returned by the last environment, or by all where they are stepped together."""
     env = model.world.env
     stepped = env.envs[-1] if isinstance(env, SyncVectorEnv) else env
     step = stepped.step

@@ -14,7 +14,7 @@ from pgts_torch.options import Mirror, SoftmaxGradient, TabularValues
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact, grid, ladder
 from pgts_torch.tabular.ascent import projected_step
-from tests.agent.helpers import copies, same_bits
+from tests.agent.helpers import same_bits, vector_env
 from tests.support import right_with
 
 
@@ -45,7 +45,7 @@ def test_one_iteration_is_algorithm_1():
     pi_SA = right_with(0.3, 0.6, 0.2, 0.9)
     policy.load_state_dict({"probs_SA": pi_SA})
     model = PGTS(
-        copies(mdp, 3),
+        vector_env(mdp, 3),
         depth=2,
         policy=policy,
         critic="exact",
@@ -120,7 +120,7 @@ def test_a_callback_sees_every_iteration_and_ends_the_training_by_returning_fals
 def test_predict_returns_actions_in_the_shape_of_the_observations():
     policy = SimplexPolicy(5, 2)
     policy.load_state_dict({"probs_SA": right_with(0.9, 0.1, 0.5, 0.0, 1.0)})
-    model = PGTS(copies(ladder(), 2), policy=policy)
+    model = PGTS(vector_env(ladder(), 2), policy=policy)
     assert model.predict(0) == 1
     assert isinstance(model.predict(np.int64(0)), np.integer)
     assert model.predict([3, 4, 1]).tolist() == [0, 1, 0]
@@ -135,7 +135,7 @@ def test_predict_samples_from_the_policy_unless_deterministic():
     # 5 standard errors of 4,000 draws: fails by chance with probability 6e-7, here and call by call.
     policy = SimplexPolicy(5, 2)
     policy.load_state_dict({"probs_SA": right_with(0.7, 0.0, 0.0, 0.0, 1.0)})
-    model, twin = (PGTS(copies(ladder(), 2), policy=policy) for _ in range(2))
+    model, twin = (PGTS(vector_env(ladder(), 2), policy=policy) for _ in range(2))
     drawn = model.predict(np.zeros(4000, dtype=np.int64), deterministic=False)
     assert abs(drawn.mean() - 0.7) < 5 * (0.21 / 4000) ** 0.5
     assert np.array_equal(drawn, twin.predict(np.zeros(4000, dtype=np.int64), deterministic=False))
@@ -285,8 +285,8 @@ def test_an_environment_without_a_model_is_refused_with_what_is_missing():
         ({"env": "pgts/Nowhere-v0"}, "pgts/Nowhere-v0 cannot be made"),
         ({"horizon": 3}, "horizon is 3"),
         ({"critic": 3}, "critic is 3"),
-        ({"env": copies(ladder(), 4), "gamma": 0.5}, "gamma is 0.5; the environment has its own, 0.9"),
-        ({"env": copies(ladder(), 2), "env_kwargs": {"n": 3}}, "takes none"),
+        ({"env": vector_env(ladder(), 4), "gamma": 0.5}, "gamma is 0.5; the environment has its own, 0.9"),
+        ({"env": vector_env(ladder(), 2), "env_kwargs": {"n": 3}}, "takes none"),
     ],
 )
 def test_arguments_that_do_not_fit_are_refused(kwargs, message):
@@ -315,7 +315,7 @@ def test_sampled_advantages_are_refused_with_parts_that_they_do_not_fit(options,
 
 def test_parts_may_be_given_as_objects():
     model = PGTS(
-        copies(grid(4, traps=(5,)), 3),
+        vector_env(grid(4, traps=(5,)), 3),
         policy=SoftmaxPolicy(16, 4),
         critic=TabularCritic(16, 4, TabularValues(target="q")),
         update=SoftmaxUpdate(SoftmaxGradient(step_size=0.2)),

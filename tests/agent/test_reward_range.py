@@ -11,7 +11,7 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import ModelMismatch, PgtsError
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.tabular import exact, random_mdp, stationary
-from tests.agent.helpers import copies
+from tests.agent.helpers import vector_env
 
 
 class Walk(gymnasium.Env):
@@ -69,7 +69,7 @@ def test_an_adaptive_depth_in_a_simulator_is_less_than_its_largest():
     model = walking(depth="adaptive", reward_range=(0, 1))
     iterations = [model.iterate() for _ in range(3)]
     assert max(iteration.depth for iteration in iterations) < 64
-    assert iterations[-1].certificate == math.inf  # four drawn starts prove nothing
+    assert iterations[-1].certificate == math.inf  # four sampled starts prove nothing
 
 
 def test_values_follow_from_the_range_and_bound_those_that_there_are():
@@ -110,9 +110,9 @@ def test_a_table_with_other_rewards_is_refused_and_one_within_keeps_the_smaller_
     mdp = random_mdp(5, 2, seed=0, gamma=0.9)
     high = float(mdp.outcomes.reward_NA.max())
     with pytest.raises(ModelMismatch, match=r"reward_range says that all are from 0 to 0\.5"):
-        PGTS(copies(mdp, 2), reward_range=(0, 0.5))
+        PGTS(vector_env(mdp, 2), reward_range=(0, 0.5))
     for promised in (high, 1000.0):
-        model = PGTS(copies(mdp, 2), reward_range=(-1000, promised)).world.model
+        model = PGTS(vector_env(mdp, 2), reward_range=(-1000, promised)).world.model
         assert model.highest_value == pytest.approx(high / 0.1)
 
 

@@ -15,12 +15,12 @@ from pgts_torch.options import FixedHorizon, GeometricHorizon
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder
 from tests.agent.helpers import (
-    copies,
     experience,
     following,
     made_in,
     same_bits,
     transitions,
+    vector_env,
     visit_z_scores,
     weight_by_episode,
     z_scores,
@@ -203,15 +203,7 @@ def test_rollouts_of_gymnasiums_environments_are_transitions_of_their_tables(nam
     assert isinstance(env, SyncVectorEnv)
     check_vector_env(env)
     mdp = TabularMDP.from_gymnasium(env.envs[0], 0.9)
-    made = made_in(
-        env,
-        following(uniform_policy(mdp)),
-        FixedHorizon(length=250),  # longer than FrozenLake's and Taxi's own time limits
-        gamma=0.9,
-        seed=0,
-        names=("test",),
-        generator=stream(0, "test"),
-    )
+    made = made_in(env, following(uniform_policy(mdp)), FixedHorizon(length=250), gamma=0.9)
     table = env.envs[0].unwrapped.P
     for s, a, reward, discount, child in transitions(made):
         listed = {(float(r), 0.0 if over else 0.9, next_state) for p, next_state, r, over in table[s][a] if p > 0}
@@ -231,15 +223,7 @@ def test_our_environments_make_the_same_kind_of_rollout_together_and_one_by_one(
         name, 3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED}
     )
     for env in (together, single):
-        made = made_in(
-            env,
-            following(uniform_policy(mdp)),
-            FixedHorizon(length=30),
-            gamma=float("nan"),
-            seed=3,
-            names=("test",),
-            generator=stream(0, "test"),
-        )
+        made = made_in(env, following(uniform_policy(mdp)), FixedHorizon(length=30), gamma=float("nan"), seed=3)
         for s, a, reward, discount, child in transitions(made):
             assert (child, discount) in outcomes_of(mdp, s, a)
             assert reward == mdp.outcomes.reward_NA[s, a]
@@ -262,9 +246,6 @@ def test_a_time_limit_cuts_an_episode_without_terminating_it(name):
         following(torch.full((num_states, num_actions), 1 / num_actions, dtype=torch.float64)),
         FixedHorizon(length=10),
         gamma=0.9,
-        seed=0,
-        names=("test",),
-        generator=stream(0, "test"),
     )
     cut_B = made.alive_TB[3] & (made.discount_TB[3] > 0)
     assert cut_B.any()
@@ -282,13 +263,7 @@ def test_an_environment_that_is_truncated_early_counts_no_longer():
             return *answer, truncated, info
 
     made = made_in(
-        FirstCopyIsCut(copies(ladder(), 3)),
-        following(uniform_policy(ladder())),
-        FixedHorizon(length=5),
-        gamma=0.9,
-        seed=0,
-        names=("test",),
-        generator=stream(0, "test"),
+        FirstCopyIsCut(vector_env(ladder(), 3)), following(uniform_policy(ladder())), FixedHorizon(length=5), gamma=0.9
     )
     assert made.alive_TB.sum(0).tolist() == [1, 5, 5]
     assert (made.weight_TB > 0).sum(0).tolist() == [1, 5, 5]
@@ -300,15 +275,7 @@ def test_the_environments_own_time_limit_is_off_in_training():
         env = EnvSource.of(name, gamma=0.9, kwargs={"is_slippery": False} if name == "FrozenLake-v1" else {}).make(1)
         num_states, num_actions = int(env.single_observation_space.n), int(env.single_action_space.n)
         left_SA = torch.eye(num_actions, dtype=torch.float64)[0].repeat(num_states, 1)
-        made = made_in(
-            env,
-            following(left_SA),
-            FixedHorizon(length=300),
-            gamma=0.9,
-            seed=0,
-            names=("test",),
-            generator=stream(0, "test"),
-        )
+        made = made_in(env, following(left_SA), FixedHorizon(length=300), gamma=0.9)
         assert made.num_steps == 300
 
 
@@ -340,7 +307,7 @@ def test_neighbouring_seeds_and_iterations_hand_disjoint_seeds_to_the_environmen
     # 800 words of 32 bits: two of them are equal by chance with probability 1e-4.
     words: list[int] = []
     mdp = ladder()
-    env = Recorded(copies(mdp, 16))
+    env = Recorded(vector_env(mdp, 16))
     for seed in range(10):
         for iteration in range(5):
             names = ("iteration", iteration)
@@ -373,7 +340,7 @@ def test_actions_that_are_not_counted_from_0_are_refused():
     with pytest.raises(PgtsError, match=r"the actions of Pendulum-v1 are continuous, Box"):
         EnvSource.of("Pendulum-v1").make(2)
     with pytest.raises(PgtsError, match=r"are Discrete\(2, start=1\)"):
-        check_vector_env(Shifted(copies(ladder(), 2)))
+        check_vector_env(Shifted(vector_env(ladder(), 2)))
 
 
 @pytest.mark.fault("unknown environment", "deprecated environment")

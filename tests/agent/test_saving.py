@@ -199,7 +199,7 @@ def test_other_files_and_no_file_are_refused_by_name(tmp_path):
         lambda: gymnasium.make("FrozenLake-v1"),
         lambda: functools.partial(gymnasium.make, "FrozenLake-v1", is_slippery=False),
     ],
-    ids=["copies", "instance", "function"],
+    ids=["vector env", "instance", "function"],
 )
 def test_a_model_of_an_environment_that_is_an_object_is_loaded_with_one(env, tmp_path):
     path = tmp_path / "model.pt"

@@ -8,7 +8,7 @@ import torch
 
 from pgts_torch import PGTS
 from pgts_torch.tabular import TabularMDP, corridor, deep_sea, grid, random_mdp, river_swim
-from tests.agent.helpers import copies
+from tests.agent.helpers import vector_env
 from tests.support import rewarded
 
 MDPS = {
@@ -30,7 +30,7 @@ OPTIONS = {
 def trained(mdp: TabularMDP, *, iterations: int = 5, **options) -> list[torch.Tensor]:
     """The policies of a training."""
     options = {"num_envs": 4, "horizon": {"type": "fixed", "length": 12}} | options
-    model = PGTS(copies(mdp, options["num_envs"]), **options)
+    model = PGTS(vector_env(mdp, options["num_envs"]), **options)
     policies = []
     for _ in range(iterations):
         model.iterate()
