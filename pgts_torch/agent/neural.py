@@ -15,6 +15,7 @@ from pgts_torch.agent.networks import Network, Trunk, default_network, make_trun
 from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
+from pgts_torch.agent.states import check_keys
 from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.options.critics import NetworkValues
@@ -197,9 +198,10 @@ class NetworkCritic(Critic):
         return state | ({"target_network": self._target_network.plain_state()} if self._lags else {})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        wanted = {"network", "optimiser", "mean", "scale", "num_fits"} | ({"target_network"} if self._lags else set())
-        if set(state) != wanted:
-            raise PgtsError(f"the state of a network critic has {sorted(wanted)}; this one has {sorted(state)}")
+        lagging = {"target_network"} if self._lags else set()
+        check_keys(
+            "the state of a network critic", state, {"network", "optimiser", "mean", "scale", "num_fits", *lagging}
+        )
         if not isinstance(state["mean"], float):
             raise PgtsError(f"mean is {state['mean']!r}; it must be a number")
         if not (isinstance(state["scale"], float) and state["scale"] >= 0):

@@ -104,6 +104,7 @@ class Rollout:
         Args:
             v: returns the values of observations; called once, with each visit and each end of an episode.
         """
+        # a visit at t has its observation in row t and the one after it in row t + 1
         needed_UB = torch.cat([self.alive_TB[:1], self.alive_TB])
         v_UB = torch.zeros_like(needed_UB, dtype=self.reward_TB.dtype)
         v_UB[needed_UB] = v(self.observation_UB[needed_UB]).to(v_UB)
@@ -124,6 +125,7 @@ class Rollout:
         if state_weight == "uniform":
             return states, torch.ones(len(states), dtype=self.weight_TB.dtype, device=states.device)
         weight_V = self.visit_weight(state_weight)
+        # the sum of the weights of all visits to a state
         weight_N = torch.zeros(len(states), dtype=weight_V.dtype, device=states.device)
         return states, weight_N.index_add_(0, row_V, weight_V)
 
@@ -131,6 +133,7 @@ class Rollout:
     def first_observation_N(self) -> Shaped[Tensor, "N ..."]:
         """The observation at the first visit to each distinct state, in the order of `visits`."""
         states, row_V = self._distinct
+        # the smallest index of a visit to each state
         visit_V = torch.arange(len(row_V), device=row_V.device)
         first_N = torch.full_like(states, len(row_V)).scatter_reduce_(0, row_V, visit_V, "amin")
         return self.observation_V[first_N]

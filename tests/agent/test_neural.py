@@ -264,7 +264,7 @@ def test_a_saved_critic_goes_on_bit_for_bit(target, polyak, tmp_path):
     assert not torch.equal(
         critics[0].v(POINTS_SD), NetworkCritic(VECTORS, 2, NetworkValues(target="v"), seed=1).v(POINTS_SD)
     )
-    with pytest.raises(PgtsError, match="the state of a network critic has"):
+    with pytest.raises(PgtsError, match="the state of a network critic lacks"):
         critics[0].load_state_dict({"network": critics[0].state_dict()["network"]})
 
 
