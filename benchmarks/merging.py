@@ -169,7 +169,7 @@ def decision_in_deep_sea(n: int, device: str) -> dict[str, Any]:
             "depth": depth,
             "enough": enough,
             "right": action == optimal_action,
-            "model_calls": topology.model_calls,
+            "model_calls": topology.table.model_calls,
             "bound": depth * (depth + 1),
         }
     return answer

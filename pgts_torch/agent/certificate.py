@@ -230,7 +230,7 @@ class Certificates:
         self._upper = None
         if state:
             assert self._search.topology is not None
-            each = torch.empty(len(self._search.topology.queried), dtype=torch.float64)
+            each = torch.empty(len(self._search.topology.table.queried), dtype=torch.float64)
             values = {name: fitting(state, name, each) for name in ("bound", "below")}
             if not all(bool(value.isfinite().all()) for value in values.values()):
                 raise PgtsError("the upper bounds of a saved search are not finite")

@@ -87,6 +87,11 @@ class MCTS(Budget):
     """The number of sampled outcomes of each action, new ones in each search; null: all outcomes are enumerated, or 4
     sampled where the model cannot enumerate them."""
 
+    @property
+    def merges(self) -> bool:
+        """Whether paths that meet in a state share one node, also where `merge` is null."""
+        return self.backup == "max" if self.merge is None else self.merge
+
     @field_validator("exploration")
     @classmethod
     def _has_exploration(cls, value: Any, info: ValidationInfo) -> Any:

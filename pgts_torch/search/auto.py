@@ -14,8 +14,9 @@ from pgts_torch.options.search import Auto, Sampled
 from pgts_torch.search.engine import SampledSearch, Search
 from pgts_torch.search.expectimax import full_width
 from pgts_torch.search.lookahead import Leaves, Lookahead
+from pgts_torch.search.memory import tree_nodes
 from pgts_torch.search.pruned import pruned
-from pgts_torch.search.topology import Topology, tree_nodes
+from pgts_torch.search.topology import Topology
 
 MOST_SAMPLES = 32
 
@@ -55,7 +56,7 @@ class AutoSearch(Search):
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
         if self.topology is not None:
-            calls_before, roots, expansions = self.topology.model_calls, len(root_B), leaves.expansions
+            calls_before, roots, expansions = self.topology.table.model_calls, len(root_B), leaves.expansions
             try:
                 if self._too_much is None or roots < self._too_much[0] or expansions < self._too_much[1]:
                     try:
@@ -75,7 +76,7 @@ class AutoSearch(Search):
         """Expectimax of the largest width that fits.
 
         Args:
-            calls_before: `topology.model_calls` before the search; what it tried in vain counts too.
+            calls_before: `topology.table.model_calls` before the search; what it tried in vain counts too.
         """
         assert self.topology is not None
         topology: Topology = self.topology
@@ -87,8 +88,8 @@ class AutoSearch(Search):
             except NodeBudgetExceeded as error:
                 if isinstance(error, MemoryBudgetExceeded):
                     # What earlier searches, or this attempt, left in the topology takes memory too: try without it.
-                    calls_left_behind += topology.model_calls - calls_before
-                    is_full = topology.num_expanded > 0
+                    calls_left_behind += topology.table.model_calls - calls_before
+                    is_full = topology.table.count > 0
                     topology = self.topology = topology.fresh()
                     calls_before = 0
                     if is_full and not is_emptied:
@@ -106,7 +107,7 @@ class AutoSearch(Search):
             )
         if 2 * max(self._width, narrow.nodes) <= self.options.max_nodes:
             self._width *= 2
-        return replace(narrow, model_calls=calls_left_behind + topology.model_calls - calls_before)
+        return replace(narrow, model_calls=calls_left_behind + topology.table.model_calls - calls_before)
 
     def _sampled(self, leaves: Leaves, root_B: Tensor, generator: torch.Generator) -> Lookahead:
         """Sparse sampling with as many samples as fit."""
@@ -147,10 +148,6 @@ class AutoSearch(Search):
             raise PgtsError(f"its width, samples and numbers of states are {counts}; they must be counts")
         if not isinstance(choices["_picked"], str) or len(choices["_most_asked"]) != 2:
             raise PgtsError("its choices are of another form")
-
-    def reset(self) -> None:
-        if self.topology is not None:
-            self.topology = self.topology.fresh()
 
     def __str__(self) -> str:
         return self._picked

@@ -13,6 +13,7 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.search.outcome_table import check_outcomes, has_weight
+from pgts_torch.search.table import with_room
 from pgts_torch.seeding import mix
 
 Share = Literal["none", "level", "search"]
@@ -136,9 +137,7 @@ class Empirical(EnumeratingModel):
 
     def _new_nodes(self, state_N: Tensor) -> Tensor:
         """Those of the distinct states that have no node; they get the next ones."""
-        room = self._model.num_states - len(self._node_S)
-        if room > 0:
-            self._node_S = torch.cat([self._node_S, self._node_S.new_full((max(room, len(self._node_S)),), -1)])
+        self._node_S = with_room(self._node_S, self._model.num_states)
         new = state_N[self._node_S[state_N] < 0]
         self._node_S[new] = self.num_states + torch.arange(len(new), device=self.device)
         return new

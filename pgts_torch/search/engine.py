@@ -75,9 +75,10 @@ class Search(ABC):
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
         """The search itself: `__call__` checks its values and counts its model calls."""
 
-    @abstractmethod
     def reset(self) -> None:
         """Drop what was learned of the model's states: their ids have been given to other states."""
+        if self.topology is not None:
+            self.topology = self.topology.fresh()
 
     def state_dict(self, *, with_states: bool) -> dict[str, Any]:
         """What later searches depend on: plain values, and a tensor on the CPU.
@@ -85,7 +86,9 @@ class Search(ABC):
         Args:
             with_states: whether states keep their ids, so that the queried ones can be named.
         """
-        queried = self.topology.queried.cpu() if with_states and self.topology is not None else torch.empty(0).long()
+        queried = (
+            self.topology.table.queried.cpu() if with_states and self.topology is not None else torch.empty(0).long()
+        )
         return {
             "choices": {name: getattr(self, name) for name in self.choices},
             "enumerates": self.topology is not None,
@@ -138,9 +141,6 @@ class ExpectimaxSearch(Search):
             return full_width(leaves, self.topology, root_B, max_nodes=max_nodes)
         return pruned(leaves, self.topology, root_B, max_width=max_width, max_nodes=max_nodes)
 
-    def reset(self) -> None:
-        self.topology = self.topology.fresh()
-
     def __str__(self) -> str:
         width = self.options.max_width
         return "expectimax" if width is None else f"expectimax, {width} states a level"
@@ -158,23 +158,10 @@ class SampledSearch(Search):
         super().__init__(model)
         self.options = options
         self._model = sampling(model, "sampled")
-        plan_levels(options.samples, 1, options.share, model)
+        plan_levels(options, 1, model)
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
-        return sparse(
-            leaves,
-            self._model,
-            root_B,
-            samples=self.options.samples,
-            share=self.options.share,
-            generator=generator,
-            replicates=REPLICATES,
-            max_nodes=self.options.max_nodes,
-            max_bytes=self.options.max_bytes,
-        )
-
-    def reset(self) -> None:
-        """It remembers nothing."""
+        return sparse(leaves, self._model, root_B, self.options, generator, replicates=REPLICATES)
 
     def __str__(self) -> str:
         return f"sampled, {self.options.samples} outcomes of each action, shared by {self.options.share}"
@@ -191,11 +178,10 @@ class MCTSSearch(Search):
     def __init__(self, model: Model, options: MCTS = MCTS()) -> None:  # noqa: B008 - frozen
         super().__init__(model)
         self.options, self.uses_prior = options, options.prior == "policy"
-        self._merge = options.backup == "max" if options.merge is None else options.merge
-        enumerates = options.samples is None and isinstance(model, EnumeratingModel)
-        self.topology = Topology(enumerating(model, "mcts"), max_bytes=options.max_bytes) if enumerates else None
         self._samples = options.samples or DEFAULT_SAMPLES
-        if not enumerates:
+        if options.samples is None and isinstance(model, EnumeratingModel):
+            self.topology = Topology(model, max_bytes=options.max_bytes)
+        else:
             sampling(model, "mcts")
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
@@ -205,25 +191,8 @@ class MCTSSearch(Search):
             samples = FixedSamples(sampling(self.model, "mcts"), samples=self._samples, key=key)
             topology = Topology(samples, max_bytes=self.options.max_bytes)
             calls_each = self._samples
-        look = grow(
-            leaves,
-            topology,
-            root_B,
-            simulations=self.options.simulations,
-            root=self.options.root,
-            rule=self.options.rule,
-            exploration=self.options.exploration,
-            wave=self.options.wave,
-            backup=self.options.backup,
-            merge=self._merge,
-            generator=generator if self.options.root == "gumbel" else None,
-            max_nodes=self.options.max_nodes,
-        )
+        look = grow(leaves, topology, root_B, self.options, generator)
         return replace(look, model_calls=look.model_calls * calls_each)
-
-    def reset(self) -> None:
-        if self.topology is not None:
-            self.topology = self.topology.fresh()
 
     def __str__(self) -> str:
         rule = self.options.rule
@@ -232,7 +201,7 @@ class MCTSSearch(Search):
             f"{rule} at the root too" if self.options.root == "rule" else rule * (rule != "gumbel"),
             "the policy as prior" * self.uses_prior,
             "mean backups" * (self.options.backup == "mean"),
-            "merged" * self._merge,
+            "merged" * self.options.merges,
             f"{self._samples} sampled outcomes of each action" * (self.topology is None),
         ]
         return ", ".join(filter(None, parts))

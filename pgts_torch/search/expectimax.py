@@ -4,7 +4,6 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from pgts_torch.bellman import backup, sweep
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.options.search import MAX_NODES
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead
@@ -30,7 +29,7 @@ def expectimax(
     before it, the others do.
 
     Paths of one level that meet in a state are one node, also across roots, and once a level brings no new state the
-    closed set is swept without further queries. In deterministic and in stochastic models the result is exact.
+    closed set is swept without further queries. The result is exact, also in stochastic models.
 
     Args:
         model: enumerates the outcomes of a state.
@@ -49,34 +48,21 @@ def expectimax(
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
     leaves, topology = Leaves(model, depth, q_leaf, v_leaf), topology_of(model, topology)
-    if max_width is not None:
-        return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
-    return full_width(leaves, topology, root_B, max_nodes=max_nodes)
+    if max_width is None:
+        return full_width(leaves, topology, root_B, max_nodes=max_nodes)
+    return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
 
 
 @torch.no_grad()
 def full_width(leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_nodes: int) -> Lookahead:
     """`expectimax` of all states of all levels, with leaves and topology at hand."""
-    calls_before = topology.model_calls
-    levels = topology.levels(root_B, leaves.expansions, max_nodes=max_nodes)
-    bottom = levels.leaves(leaves.expansions)
-    if leaves.expansions == 0:
-        q_NA = leaves.q(bottom)
-    else:
-        v_N = leaves.v(bottom)
-        if sweeps := levels.sweeps(leaves.expansions):
-            assert levels.closed is not None
-            v_N = sweep(levels.closed, v_N, sweeps)
-        for outcomes in reversed(levels.outcomes[: leaves.expansions]):
-            q_NA = backup(outcomes, v_N)
-            v_N = q_NA.amax(-1)
-    q_BA = q_NA.index_select(0, levels.root_row_B)
-    exactly_BA = torch.zeros((), dtype=q_BA.dtype, device=q_BA.device).expand(q_BA.shape)
-    return Lookahead(
-        q_BA,
-        stderr_BA=exactly_BA,
-        pruned_BA=exactly_BA,
-        model_calls=topology.model_calls - calls_before,
+    calls_before, expansions = topology.table.model_calls, leaves.expansions
+    levels = topology.levels(root_B, expansions, max_nodes=max_nodes)
+    bottom = levels.leaves(expansions)
+    q_NA = levels.back_up(leaves.v(bottom), expansions) if expansions else leaves.q(bottom)
+    return Lookahead.enumerated(
+        q_NA.index_select(0, levels.root_row_B),
+        model_calls=topology.table.model_calls - calls_before,
         critic_calls=leaves.calls,
-        nodes_per_level=levels.nodes_per_level(leaves.expansions),
+        nodes_per_level=levels.nodes_per_level(expansions),
     )

@@ -1,11 +1,12 @@
-"""The levels of a lookahead: which states it has at which depth."""
+"""The levels of a lookahead: which states it has at which depth, and how values go up through them."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.bellman import Outcomes
+from pgts_torch.bellman import Outcomes, backup, sweep
 
 
 @dataclass(eq=False)
@@ -45,12 +46,31 @@ class Levels:
             return self.closed_states
         return self.frontiers[expansions]
 
+    def back_up(self, v_N: Float[Tensor, "leaves"], expansions: int) -> Float[Tensor, "N A"]:
+        """Values of all actions in frontier 0, from values v of the leaves below `expansions` >= 1 levels."""
+        if sweeps := self.sweeps(expansions):
+            assert self.closed is not None
+            v_N = sweep(self.closed, v_N, sweeps)
+        return back_up(reversed(self.outcomes[:expansions]), v_N)
+
     def nodes_per_level(self, expansions: int) -> tuple[int, ...]:
         """How many nodes each of the levels 0 .. expansions holds."""
         frontiers = [len(frontier) for frontier in self.frontiers[: expansions + 1]]
         return (*frontiers, *[len(self.closed_states)] * (expansions + 1 - len(frontiers)))
 
     def nodes(self, expansions: int) -> int:
-        """How many nodes the levels 0 .. expansions hold together; in constant time for any depth of a closed set."""
+        """How many these are together, in constant time for any depth of a closed set."""
         frontiers = [len(frontier) for frontier in self.frontiers[: expansions + 1]]
         return sum(frontiers) + len(self.closed_states) * (expansions + 1 - len(frontiers))
+
+
+def back_up(outcomes: Iterable[Outcomes], v_N: Float[Tensor, "leaves"]) -> Float[Tensor, "N A"]:
+    """Values of all actions of the highest level, from values v of the leaves.
+
+    Args:
+        outcomes: of at least one level, from the lowest up.
+    """
+    for step in outcomes:
+        q_NA = backup(step, v_N)
+        v_N = q_NA.amax(-1)
+    return q_NA

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import final
+from typing import Self, final
 
 import scipy.special
 import torch
@@ -51,6 +51,22 @@ class Lookahead:
     bias_BA: Float[Tensor, "B A"] | None = None
     samples: int | None = None
     value_range: tuple[float, float] = (-math.inf, math.inf)
+
+    @classmethod
+    def enumerated(
+        cls,
+        q_BA: Float[Tensor, "B A"],
+        *,
+        pruned_BA: Float[Tensor, "B A"] | None = None,
+        model_calls: int,
+        critic_calls: int,
+        nodes_per_level: tuple[int, ...],
+    ) -> Self:
+        """What a search finds that enumerates outcomes: without sampling error, and by default of full width."""
+        zero_BA = q_BA.new_zeros(()).expand_as(q_BA)  # one number in memory
+        return cls(
+            q_BA, zero_BA, zero_BA if pruned_BA is None else pruned_BA, model_calls, critic_calls, nodes_per_level
+        )
 
     def interval(self, confidence: float = 0.95) -> tuple[Float[Tensor, "B A"], Float[Tensor, "B A"]]:
         """Lower and upper bounds of T^m Q, as far as sampled outcomes put it in doubt: q - bias -+ t stderr.
@@ -176,8 +192,7 @@ def unexpanded(leaves: Leaves, root_B: Int[Tensor, "B"]) -> Lookahead:
     """The lookahead of no levels: the critic's Q at the roots, called once for the distinct ones."""
     state_N, row_B = torch.unique(root_B, return_inverse=True)
     q_BA = leaves.q(state_N)[row_B]
-    zero_BA = torch.zeros_like(q_BA)
-    return Lookahead(q_BA, zero_BA, zero_BA, 0, leaves.calls, (len(state_N),))
+    return Lookahead.enumerated(q_BA, model_calls=0, critic_calls=leaves.calls, nodes_per_level=(len(state_N),))
 
 
 def check_finite(what: str, name: str, value_N: Float[Tensor, "N ..."], state_N: Int[Tensor, "N"] | None) -> None:
@@ -193,16 +208,12 @@ def check_finite(what: str, name: str, value_N: Float[Tensor, "N ..."], state_N:
         raise NotFinite(f"{name} {where} is {value_N[row].tolist()}; it must be finite", what=what)
 
 
-def check_vector(root_B: Tensor) -> None:
-    """PgtsError unless these are one or more integers."""
+def check_roots(root_B: Tensor, num_states: int) -> None:
+    """PgtsError unless these are one or more states."""
     if root_B.ndim != 1 or len(root_B) == 0:
         raise PgtsError(f"root_B has shape {tuple(root_B.shape)}; it must be a vector of at least one state")
     if root_B.dtype != torch.int64:
         raise PgtsError(f"root_B is {root_B.dtype}; states are int64")
-
-
-def check_states(root_B: Tensor, num_states: int) -> None:
-    """PgtsError unless these are states."""
     off = torch.nonzero((root_B < 0) | (root_B >= num_states)).flatten()
     if len(off):
         raise PgtsError(f"root_B[{int(off[0])}] is {int(root_B[off[0]])}; states are 0 to {num_states - 1}")

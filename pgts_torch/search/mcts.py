@@ -12,13 +12,11 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.options.search import MAX_NODES, MCTS
 from pgts_torch.search.known import KnownStates
-from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_states, check_vector, unexpanded
-from pgts_torch.search.split import Rule, Selection, sigma
+from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_roots, unexpanded
+from pgts_torch.search.split import Rule, sigma
 from pgts_torch.search.topology import Topology, topology_of
-from pgts_torch.search.tree import Backup, Tree
+from pgts_torch.search.tree import Tree
 from pgts_torch.seeding import mix, sample_keys, uniform
-
-Root = Literal["gumbel", "rule"]
 
 _WHOLE = 1e-6
 """In a graph shares of simulations add up to whole ones up to rounding."""
@@ -32,12 +30,12 @@ def mcts(
     q_leaf: Leaf | None = None,
     v_leaf: Leaf | None = None,
     simulations: int,
-    root: Root = "gumbel",
+    root: Literal["gumbel", "rule"] = "gumbel",
     rule: Rule = "gumbel",
     exploration: float | None = None,
     wave: int | None = None,
     prior: Leaf | None = None,
-    backup: Backup = "max",
+    backup: Literal["max", "mean"] = "max",
     merge: bool = False,
     topology: Topology | None = None,
     generator: torch.Generator | None = None,
@@ -63,15 +61,10 @@ def mcts(
     the answer is the same bit for bit however the roots are split into batches or ordered.
 
     Args:
-        model: enumerates the outcomes of a state.
-        root_B: states of the model, int64; repeated ones cost nothing.
-        depth: m, a finite whole number of at least 0.
-        q_leaf: an estimate of Q^pi: states [N] to [N, A].
-        v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.
+        model, root_B, depth, q_leaf, v_leaf: as in `expectimax`.
         simulations: how many for each root, at least 1; the first one expands the root.
         root: sequential halving at the root, or the tree rule there too.
-        rule: how actions are selected below the root, see `Selection`.
-        exploration: c of "puct" and "uct". Default: 1.25.
+        rule, exploration: how actions are selected below the root, see `Selection`. Default of c: 1.25.
         wave: the most simulations of one action of a root (with root="rule": of the root) that are under way before
             values are backed up. 1 is the ordinary search, one simulation after another. Default: a whole round of
             sequential halving (with root="rule": as many as before it together): several times faster, and a little
@@ -81,8 +74,7 @@ def mcts(
             estimate q_0 and the returns G_i seen, which does not converge to T^m Q; its `pruned_BA` is inf.
         merge: a node is a (level, state), shared by all paths and roots. What a simulation could not update is
             backed up at the end.
-        topology: what earlier searches of the same model found; this search adds to it. Its `max_bytes` is the most
-            memory that the search may take. Default: a fresh one.
+        topology: as in `expectimax`. Its `max_bytes` is the most memory that the search may take.
         generator: of the Gumbel noise, one number a search. Default: no noise.
         max_nodes: the most nodes, summed over levels: those that the critic valued count too.
 
@@ -92,7 +84,7 @@ def mcts(
         NodeBudgetExceeded: more than `max_nodes` would be needed; or what is to be expanded next would not fit into
             `max_bytes`, and the model has not been queried for it.
     """
-    MCTS(
+    options = MCTS(
         simulations=simulations,
         root=root,
         rule=rule,
@@ -101,105 +93,77 @@ def mcts(
         prior="uniform" if prior is None else "policy",
         backup=backup,
         merge=merge,
+        max_nodes=max_nodes,
     )
     if root == "rule" and generator is not None:
         raise PgtsError("only root='gumbel' draws from a generator")
-    return grow(
-        Leaves(model, depth, q_leaf, v_leaf, prior),
-        topology_of(model, topology),
-        root_B,
-        simulations=simulations,
-        root=root,
-        rule=rule,
-        exploration=exploration,
-        wave=wave,
-        backup=backup,
-        merge=merge,
-        generator=generator,
-        max_nodes=max_nodes,
-    )
+    return grow(Leaves(model, depth, q_leaf, v_leaf, prior), topology_of(model, topology), root_B, options, generator)
 
 
 @torch.no_grad()
 def grow(
-    leaves: Leaves,
-    topology: Topology,
-    root_B: Int[Tensor, "B"],
-    *,
-    simulations: int,
-    root: Root,
-    rule: Rule,
-    exploration: float | None,
-    wave: int | None,
-    backup: Backup,
-    merge: bool,
-    generator: torch.Generator | None,
-    max_nodes: int,
+    leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], options: MCTS, generator: torch.Generator | None
 ) -> Lookahead:
-    """`mcts`, with leaves and topology at hand and its options checked."""
-    check_vector(root_B)
-    check_states(root_B, topology.model.num_states)
+    """`mcts`, with leaves and topology at hand."""
+    check_roots(root_B, topology.model.num_states)
     if leaves.expansions == 0:
         return unexpanded(leaves, root_B)
     state_B, row_B = root_B.unique(return_inverse=True)
-    calls_before = topology.model_calls
+    calls_before = topology.table.model_calls
     # A level is tens of small operations, each a fifth cheaper without the bookkeeping of autograd.
     with torch.inference_mode():
         known = KnownStates(topology, leaves)
         known.rows(state_B)  # before the tree is made, so that its tables have room for K outcomes at once
-        selection = Selection(rule, 1.25 if exploration is None else exploration)
-        room = len(state_B) * simulations
-        tree = Tree(known, leaves.expansions, selection, backup=backup, merge=merge, max_nodes=max_nodes, room=room)
+        tree = Tree(known, leaves.expansions, options, room=len(state_B) * options.simulations)
         node_B = tree.nodes.add_roots(state_B)
-        if root == "rule":
-            _by_rule(tree, node_B, simulations - 1, wave)
+        if options.root == "rule":
+            _by_rule(tree, node_B, options)
         else:
-            _halve(tree, node_B, simulations - 1, wave, _preference(known, state_B, generator))
+            _halve(tree, node_B, options, _preference(known, state_B, generator))
         pruned_NA = tree.backup_all(node_B)
         q_NA = tree.nodes.q_NA[node_B]
-    q_BA = q_NA[row_B]
-    return Lookahead(
-        q_BA,
-        stderr_BA=torch.zeros_like(q_BA),
+    return Lookahead.enumerated(
+        q_NA[row_B],
         pruned_BA=pruned_NA[row_B],
-        model_calls=topology.model_calls - calls_before,
+        model_calls=topology.table.model_calls - calls_before,
         critic_calls=leaves.calls,
         nodes_per_level=tree.nodes.nodes_per_level(),
     )
 
 
-def _by_rule(tree: Tree, node_B: Tensor, simulations: int, wave: int | None) -> None:
+def _by_rule(tree: Tree, node_B: Tensor, options: MCTS) -> None:
     """The tree rule at the root too. Without a given size a wave is as large as all waves before it together."""
     used_B = torch.zeros(len(node_B), dtype=torch.float64, device=node_B.device)
     while True:
         # at_B: the roots that have a whole simulation left and something to expand.
-        open_B = tree.open(node_B).any(1)
-        budget_B = (simulations - used_B + _WHOLE).floor_()
+        open_B = tree.nodes.open(node_B).any(1)
+        budget_B = (options.simulations - 1 - used_B + _WHOLE).floor_()
         at_B = ((budget_B >= 1) & open_B).nonzero().squeeze(1)
         if len(at_B) == 0:
             return
-        most_B = (
-            (used_B[at_B] + _WHOLE).floor_().clamp_min_(1) if wave is None else wave * torch.ones_like(used_B[at_B])
-        )
+        most_B = (used_B[at_B] + _WHOLE).floor_().clamp_min_(1)
+        if options.wave is not None:
+            most_B.fill_(options.wave)
         budget_B = budget_B[at_B].minimum(most_B)
         used_B[at_B] += tree.wave(node_B[at_B], tree.split(node_B[at_B], budget_B))
 
 
-def _halve(tree: Tree, node_B: Tensor, simulations: int, wave: int | None, preference_BA: Tensor) -> None:
+def _halve(tree: Tree, node_B: Tensor, options: MCTS, preference_BA: Tensor) -> None:
     """Sequential halving of the root's actions (Karnin, Koren and Somekh 2013; Danihelka et al. 2022, Sec. 3.2).
 
     The simulations of an exhausted action go to the next best one, also after the last round.
     """
+    simulations = options.simulations - 1  # the first one has expanded the root
     used_B = torch.zeros(len(node_B), dtype=torch.float64, device=node_B.device)
     alive_BA = torch.ones_like(preference_BA, dtype=torch.bool)
     place_A = torch.arange(tree.A, device=node_B.device)
     before = 0
-    for width, most in _rounds(tree.A, simulations, wave):
+    for width, most in _rounds(tree.A, simulations, options.wave):
         if width != before:  # a new round: the best `width` actions of those that are left go on
             order_BA, before = _order(tree, node_B, preference_BA, alive_BA), width
             alive_BA = torch.zeros_like(alive_BA).scatter_(1, order_BA[:, :width], True)
         # total_B1: the simulations of this wave; the best `lanes_B1` actions share them evenly, the first get one more.
-        lanes_B1 = tree.open(node_B).sum(1, keepdim=True).clamp_max_(width)
+        lanes_B1 = tree.nodes.open(node_B).sum(1, keepdim=True).clamp_max_(width)
         left_B1 = (simulations - used_B + _WHOLE).floor_().unsqueeze(1)
         total_B1 = left_B1.minimum(lanes_B1 * most)
         at_B = (total_B1.squeeze(1) >= 1).nonzero().squeeze(1)
@@ -233,7 +197,7 @@ def _order(tree: Tree, node_B: Tensor, preference_BA: Tensor, alive_BA: Tensor) 
     """The actions of each root, best first: survivors before the others, exhausted ones last."""
     score_BA = preference_BA + sigma(tree.nodes.q_NA[node_B], tree.nodes.visits_NA[node_B])
     by_score_BA = score_BA.argsort(dim=1, descending=True, stable=True)
-    rank_BA = torch.where(tree.open(node_B), torch.where(alive_BA, 0, 1), 2).gather(1, by_score_BA)
+    rank_BA = torch.where(tree.nodes.open(node_B), torch.where(alive_BA, 0, 1), 2).gather(1, by_score_BA)
     return by_score_BA.gather(1, rank_BA.argsort(dim=1, stable=True))
 
 

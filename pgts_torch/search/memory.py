@@ -1,10 +1,11 @@
-"""How much memory a search takes, counted in one place."""
+"""How much memory and how many nodes a search takes, counted and limited in one place."""
 
+import math
 from dataclasses import dataclass
 
 import torch
 
-from pgts_torch.errors import MemoryBudgetExceeded
+from pgts_torch.errors import MemoryBudgetExceeded, NodeBudgetExceeded
 
 GROWTH = 1.5
 """By how much a table that is full becomes longer."""
@@ -91,13 +92,38 @@ def search_bytes(
     return int(total)
 
 
+_SMALLER = "set a smaller depth or max_width, fewer simulations, samples or environments, or a larger"
+
+
 def check_memory(needed: int, most: int, what: str) -> None:
     """MemoryBudgetExceeded if a search would take more than that."""
     if needed > most:
         raise MemoryBudgetExceeded(
-            f"{what} would take up to {gib(needed)}; the limit is {gib(most)}: set a smaller depth or max_width, fewer "
-            "simulations, samples or environments, or a larger max_bytes"
+            f"{what} would take up to {gib(needed)}; the limit is {gib(most)}: {_SMALLER} max_bytes"
         )
+
+
+def check_nodes(nodes: int, most: int, where: str = "", more: str = "") -> None:
+    """NodeBudgetExceeded if a search has more nodes than that.
+
+    Args:
+        where: on which levels they are.
+        more: how many there may be on others.
+    """
+    if nodes > most:
+        raise NodeBudgetExceeded(
+            f"the lookahead has {nodes} nodes{where}; max_nodes is {most}{more}: {_SMALLER} max_nodes"
+        )
+
+
+def tree_nodes(roots: int, children: int, expansions: int) -> float:
+    """Nodes of trees in which no two paths meet."""
+    if children == 1:
+        return roots * (expansions + 1.0)
+    try:
+        return roots * (float(children) ** (expansions + 1) - 1) / (children - 1)
+    except OverflowError:
+        return math.inf
 
 
 def gib(num_bytes: float) -> str:

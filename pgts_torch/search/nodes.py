@@ -1,35 +1,36 @@
-"""The nodes of many search trees in one set of tables, and the memory that these take."""
+"""The nodes of many search trees in one table, and the memory that they take."""
 
+from collections.abc import Sequence
 from typing import final
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import NodeBudgetExceeded
-from pgts_torch.search.known import KnownStates, longer, widened
-from pgts_torch.search.memory import GROWTH, Sizes
+from pgts_torch.search.known import KnownStates
+from pgts_torch.search.memory import GROWTH, Sizes, check_nodes
+from pgts_torch.search.table import Table, with_room
 
 _ROOM = 2**22
 """The most edges for which there is room before they are needed."""
 
 
 @final
-class Nodes:
-    """The N nodes that have been expanded, of all roots, each with A actions and E = A * K edges, its outcomes.
+class Nodes(Table):
+    """A row for each node that has been expanded, of all roots. A node has A actions and A * K edges, its outcomes.
 
     Row 0 is no node: an edge leads there as long as its child is not expanded.
 
     known_N: the row of the node's state in `KnownStates`.
     table_row_N: that in the table of the topology, where the outcomes are.
     level_N: 0 for roots.
-    visits_NA, visits_NE: how many simulations took the action, and the outcome; in a graph shares of simulations.
+    visits_NA, visits_NAK: how many simulations took the action, and the outcome; in a graph shares of simulations.
     q_NA, v_N: backed up values.
-    value_NE: what q is backed up from: the critic's value of the child, or v of its node.
-    exhausted_outcome_NE, exhausted_action_NA, exhausted_N: -inf where nothing below is left to expand, else 0.
-    below_NE: the node of the child, or 0. In a graph it is up to date only when the node has just been backed up.
+    value_NAK: what q is backed up from: the critic's value of the child, or v of its node.
+    exhausted_NAK, exhausted_NA, exhausted_N: -inf where nothing below is left to expand, else 0.
+    below_NAK: the node of the child, or 0. In a graph it is up to date only when the node has just been backed up.
     node_at: in a graph the node of a (state, level), or 0, see `place`; in trees empty.
-    count: how many rows are filled.
+    most_arms: the most (node, action) that a wave has passed on one level.
 
     Args:
         known: what is known of states.
@@ -40,30 +41,29 @@ class Nodes:
         room: for how many nodes there is room at first.
     """
 
+    axis = "N"
+
     def __init__(
         self, known: KnownStates, bottom: int, *, merge: bool, revisits: bool, max_nodes: int, room: int
     ) -> None:
+        super().__init__(known.num_actions, known.num_outcomes, known.dtype, known.device)
         self.known, self.bottom, self.merge, self._revisits, self._max_nodes = known, bottom, merge, revisits, max_nodes
-        self.A, self.K, self.count = known.num_actions, known.num_outcomes, 1
-        self.most_arms = 0
-        """The most (node, action) that a wave has passed on one level."""
+        self.count, self.most_arms = 1, 0
         known.check_memory(0, places=self._num_places())
-        self._valued = [0] * (
-            bottom + 1
-        )  # by level: nodes that the critic has valued, each as often as edges lead there
-        most = known.topology.max_bytes // (2 * Sizes(self.A, self.K, known.dtype).node)
-        room = min(room, most, _ROOM // (self.A * self.K)) + 1
+        # By level: nodes that the critic has valued, each as often as edges lead there.
+        self._valued = [0] * (bottom + 1)
+        most = known.topology.max_bytes // (2 * Sizes(self.num_actions, self.num_outcomes, known.dtype).node)
+        room = min(room, most, _ROOM // (self.num_actions * self.num_outcomes)) + 1
 
-        def table(*shape: int, dtype: torch.dtype = known.dtype) -> Tensor:
-            return torch.zeros(shape, dtype=dtype, device=known.device)
+        def column(axes: str = "", dtype: torch.dtype | None = None) -> Tensor:
+            return self._column(axes, room=room, dtype=dtype)
 
-        A, E = self.A, self.A * self.K
-        self.known_N, self.table_row_N, self.level_N = (table(room, dtype=torch.int64) for _ in range(3))
-        self.visits_NA, self.visits_NE = table(room, A, dtype=torch.float64), table(room, E, dtype=torch.float64)
-        self.q_NA, self.v_N, self.value_NE = table(room, A), table(room), table(room, E)
-        self.exhausted_action_NA, self.exhausted_N = table(room, A), table(room)
-        self.exhausted_outcome_NE, self.below_NE = table(room, E), table(room, E, dtype=torch.int64)
-        self.node_at = table(self._graph_places() if merge else 0, dtype=torch.int64)
+        self.known_N, self.table_row_N, self.level_N = (column(dtype=torch.int64) for _ in range(3))
+        self.visits_NA, self.visits_NAK = column("A", torch.float64), column("AK", torch.float64)
+        self.q_NA, self.v_N, self.value_NAK = column("A"), column(), column("AK")
+        self.exhausted_NAK, self.exhausted_NA, self.exhausted_N = column("AK"), column("A"), column()
+        self.below_NAK = column("AK", torch.int64)
+        self.node_at = torch.zeros(self._graph_places() if merge else 0, dtype=torch.int64, device=known.device)
 
     def add(self, state_N: Int[Tensor, "N"], level: int) -> Int[Tensor, "N"]:
         """Expanded nodes for these states; no edge leads to them yet.
@@ -74,7 +74,10 @@ class Nodes:
         """
         known, N = self.known, len(state_N)
         known_N = known.rows(state_N, **self._counts(N))
-        self._reserve(N)
+        # Room also for as many outcomes of an action, and for as many states, as are known by now.
+        self._reserve(N, known.num_outcomes)
+        if self.merge:
+            self.node_at = with_room(self.node_at, self._graph_places(), fill=0)
         new = slice(self.count, self.count + N)
         self.count += N
         self.known_N[new], self.level_N[new] = known_N, level
@@ -83,21 +86,17 @@ class Nodes:
             ("table_row_N", known.table_row_T),
             ("q_NA", known.q_TA),
             ("v_N", known.v_T),
-            ("value_NE", known.value_TE),
-            ("exhausted_outcome_NE", known.exhausted_outcome_TE),
-            ("exhausted_action_NA", known.exhausted_action_TA),
+            ("value_NAK", known.value_TAK),
+            ("exhausted_NAK", known.exhausted_TAK),
+            ("exhausted_NA", known.exhausted_TA),
             ("exhausted_N", known.exhausted_T),
         ):
             torch.index_select(of_state, 0, known_N, out=getattr(self, name)[new])
         if level + 1 == self.bottom and (level == 0 or not self._revisits):
-            self.exhausted_N[new], self.exhausted_action_NA[new] = -torch.inf, -torch.inf
+            self.exhausted_N[new], self.exhausted_NA[new] = -torch.inf, -torch.inf
         self._valued[level + 1] += int(known.outcomes_T.index_select(0, known_N).sum())
-        nodes = sum(self._valued)
-        if nodes > self._max_nodes and (nodes := sum(self.nodes_per_level())) > self._max_nodes:
-            raise NodeBudgetExceeded(
-                f"the search has {nodes} nodes; max_nodes is {self._max_nodes}: "
-                "lower the simulations, search from fewer roots or raise the budget"
-            )
+        if sum(self._valued) > self._max_nodes:
+            check_nodes(sum(self.nodes_per_level()), self._max_nodes)
         return torch.arange(new.start, new.stop, device=known.device)
 
     def add_roots(self, root_B: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
@@ -112,29 +111,44 @@ class Nodes:
         """Where in `node_at` the nodes of these states stand."""
         return state_N * (self.bottom + 1) + level
 
+    def open(self, node_B: Int[Tensor, "B"]) -> Bool[Tensor, "B A"]:
+        """Actions of these nodes below which there is something to expand."""
+        return torch.isfinite(self.exhausted_NA.index_select(0, node_B))
+
+    def at_level(self, level: int, among_N: Bool[Tensor, "N"]) -> Int[Tensor, "F"]:
+        """Those of some nodes that are at this level."""
+        return (among_N & (self.level_N[: self.count] == level)).nonzero().squeeze(1)
+
+    def open_mass(self, node_F_by_level: Sequence[Tensor]) -> Float[Tensor, "B A"]:
+        """The most discounted probability that a plan after each action of the roots puts on nodes that could be
+        expanded.
+
+        Args:
+            node_F_by_level: the roots, and the nodes below them that have nodes below.
+        """
+        known = self.known
+        # mass_N: the same after each node. Above the last level all edges of a node lead to nodes that could be
+        # expanded; node 0 is one of these.
+        mass_T = known.weight_NAK(torch.arange(known.count, device=self.device)).sum(2).amax(1)
+        mass_N = mass_T.index_select(0, self.known_N[: self.count])
+        mass_N.masked_fill_(self.level_N[: self.count] + 1 >= self.bottom, 0)
+        mass_N[0] = 1
+        mass_FA = self.q_NA.new_zeros(len(node_F_by_level[0]), self.num_actions)  # of roots at the last level
+        for node_F in reversed(node_F_by_level[:-1]):
+            weight_FAK = known.weight_NAK(self.known_N.index_select(0, node_F))
+            mass_FA = (weight_FAK * mass_N.take(self.below_NAK.index_select(0, node_F))).sum(2)
+            mass_N[node_F] = mass_FA.amax(1)
+        return mass_FA
+
     def nodes_per_level(self) -> tuple[int, ...]:
         """How many nodes have been valued at each level, by the critic or by a look below."""
         if self.merge:  # then the children of a level are counted without repetition
             for level in range(self.bottom):
                 known_F = self.known_N[1 : self.count][self.level_N[1 : self.count] == level]
-                weighs_FE = torch.isfinite(self.known.exhausted_outcome_TE[known_F])
+                weighs_FAK = torch.isfinite(self.known.exhausted_TAK[known_F])
                 child_FAK = self.known.topology.table.child_RAK[self.known.table_row_T[known_F]]
-                self._valued[level + 1] = len(child_FAK.flatten(1)[weighs_FE].unique())
+                self._valued[level + 1] = len(child_FAK[weighs_FAK].unique())
         return tuple(self._valued)
-
-    def _reserve(self, rows: int) -> None:
-        """Room for so many more nodes, for as many outcomes of an action and for as many states as are known by now."""
-        if (K := self.known.num_outcomes) > self.K:
-            for name in ("visits_NE", "value_NE", "exhausted_outcome_NE", "below_NE"):
-                fill = -torch.inf if name.startswith("exhausted") else 0
-                setattr(self, name, widened(getattr(self, name), self.K, K, fill))
-            self.K = K
-        if self.merge and self._graph_places() > len(self.node_at):
-            self.node_at = longer(self.node_at, self._graph_places())
-        if self.count + rows > len(self.known_N):
-            for name, table in vars(self).items():
-                if name.endswith(("_N", "_NA", "_NE")):
-                    setattr(self, name, longer(table, max(self.count + rows, int(GROWTH * len(table)))))
 
     def _counts(self, rows: int) -> dict[str, int]:
         """What `search_bytes` counts once there are so many more nodes."""

@@ -1,80 +1,84 @@
-"""What a model has answered so far, one row a state, checked: the one copy of outcomes that searches read from."""
+"""What a model has answered so far, one row for each state, checked: the one copy of outcomes that searches read."""
 
 from typing import final
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NotFinite, PgtsError
-from pgts_torch.models.base import Model
-from pgts_torch.search.memory import GROWTH
+from pgts_torch.models.base import EnumeratingModel, Model
+from pgts_torch.search.table import Table, with_room
 
 _TOLERANCE = 1e-4
 """By how much the probabilities of a model may miss 1: enough for many of them in float32."""
 
 
 @final
-class OutcomeTable:
-    """The outcomes of the states that a model was queried for, in the order of the queries.
-
-    Room grows by a factor where it is full, so that a row costs the same however many there are. Rows at `count` and
-    beyond are room; outcomes beyond those that the model gave are padding of probability 0.
+class OutcomeTable(Table):
+    """The outcomes of the states that a model was queried for, in the order of the queries: each state only once.
 
     reward_RA, prob_RAK, discount_RAK, child_RAK: as in `Outcomes`, children as states of the model.
-    count: how many rows are filled.
-    num_outcomes: the largest K so far; 1 where nothing was added.
+    row_S: the row R of a state; -1 where the model was not queried. It may be longer than there are states.
+    model_calls: for how many (state, action) the model was queried.
+
+    Args:
+        model: enumerates outcomes.
     """
 
-    def __init__(self, model: Model) -> None:
-        A, float_, device = model.num_actions, model.dtype, model.device
-        self.reward_RA: Float[Tensor, "R A"] = torch.empty(0, A, dtype=float_, device=device)
-        self.prob_RAK: Float[Tensor, "R A K"] = torch.empty(0, A, 1, dtype=float_, device=device)
-        self.discount_RAK: Float[Tensor, "R A K"] = torch.empty(0, A, 1, dtype=float_, device=device)
-        self.child_RAK: Int[Tensor, "R A K"] = torch.empty(0, A, 1, dtype=torch.int64, device=device)
-        self.count = 0
+    axis = "R"
+
+    def __init__(self, model: EnumeratingModel) -> None:
+        super().__init__(model.num_actions, 1, model.dtype, model.device)
+        self.model, self.model_calls = model, 0
+        self.reward_RA = self._column("A")
+        self.prob_RAK, self.discount_RAK = self._column("AK"), self._column("AK")
+        self.child_RAK = self._column("AK", dtype=torch.int64)
+        self.row_S = torch.empty(0, dtype=torch.int64, device=model.device)
 
     @property
-    def num_outcomes(self) -> int:
-        return self.prob_RAK.shape[2]
+    def queried(self) -> Int[Tensor, "N"]:
+        """The states that the model was queried for, ascending."""
+        return torch.nonzero(self.row_S >= 0).flatten()
 
-    def rows(self, row_N: Int[Tensor, "N"], num_children: int) -> Outcomes:
-        """A copy of some of the rows, in the given order."""
-        return Outcomes(
-            self.reward_RA[row_N], self.prob_RAK[row_N], self.discount_RAK[row_N], self.child_RAK[row_N], num_children
-        )
+    def missing(self, state_N: Int[Tensor, "N"]) -> Int[Tensor, "missing"]:
+        """Those of the states that the model was not queried for."""
+        self.row_S = with_room(self.row_S, self.model.num_states)
+        return state_N[self.row_S[state_N] < 0]
 
-    def all(self, num_children: int) -> Outcomes:
-        """All rows, in the memory of the table."""
-        n = self.count
-        return Outcomes(self.reward_RA[:n], self.prob_RAK[:n], self.discount_RAK[:n], self.child_RAK[:n], num_children)
+    def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
+        """A copy of the outcomes of these distinct states; the model is queried for the missing ones.
 
-    def append(self, more: Outcomes) -> Int[Tensor, "N"]:
-        """Add copies of these rows, padded to the largest K so far, and return where they are."""
-        first, last = self.count, self.count + more.num_states
-        room, K = len(self.reward_RA), max(self.num_outcomes, more.num_outcomes)
-        room = room if last <= room else max(last, int(GROWTH * room))
-        columns = {
-            "reward_RA": more.reward_NA,
-            "prob_RAK": more.prob_NAK,
-            "discount_RAK": more.discount_NAK,
-            "child_RAK": more.child_NAK,
-        }
-        for name, given in columns.items():  # one after the other, so that only one is there twice
-            setattr(self, name, _padded(getattr(self, name), room, K))
-            getattr(self, name)[first:last, ..., : given.shape[-1]] = given
-        self.count = last
-        return torch.arange(first, last, device=more.device)
+        Raises:
+            PgtsError: the answer cannot be true, see `check_outcomes`.
+        """
+        missing = self.missing(state_N)
+        if len(missing):
+            answer = self.model.outcomes(missing)
+            self.model_calls += len(missing) * self.num_actions
+            check_outcomes(self.model, missing, answer)
+            # The model may have met new states, which get room before their ids are used.
+            self.row_S = with_room(self.row_S, self.model.num_states)
+            self.row_S[missing] = self._append(
+                reward_RA=answer.reward_NA,
+                prob_RAK=answer.prob_NAK,
+                discount_RAK=answer.discount_NAK,
+                child_RAK=answer.child_NAK,
+            )
+        return self._rows(self.row_S[state_N])
 
+    def all(self) -> tuple[Int[Tensor, "R"], Outcomes]:
+        """The state of each row, and the outcomes, with states as children and in the memory of the table."""
+        queried = self.queried
+        # The inverse of `row_S`.
+        state_R = torch.empty_like(queried)
+        state_R[self.row_S[queried]] = queried
+        return state_R, self._rows(slice(self.count))
 
-def _padded(column: Tensor, R: int, K: int) -> Tensor:
-    """The same column with room for R rows, and for K outcomes if it has outcomes."""
-    by_outcome = column.ndim == 3
-    if len(column) == R and (not by_outcome or column.shape[-1] == K):
-        return column
-    more = (0, K - column.shape[-1], 0, 0, 0, R - len(column)) if by_outcome else (0, 0, 0, R - len(column))
-    return torch.nn.functional.pad(column, more)
+    def _rows(self, at: Tensor | slice) -> Outcomes:
+        columns = self.reward_RA[at], self.prob_RAK[at], self.discount_RAK[at], self.child_RAK[at]
+        return Outcomes(*columns, self.model.num_states)
 
 
 def has_weight(outcomes: Outcomes) -> Bool[Tensor, "N A K"]:
@@ -86,43 +90,37 @@ def has_weight(outcomes: Outcomes) -> Bool[Tensor, "N A K"]:
 
 def check_outcomes(model: Model, state_N: Int[Tensor, "N"], outcomes: Outcomes) -> None:
     """PgtsError, naming the state, unless these can be the outcomes of these states of the model."""
-    expected, shape = (len(state_N), model.num_actions), tuple(outcomes.reward_NA.shape)
+    reward_NA, child_NAK = outcomes.reward_NA, outcomes.child_NAK
+    expected, shape = (len(state_N), model.num_actions), tuple(reward_NA.shape)
     if shape != expected:
         raise PgtsError(f"the model returned outcomes of {shape} states and actions; they must be of {expected}")
-    for name, x in (("reward", outcomes.reward_NA), ("prob", outcomes.prob_NAK), ("discount", outcomes.discount_NAK)):
+    for name, x in (("reward", reward_NA), ("prob", outcomes.prob_NAK), ("discount", outcomes.discount_NAK)):
         if x.dtype != model.dtype:
             raise PgtsError(f"the model's {name} is {x.dtype}; its dtype is {model.dtype}")
-    best_N = outcomes.reward_NA.amax(-1)
-    if not bool(best_N.isfinite().all()):
-        n = int(torch.nonzero(~best_N.isfinite())[0, 0])
+    if (off := _first(~reward_NA.amax(-1).isfinite())) is not None:
         raise NotFinite(
-            f"the model's rewards in state {int(state_N[n])} are {outcomes.reward_NA[n].tolist()}; they must be "
+            f"the model's rewards in state {int(state_N[off[0]])} are {reward_NA[off[0]].tolist()}; they must be "
             "numbers, or -inf where an action is not allowed, and one action must be",
             what="reward",
         )
+
+    def named(off: list[int]) -> str:
+        return f"of outcome {off[2]} " * (len(off) > 2) + f"of state {int(state_N[off[0]])} and action {off[1]}"
+
     # Probabilities of actions that are not allowed need not sum to 1: as if they did.
-    total_NA = torch.where(outcomes.reward_NA > -torch.inf, outcomes.prob_NAK.sum(-1), 1.0)
-    fair_NA = (total_NA - 1).abs() <= _TOLERANCE
-    if not bool(fair_NA.all()):
-        n, a = torch.nonzero(~fair_NA)[0].tolist()
-        raise PgtsError(
-            f"the model's probabilities of what follows state {int(state_N[n])} and action {a} sum to "
-            f"{float(total_NA[n, a])}"
-        )
+    total_NA = torch.where(reward_NA > -torch.inf, outcomes.prob_NAK.sum(-1), 1.0)
+    if (off := _first(~((total_NA - 1).abs() <= _TOLERANCE))) is not None:
+        raise PgtsError(f"the model's probabilities {named(off)} sum to {float(total_NA[*off])}")
     most = 1 + _TOLERANCE
     for name, x_NAK, highest in (("probability", outcomes.prob_NAK, most), ("discount", outcomes.discount_NAK, 1.0)):
-        off_NAK = ~((x_NAK >= 0) & (x_NAK <= highest))  # so put that NaN is off too
-        if bool(off_NAK.any()):
-            n, a, k = torch.nonzero(off_NAK)[0].tolist()
-            raise PgtsError(
-                f"the model's {name} of outcome {k} of state {int(state_N[n])} and action {a} is "
-                f"{float(x_NAK[n, a, k])}; it must be in [0, 1]"
-            )
-    child_NAK = outcomes.child_NAK
-    off_NAK = (child_NAK < 0) | (child_NAK >= model.num_states)
-    if off_NAK.any():
-        n, a, k = torch.nonzero(off_NAK)[0].tolist()
-        raise PgtsError(
-            f"the model leads from state {int(state_N[n])} by action {a} to {int(child_NAK[n, a, k])}; "
-            f"states are 0 to {model.num_states - 1}"
-        )
+        # So put that NaN is off too.
+        if (off := _first(~((x_NAK >= 0) & (x_NAK <= highest)))) is not None:
+            raise PgtsError(f"the model's {name} {named(off)} is {float(x_NAK[*off])}; it must be in [0, 1]")
+    if (off := _first((child_NAK < 0) | (child_NAK >= model.num_states))) is not None:
+        child = f"{int(child_NAK[*off])}; states are 0 to {model.num_states - 1}"
+        raise PgtsError(f"the model's child {named(off)} is {child}")
+
+
+def _first(off: Bool[Tensor, "..."]) -> list[int] | None:
+    """Where the first true entry is; None where there is none."""
+    return torch.nonzero(off)[0].tolist() if bool(off.any()) else None

@@ -8,8 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes, backup
-from pgts_torch.errors import NodeBudgetExceeded, check_count
-from pgts_torch.search.lookahead import Leaves, Lookahead, check_states, check_vector
+from pgts_torch.errors import check_count
+from pgts_torch.search.lookahead import Leaves, Lookahead, check_roots, unexpanded
+from pgts_torch.search.memory import check_nodes
 from pgts_torch.search.outcome_table import has_weight
 from pgts_torch.search.topology import Topology
 
@@ -55,24 +56,18 @@ def pruned(
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
     check_count("max_width", max_width)
-    check_vector(root_B)
-    check_states(root_B, topology.model.num_states)
-    calls_before = topology.model_calls
+    check_roots(root_B, topology.model.num_states)
     roots, row_B = torch.unique(root_B, return_inverse=True)
-    nodes_per_level = [len(roots)]
-    _check_budget(nodes_per_level, max_nodes)
+    nodes_per_level, calls_before = [len(roots)], topology.table.model_calls
+    _check_nodes(nodes_per_level, max_nodes)
     if leaves.expansions == 0:
-        q_NA = leaves.q(roots)
-        pruned_NA = torch.zeros_like(q_NA)
-    else:
-        levels, v_C = _expand(leaves, topology, roots, max_width, max_nodes, nodes_per_level)
-        q_NA, pruned_NA = _back_up(levels, v_C)
-    q_BA = q_NA[row_B]
-    return Lookahead(
-        q_BA,
-        stderr_BA=torch.zeros((), dtype=q_BA.dtype, device=q_BA.device).expand(q_BA.shape),
+        return unexpanded(leaves, root_B)
+    levels, v_C = _expand(leaves, topology, roots, max_width, max_nodes, nodes_per_level)
+    q_NA, pruned_NA = _back_up(levels, v_C)
+    return Lookahead.enumerated(
+        q_NA[row_B],
         pruned_BA=pruned_NA[row_B],
-        model_calls=topology.model_calls - calls_before,
+        model_calls=topology.table.model_calls - calls_before,
         critic_calls=leaves.calls,
         nodes_per_level=(*nodes_per_level, *[0] * (leaves.expansions + 1 - len(nodes_per_level))),
     )
@@ -104,13 +99,13 @@ def _expand(
         step, children = topology.step(frontier[kept_M], kept=sum(len(level.kept_M) for level in levels))
         levels.append(_Level(v_N, kept_M, step))
         nodes_per_level.append(len(children))
-        _check_budget(nodes_per_level, max_nodes)
+        _check_nodes(nodes_per_level, max_nodes)
         v_N = leaves.v(children) if len(children) else v_N[:0]
         frontier, kept_M = children, _all(children)
         if len(children) and len(levels) < leaves.expansions:
             plan.descend(levels[-1], v_N)
             if len(children) > max_width:
-                kept_M = _highest(plan.reach_N * (v_N / 2 - v_N.amin() / 2), plan.reach_N, max_width)
+                kept_M = highest(plan.reach_N * (v_N / 2 - v_N.amin() / 2), plan.reach_N, max_width)
     return levels, v_N
 
 
@@ -164,17 +159,12 @@ def _all(state_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
     return torch.arange(len(state_N), device=state_N.device)
 
 
-def _highest(priority_N: Float[Tensor, "N"], reach_N: Float[Tensor, "N"], count: int) -> Int[Tensor, "M"]:
+def highest(priority_N: Float[Tensor, "N"], reach_N: Float[Tensor, "N"], count: int) -> Int[Tensor, "M"]:
     """The positions of the highest priorities, ascending; of equal ones those of higher reach, then the first."""
     by_reach_N = reach_N.sort(descending=True, stable=True).indices
     order_N = by_reach_N[priority_N[by_reach_N].sort(descending=True, stable=True).indices]
     return order_N[:count].sort().values
 
 
-def _check_budget(nodes_per_level: list[int], max_nodes: int) -> None:
-    nodes = sum(nodes_per_level)
-    if nodes > max_nodes:
-        raise NodeBudgetExceeded(
-            f"the lookahead has {nodes} nodes on levels 0 to {len(nodes_per_level) - 1}; max_nodes is {max_nodes}: "
-            "lower the depth or the width, search from fewer roots or raise the budget"
-        )
+def _check_nodes(nodes_per_level: list[int], max_nodes: int) -> None:
+    check_nodes(sum(nodes_per_level), max_nodes, f" on levels 0 to {len(nodes_per_level) - 1}")

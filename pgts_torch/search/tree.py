@@ -8,17 +8,16 @@ they had come one by one. What could be used nowhere below goes back to the root
 """
 
 from dataclasses import dataclass, field
-from typing import Literal, final
+from typing import final
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.options.search import MCTS
 from pgts_torch.search.known import KnownStates
 from pgts_torch.search.nodes import Nodes
 from pgts_torch.search.split import Selection, apportion
-
-Backup = Literal["max", "mean"]
 
 _DUST = 1e-6
 """Shares of simulations below this are rounding and go nowhere."""
@@ -45,17 +44,10 @@ class _Step:
     used_C: Tensor = field(init=False)  # those that are used: 1 where the child is new, then what was used below it
     on_G: Tensor = field(init=False)  # position in C
     at_L: Tensor | None = None  # in a graph: position of the edge's child in C
-    edges: tuple[int, Tensor] = (0, torch.empty(0))  # what `edge` has made last, and K
 
-    def edge(self, K: int) -> Tensor:
-        """The L edges. Made once, and again where K has grown."""
-        if self.edges[0] != K:
-            self.edges = K, torch.add(self.outcome_L, self.arm_M.index_select(0, self.row_L), alpha=K)
-        return self.edges[1]
-
-    def table_edge(self, K: int) -> Tensor:
-        """The same outcomes in the table: table_arm * K + k."""
-        return torch.add(self.outcome_L, self.table_arm_M.index_select(0, self.row_L), alpha=K)
+    def edge(self, arm_M: Tensor, K: int) -> Tensor:
+        """The L edges of these arms: `arm_M`, or `table_arm_M` for the same outcomes in the table."""
+        return torch.add(self.outcome_L, arm_M.index_select(0, self.row_L), alpha=K)
 
 
 @final
@@ -65,28 +57,16 @@ class Tree:
     Args:
         known: what is known of states.
         bottom: nodes at this level are never expanded.
-        selection: how actions are selected.
-        backup: maxima, or averages of returns.
-        merge: a node is a (level, state), whatever the path that led to it: Czech et al. 2021.
-        max_nodes: the most nodes, see `Lookahead.nodes_per_level`.
+        options: how actions are selected; maxima or averages; with `merges` a node is a (level, state), whatever the
+            path that led to it (Czech et al. 2021).
         room: for how many nodes there is room at first.
     """
 
-    def __init__(
-        self,
-        known: KnownStates,
-        bottom: int,
-        selection: Selection,
-        *,
-        backup: Backup,
-        merge: bool,
-        max_nodes: int,
-        room: int,
-    ) -> None:
-        self.known, self.bottom, self.selection, self.mean = known, bottom, selection, backup == "mean"
-        self.nodes = Nodes(known, bottom, merge=merge, revisits=self.mean, max_nodes=max_nodes, room=room)
-        self.merge, self.A = merge, known.num_actions
-        self._full_T = dict[tuple[int, int], Tensor]()  # see `_full`
+    def __init__(self, known: KnownStates, bottom: int, options: MCTS, *, room: int) -> None:
+        self.known, self.bottom, self.A = known, bottom, known.num_actions
+        self.merge, self.mean = options.merges, options.backup == "mean"
+        self.selection = Selection(options.rule, 1.25 if options.exploration is None else options.exploration)
+        self.nodes = Nodes(known, bottom, merge=self.merge, revisits=self.mean, max_nodes=options.max_nodes, room=room)
 
     def wave(self, node_B: Int[Tensor, "B"], budget_BA: Float[Tensor, "B A"]) -> Float[Tensor, "B"]:
         """So many simulations below each action of these distinct roots; how many of each root could be used."""
@@ -106,10 +86,6 @@ class Tree:
 
     # Select
 
-    def open(self, node_B: Int[Tensor, "B"]) -> Bool[Tensor, "B A"]:
-        """Actions of roots below which there is something to expand."""
-        return torch.isfinite(self.nodes.exhausted_action_NA.index_select(0, node_B))
-
     def split(self, node_F: Int[Tensor, "F"], budget_F: Float[Tensor, "F"], level: int = 0) -> Float[Tensor, "F A"]:
         """How many of the simulations that pass a node take each action."""
         nodes, most_FA = self.nodes, None
@@ -117,20 +93,21 @@ class Tree:
         visits_FA = nodes.visits_NA.index_select(0, node_F)
         if not self.mean and int(budget_F.amax()) > 1:
             # No more than can be of use below the action, as far as that is known; but one, in case it is not.
-            most_FA = self.known.width_TA.index_select(0, known_F) * self._full(known_F, level).unsqueeze(1)
+            useful_F1 = self.known.useful(known_F, self.bottom - 1 - level)
+            most_FA = self.known.width_TA.index_select(0, known_F) * useful_F1
             most_FA.sub_(visits_FA).clamp_min_(1)
         return self.selection.split(
             budget_F,
             q_NA=nodes.q_NA.index_select(0, node_F),
             visits_NA=visits_FA,
             prior_NA=self.known.prior_TA.index_select(0, known_F),
-            exhausted_NA=nodes.exhausted_action_NA.index_select(0, node_F),
+            exhausted_NA=nodes.exhausted_NA.index_select(0, node_F),
             most_NA=most_FA,
         )
 
     def _select(self, node_F: Tensor, budget_FA: Tensor, level: int) -> _Step:
         """Split the simulations of each action among its outcomes."""
-        nodes, A, K = self.nodes, self.A, self.nodes.K
+        nodes, A, K = self.nodes, self.A, self.nodes.num_outcomes
         # M of the F * A actions have simulations; `at_M` is parent * A + action, so that node * A + action, the arm,
         # is at_M + (node - parent) * A.
         at_M = budget_FA.view(-1).nonzero().squeeze(1)
@@ -139,39 +116,22 @@ class Tree:
         parent_M = at_M.div(A, rounding_mode="trunc")
         node_M = node_F.index_select(0, parent_M)
         arm_M = torch.add(at_M, node_M - parent_M, alpha=A)
-        table_row_M = nodes.table_row_N.index_select(0, node_M)
-        table_arm_M = torch.add(arm_M, table_row_M - node_M, alpha=A)
+        table_arm_M = torch.add(arm_M, nodes.table_row_N.index_select(0, node_M) - node_M, alpha=A)
         # What each outcome lacks of the simulations due to it, p_k (N_a + b) - N_k: chance is enumerated evenly.
         lack_MK = self.known.topology.table.prob_RAK.view(-1, K).index_select(0, table_arm_M).double()
         lack_MK.mul_((nodes.visits_NA.view(-1).index_select(0, arm_M) + budget_M).unsqueeze(1))
-        visits_MK, most_MK = nodes.visits_NE.view(-1, K).index_select(0, arm_M), None
+        visits_MK, most_MK = nodes.visits_NAK.view(-1, K).index_select(0, arm_M), None
         lack_MK.sub_(visits_MK)
-        lack_MK.add_(nodes.exhausted_outcome_NE.view(-1, K).index_select(0, arm_M))
+        lack_MK.add_(nodes.exhausted_NAK.view(-1, K).index_select(0, arm_M))
         if not self.mean and int(budget_M.amax()) > 1:
-            known_M = nodes.known_N.index_select(0, node_M)
-            most_MK = (self._full(known_M, level).unsqueeze(1) - visits_MK).clamp_min_(1)
+            useful_M1 = self.known.useful(nodes.known_N.index_select(0, node_M), self.bottom - 1 - level)
+            most_MK = (useful_M1 - visits_MK).clamp_min_(1)
         split = apportion(lack_MK, budget_M, most_MK).view(-1)
         # L of the M * K outcomes get simulations.
         at_L = split.nonzero().squeeze(1)
         row_L = at_L.div(K, rounding_mode="trunc")
         outcome_L = torch.sub(at_L, row_L, alpha=K)
-        budget_L = split.index_select(0, at_L)
-        return _Step(level, node_F, parent_M, arm_M, table_arm_M, row_L, outcome_L, budget_L)
-
-    def _full(self, known_F: Tensor, level: int) -> Tensor:
-        """How many simulations a subtree below each outcome can use, if all states in it have as many outcomes as the
-        state that the outcome belongs to.
-
-        An estimate, in order that simulations do not crowd where there is little to expand: 1 + e + e^2 + ...
-        """
-        key = level, self.known.count
-        if key not in self._full_T:
-            outcomes_T = self.known.outcomes_T.double()
-            full_T = torch.zeros_like(outcomes_T)
-            for _ in range(self.bottom - 1 - level):
-                full_T.mul_(outcomes_T).add_(1)
-            self._full_T[key] = full_T
-        return self._full_T[key].index_select(0, known_F)
+        return _Step(level, node_F, parent_M, arm_M, table_arm_M, row_L, outcome_L, split.index_select(0, at_L))
 
     # Expand
 
@@ -182,42 +142,50 @@ class Tree:
             step.child_C, step.on_G = torch.zeros_like(step.row_L), step.row_L[:0]
             return step.budget_L[:0]
         child = self.known.topology.table.child_RAK.view(-1)
-        state_L = child.index_select(0, step.table_edge(self.nodes.K))
+        state_L = child.index_select(0, step.edge(step.table_arm_M, self.nodes.num_outcomes))
         if self.merge:
             self._expand_graph(step, state_L)
         else:
             self._expand_tree(step, state_L)
+        # G: the children with simulations left and something below them to expand.
         left_C = step.budget_C - step.used_C
         can_C = (left_C > _DUST) & (self.nodes.exhausted_N.index_select(0, step.child_C) == 0)
         step.on_G = can_C.nonzero().squeeze(1)
         return left_C.index_select(0, step.on_G)
 
     def _expand_tree(self, step: _Step, state_L: Tensor) -> None:
+        """Every edge leads to a node of its own."""
         nodes = self.nodes
-        child_L = nodes.below_NE.view(-1).index_select(0, step.edge(nodes.K))
+        child_L = nodes.below_NAK.view(-1).index_select(0, step.edge(step.arm_M, nodes.num_outcomes))
         new = (child_L == 0).nonzero().squeeze(1)
         step.budget_C, step.used_C, step.child_C = step.budget_L, torch.zeros_like(step.budget_L), child_L
         if len(new):
             node = nodes.add(state_L.index_select(0, new), step.level + 1)
             child_L.scatter_(0, new, node)
             step.used_C.index_fill_(0, new, 1)
-            nodes.below_NE.view(-1).scatter_(0, step.edge(nodes.K).index_select(0, new), node)
+            # Nodes may have more outcomes now, and edges other numbers.
+            edge_L = step.edge(step.arm_M, nodes.num_outcomes)
+            nodes.below_NAK.view(-1).scatter_(0, edge_L.index_select(0, new), node)
 
     def _expand_graph(self, step: _Step, state_L: Tensor) -> None:
         """As in trees, but the simulations of all edges that lead to a node arrive there together, and nodes that other
         paths have expanded are backed up first, so that what was found below them counts."""
         nodes, level = self.nodes, step.level + 1
+        place_L, first = nodes.place(state_L, level), nodes.count
+        child_L = nodes.node_at.index_select(0, place_L)
         # The states among the children that have no node at this level yet, each once.
-        new_C = state_L[nodes.node_at.index_select(0, nodes.place(state_L, level)) == 0].unique()
-        first = nodes.count
+        new_C = state_L[child_L == 0].unique()
         if len(new_C):
             node_C = nodes.add(new_C, level)
             nodes.node_at[nodes.place(new_C, level)] = node_C
-        child_L = nodes.node_at[nodes.place(state_L, level)]
+            child_L = nodes.node_at.index_select(0, place_L)
         step.child_C, step.at_L = child_L.unique(return_inverse=True)
         step.budget_C = step.budget_L.new_zeros(len(step.child_C)).index_add_(0, step.at_L, step.budget_L)
+        # Children ascend: the new ones are the last.
+        num_old = len(step.child_C) - len(new_C)
         step.used_C = (step.child_C >= first).to(step.budget_L.dtype)
-        self._back_up_whole(step.child_C[step.child_C < first], level)
+        if num_old:
+            self._back_up(step.child_C[:num_old], level)
 
     # Backward
 
@@ -227,59 +195,59 @@ class Tree:
         Args:
             used_G, return_G: the same of the children that more simulations passed.
         """
-        nodes = self.nodes
-        edge_L = step.edge(nodes.K)
-        used_C = step.used_C.index_add(0, step.on_G, used_G)
-        # In a graph the edges that lead to a node share what it used, as they have shared in what arrived there.
-        used_L = used_C if step.at_L is None else step.budget_L * (used_C / step.budget_C)[step.at_L]
+        nodes, edge_L = self.nodes, step.edge(step.arm_M, self.nodes.num_outcomes)
         if self.mean:  # a return can be averaged however little was expanded
             used_L = step.budget_L
+        else:
+            used_C = step.used_C.index_add(0, step.on_G, used_G)
+            # In a graph the edges that lead to a node share what it used, as they have shared in what arrived there.
+            used_L = used_C if step.at_L is None else step.budget_L * (used_C / step.budget_C)[step.at_L]
         used_M = used_G.new_zeros(len(step.arm_M)).index_add_(0, step.row_L, used_L)
         if self.mean:
             return_G = self._average(step, edge_L, return_G, used_M)
         elif self.merge:
-            self._back_up_whole(step.node_F, step.level)
+            self._back_up(step.node_F, step.level)
         else:
             # The node of a child replaces the critic's value, and says whether anything is left below the edge.
-            nodes.value_NE.view(-1).scatter_(0, edge_L, nodes.v_N.index_select(0, step.child_C))
-            nodes.exhausted_outcome_NE.view(-1).scatter_(0, edge_L, nodes.exhausted_N.index_select(0, step.child_C))
-            self._back_up(step.node_F, step.arm_M, step.table_arm_M)
+            nodes.value_NAK.view(-1).scatter_(0, edge_L, nodes.v_N.index_select(0, step.child_C))
+            nodes.exhausted_NAK.view(-1).scatter_(0, edge_L, nodes.exhausted_N.index_select(0, step.child_C))
+            self._back_up(step.node_F, step.level)
         nodes.visits_NA.view(-1).scatter_add_(0, step.arm_M, used_M)
-        nodes.visits_NE.view(-1).scatter_add_(0, edge_L, used_L)
+        nodes.visits_NAK.view(-1).scatter_add_(0, edge_L, used_L)
         return used_M.new_zeros(len(step.node_F)).index_add_(0, step.parent_M, used_M), return_G
 
-    def _back_up(self, node_F: Tensor, arm_M: Tensor, table_arm_M: Tensor) -> None:
-        """q of these actions and v of these nodes, and whether they are exhausted."""
-        nodes, table, K = self.nodes, self.known.topology.table, self.nodes.K
-        # q_MK: p_k gamma_k v_k of each outcome; their sum and the reward are q.
-        q_MK = table.prob_RAK.view(-1, K).index_select(0, table_arm_M)
-        q_MK *= table.discount_RAK.view(-1, K).index_select(0, table_arm_M)
-        q_MK *= nodes.value_NE.view(-1, K).index_select(0, arm_M)
-        q_M = q_MK.sum(1).add_(table.reward_RA.view(-1).index_select(0, table_arm_M))
-        nodes.q_NA.view(-1).scatter_(0, arm_M, q_M)
-        exhausted_M = nodes.exhausted_outcome_NE.view(-1, K).index_select(0, arm_M).amax(1)
-        nodes.exhausted_action_NA.view(-1).scatter_(0, arm_M, exhausted_M)
-        nodes.v_N.scatter_(0, node_F, nodes.q_NA.index_select(0, node_F).amax(1))
-        nodes.exhausted_N.scatter_(0, node_F, nodes.exhausted_action_NA.index_select(0, node_F).amax(1))
+    def _back_up(self, node_F: Tensor, level: int) -> None:
+        """q and v of the nodes of a level from the values at their edges, and whether they are exhausted.
 
-    def _back_up_whole(self, node_F: Tensor, level: int) -> None:
-        """In a graph: back up all actions of nodes from the children that there are now, whoever expanded them."""
-        nodes, known, A = self.nodes, self.known, self.A
-        known_F, table_row_F = nodes.known_N.index_select(0, node_F), nodes.table_row_N.index_select(0, node_F)
-        child_FE = known.topology.table.child_RAK.flatten(1).index_select(0, table_row_F)
-        below_FE = nodes.node_at.take(nodes.place(child_FE, level + 1))
-        nodes.below_NE.index_copy_(0, node_F, below_FE)
-        of_critic_FE = known.value_TE.index_select(0, known_F)
-        nodes.value_NE.index_copy_(0, node_F, torch.where(below_FE > 0, nodes.v_N.take(below_FE), of_critic_FE))
-        if level + 1 < self.bottom:
-            # Node 0, which stands for a child that is not expanded, is not exhausted.
-            exhausted_FE = known.exhausted_outcome_TE.index_select(0, known_F)
-            nodes.exhausted_outcome_NE.index_copy_(0, node_F, exhausted_FE.add_(nodes.exhausted_N.take(below_FE)))
+        In a graph these are first read from the children that there are now, whoever expanded them.
+        """
+        nodes, known = self.nodes, self.known
+        table, table_row_F = known.topology.table, nodes.table_row_N.index_select(0, node_F)
+        if self.merge:
+            known_F = nodes.known_N.index_select(0, node_F)
+            place_FAK = nodes.place(table.child_RAK.index_select(0, table_row_F), level + 1)
+            below_FAK = nodes.node_at.take(place_FAK)
+            of_critic_FAK = known.value_TAK.index_select(0, known_F)
+            value_FAK = torch.where(below_FAK > 0, nodes.v_N.take(below_FAK), of_critic_FAK)
+            if level + 1 < self.bottom:
+                # Node 0, which stands for a child that is not expanded, is not exhausted.
+                exhausted_FAK = known.exhausted_TAK.index_select(0, known_F).add_(nodes.exhausted_N.take(below_FAK))
+            else:
+                exhausted_FAK = torch.full_like(value_FAK, -torch.inf)
+            nodes.below_NAK.index_copy_(0, node_F, below_FAK)
+            nodes.exhausted_NAK.index_copy_(0, node_F, exhausted_FAK)
         else:
-            nodes.exhausted_outcome_NE.index_fill_(0, node_F, -torch.inf)
-        action_A = torch.arange(A, device=known.device)
-        arm_FA, table_arm_FA = (x_F.unsqueeze(1) * A + action_A for x_F in (node_F, table_row_F))
-        self._back_up(node_F, arm_FA.view(-1), table_arm_FA.view(-1))
+            value_FAK = nodes.value_NAK.index_select(0, node_F)
+            exhausted_FAK = nodes.exhausted_NAK.index_select(0, node_F)
+        # p_k gamma_k v_k of each outcome; their sum and the reward are q.
+        q_FAK = table.prob_RAK.index_select(0, table_row_F)
+        q_FAK *= table.discount_RAK.index_select(0, table_row_F)
+        q_FA = (q_FAK.mul_(value_FAK)).sum(2).add_(table.reward_RA.index_select(0, table_row_F))
+        exhausted_FA = exhausted_FAK.amax(2)
+        nodes.q_NA.index_copy_(0, node_F, q_FA)
+        nodes.v_N.index_copy_(0, node_F, q_FA.amax(1))
+        nodes.exhausted_NA.index_copy_(0, node_F, exhausted_FA)
+        nodes.exhausted_N.index_copy_(0, node_F, exhausted_FA.amax(1))
 
     def _average(self, step: _Step, edge_L: Tensor, return_G: Tensor, used_M: Tensor) -> Float[Tensor, "F"]:
         """q = (q_0 + sum of returns) / (1 + N). A return is a critic's value, backed up along the path.
@@ -293,7 +261,7 @@ class Tree:
         if len(step.on_G):
             ended_L[step.on_G] = step.used_C[step.on_G]
         if step.level + 1 == self.bottom:
-            value_L = nodes.value_NE.view(-1).index_select(0, edge_L)
+            value_L = nodes.value_NAK.view(-1).index_select(0, edge_L)
         else:
             value_L = nodes.v_N.index_select(0, step.child_C)
         return_L = (ended_L * value_L).index_add_(0, step.on_G, return_G)
@@ -301,8 +269,9 @@ class Tree:
         node_M = step.node_F.index_select(0, step.parent_M)
         known_arm_M = torch.add(step.arm_M, nodes.known_N.index_select(0, node_M) - node_M, alpha=self.A)
         weighed_M = self.known.weighed_TA.view(-1).index_select(0, known_arm_M)
-        carry_L = table.discount_RAK.view(-1).index_select(0, step.table_edge(nodes.K))
+        carry_L = table.discount_RAK.view(-1).index_select(0, step.edge(step.table_arm_M, nodes.num_outcomes))
         return_L *= carry_L.mul_(weighed_M.index_select(0, step.row_L))
+        # N and q of the actions before this wave, and their returns in it.
         return_M = used_M * table.reward_RA.view(-1).index_select(0, step.table_arm_M)
         return_M.index_add_(0, step.row_L, return_L)
         visits_M = nodes.visits_NA.view(-1).index_select(0, step.arm_M)
@@ -318,33 +287,16 @@ class Tree:
             node_B: the roots.
 
         Returns:
-            `Lookahead.pruned_BA`: the most discounted probability that a plan after each action of the roots puts on
-            nodes that could be expanded; inf for averages, which have no bound and are as the waves left them.
+            `Lookahead.pruned_BA`; inf for averages, which have no bound and are as the waves left them.
         """
         nodes = self.nodes
         if self.mean:
             return torch.full_like(nodes.q_NA[node_B], torch.inf)
-        known, A, K, count = self.known, self.A, nodes.K, nodes.count
-        # mass_N: the same after each node. Above the last level all edges of a node lead to nodes that could be
-        # expanded; node 0 is one of these.
-        all_T = torch.arange(known.count, device=known.device)
-        leaf_T = known.weight_NE(all_T).view(-1, A, K).sum(2).amax(1)
-        mass_N = leaf_T.index_select(0, nodes.known_N[:count])
-        mass_N.masked_fill_(nodes.level_N[:count] + 1 >= self.bottom, 0)
-        mass_N[0] = 1
-        # Trees are backed up already; there only the mass of nodes that a wave has passed is still to be found.
-        inner_N = (nodes.visits_NA[:count].sum(1) > 0) | self.merge
+        # In trees all values are backed up already, and only nodes that a wave has passed have something below.
+        inner_N = (nodes.visits_NA[: nodes.count].sum(1) > 0) | self.merge
         inner_N[node_B], inner_N[0] = True, False
-        for level in range(self.bottom - 1, -1, -1):
-            node_F = (inner_N & (nodes.level_N[:count] == level)).nonzero().squeeze(1)
-            if self.merge:
-                self._back_up_whole(node_F, level)
-            if level + 1 < self.bottom:
-                weight_FE = known.weight_NE(nodes.known_N.index_select(0, node_F))
-                below_FE = nodes.below_NE.index_select(0, node_F)
-                mass_FE = weight_FE * mass_N.index_select(0, below_FE.view(-1)).view_as(weight_FE)
-                mass_FA = mass_FE.view(-1, A, K).sum(2)
-                mass_N[node_F] = mass_FA.amax(1)
-        if self.bottom == 1:
-            return torch.zeros_like(nodes.q_NA[node_B])
-        return mass_FA  # of the roots: level 0 has no other nodes
+        node_F_by_level = [nodes.at_level(level, inner_N) for level in range(self.bottom)]
+        if self.merge:
+            for level in reversed(range(self.bottom)):
+                self._back_up(node_F_by_level[level], level)
+        return nodes.open_mass(node_F_by_level)

@@ -11,7 +11,7 @@ from pgts_torch.bellman import Outcomes
 from pgts_torch.search.topology import Topology
 from pgts_torch.tabular.exact import UNDISCOUNTED
 
-_WORK, _MOST_SWEEPS = 2**20, 256
+_WORK, MOST_SWEEPS = 2**20, 256
 """About how many outcomes are swept in one call, and the most sweeps."""
 
 _EVERY = 8
@@ -63,8 +63,8 @@ class UpperBound:
         self._bound_S = torch.empty(0, dtype=torch.float64, device=topology.model.device)
         self._below_S = self._bound_S
 
-    def tighten(self, least: int) -> None:
-        """Sweep at least so often, and further as far as the budget goes, or until nothing changes.
+    def tighten(self, least: int) -> int:
+        """Sweep at least so often, and further as far as the budget goes, or until nothing changes; how often it swept.
 
         With as many sweeps as a lookahead of full width has levels, the bound at its roots is no larger than T^n w.
         """
@@ -73,10 +73,11 @@ class UpperBound:
             self._update_states()
             if not self._settled and len(self._state_X):
                 entries = len(self._reward) * self._num_outcomes
-                times = max(least, min(_MOST_SWEEPS, _WORK // entries))
+                times = max(least, min(MOST_SWEEPS, _WORK // entries))
                 # Where X has just grown and is too large for the budget, sweeps from below would not come far enough.
                 both = self._beta < UNDISCOUNTED and (self._taken == before or times * entries <= _WORK)
-                self._sweep(times, both=both)
+                return self._sweep(times, both=both)
+        return 0
 
     def at(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         """The bound; w at states that no search has expanded."""
@@ -92,20 +93,20 @@ class UpperBound:
         return u_S1[state_N, 0]
 
     def state_dict(self) -> dict[str, Any]:
-        """What later bounds depend on, in the order of `topology.queried`, on the CPU."""
-        queried = self.topology.queried
+        """What later bounds depend on, in the order of `topology.table.queried`, on the CPU."""
+        queried = self.topology.table.queried
         return {
             "bound": self._grown(self._bound_S)[queried].cpu(),
             "below": self._grown(self._below_S)[queried].cpu(),
             "settled": self._settled,
-            "current": self._taken == self.topology.num_expanded,
+            "current": self._taken == self.topology.table.count,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` gave; the topology has preloaded the states."""
         if self.w < math.inf:
             self._update_states()
-            queried = self.topology.queried
+            queried = self.topology.table.queried
             self._bound_S[queried] = state["bound"].to(queried.device)
             self._below_S[queried] = state["below"].to(queried.device)
             self._settled = state["settled"]
@@ -115,10 +116,10 @@ class UpperBound:
     def _update_states(self) -> None:
         """Take the states that were expanded since into X. The sweeps from below start again: with more states the old
         values need not be below v_hat any more."""
-        if self._taken == self.topology.num_expanded:
+        if self._taken == self.topology.table.count:
             return
-        self._taken, self._settled = self.topology.num_expanded, False
-        self._state_X, outcomes = _without_ends(*self.topology.expanded())
+        self._taken, self._settled = self.topology.table.count, False
+        self._state_X, outcomes = _without_ends(*self.topology.table.all())
         self._num_outcomes, self._rounding = outcomes.num_outcomes, (outcomes.num_outcomes + 4) * _EPS
         self._reward, self._weight = outcomes.reward_NA.double().reshape(-1, 1), outcomes.to(dtype=torch.float64).weight
         allowed = self._reward.isfinite()
@@ -130,8 +131,8 @@ class UpperBound:
         if self._beta < UNDISCOUNTED and len(reward):
             self._below_S[self._state_X] = min(0.0, float(reward.min())) / (1 - self._beta)
 
-    def _sweep(self, times: int, *, both: bool) -> None:
-        """So many sweeps of both, or of the one from above, or until they have converged."""
+    def _sweep(self, times: int, *, both: bool) -> int:
+        """So many sweeps of both, or of the one from above, or until they have converged; how many they were."""
         u_SC = torch.stack([self._bound_S, self._below_S] if both else [self._bound_S], -1)
         old_XC = u_SC[self._state_X]
         for n in range(1, times + 1):
@@ -154,6 +155,7 @@ class UpperBound:
             delta = max(0.0, change_C[1]) + 2 * error
             above_X = new_XC[:, 1] + error + self._beta * delta / (1 - self._beta)
             self._bound_S[self._state_X] = torch.minimum(new_XC[:, 0], above_X)
+        return n
 
     def _backed_up(self, u_SC: Float[Tensor, "S C"]) -> Float[Tensor, "X C"]:
         """T u on X, for each of C functions; the first rounded up."""

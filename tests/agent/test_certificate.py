@@ -119,7 +119,7 @@ def test_a_start_that_no_search_has_expanded_counts_as_the_highest_value():
     assert visited.state_N.tolist() in ([0], [1])
     # It loses 1 of the 2 that are to be had in each state, and the other one is known to be worth at most 2.
     assert visited.certificate == pytest.approx(1.0, abs=1e-9)
-    while len(model.search.topology.queried) == 1:
+    while len(model.search.topology.table.queried) == 1:
         model.iterate()
     missing = 2 - exact.evaluate(apart, model.policy.table()).J
     assert model.iterate().certificate == pytest.approx(missing, abs=1e-9)

@@ -240,7 +240,7 @@ def test_each_pair_is_asked_once_and_states_that_are_reached_on_several_paths_ar
         look = expectimax(model, roots, depth=depth, v_leaf=lambda s: height(model.states(s)), topology=topology)
     # Level k of three moves right, up and left holds the (k + 1) (k + 2) / 2 sums of k moves.
     assert look.nodes_per_level == tuple((k + 1) * (k + 2) // 2 for k in range(7))
-    assert topology.model_calls == model.pairs
+    assert topology.table.model_calls == model.pairs
     separate = Lattice(merge=False)
     roots = separate.number(torch.tensor([[9.0, 9.0]], dtype=torch.float64))
     look = expectimax(separate, roots, depth=3, v_leaf=lambda s: height(separate.states(s)))

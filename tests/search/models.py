@@ -1,4 +1,4 @@
-"""Models and critics that keep a record of what they are asked, and the slow oracle of the search."""
+"""Models and critics that keep a record of their queries, and the slow oracle of the search."""
 
 from collections.abc import Callable, Hashable, Sequence
 
@@ -15,7 +15,7 @@ Step = Callable[[Hashable, int], tuple[float, Sequence[tuple[float, float, Hasha
 
 
 class WatchedModel(EnumeratingModel):
-    """Another model, with the states that it was asked about, call by call."""
+    """Another model, with the states of its queries, call by call."""
 
     def __init__(self, model: EnumeratingModel) -> None:
         self.model = model
@@ -28,8 +28,8 @@ class WatchedModel(EnumeratingModel):
         return self.model.num_states
 
     @property
-    def asked(self) -> list[int]:
-        """All states that it was asked about, in order, with repetition."""
+    def queried(self) -> list[int]:
+        """The states of all queries, in order, with repetition."""
         return [state for call in self.calls for state in call]
 
     def outcomes(self, state_N: Tensor) -> Outcomes:
@@ -38,7 +38,7 @@ class WatchedModel(EnumeratingModel):
 
 
 class InterningModel(EnumeratingModel):
-    """States that are anything hashable, numbered as they are met; K is the most outcomes among those asked about."""
+    """States that are anything hashable, numbered as they are met; K is the most outcomes among those of a query."""
 
     def __init__(self, step: Step, starts: Sequence[Hashable], *, num_actions: int) -> None:
         self.step = step
@@ -58,11 +58,11 @@ class InterningModel(EnumeratingModel):
         return self.number[state]
 
     def outcomes(self, state_N: Tensor) -> Outcomes:
-        asked = [self.states[s] for s in state_N.tolist()]
-        rows = [[self.step(state, a) for a in range(self.num_actions)] for state in asked]
+        queried = [self.states[s] for s in state_N.tolist()]
+        rows = [[self.step(state, a) for a in range(self.num_actions)] for state in queried]
         K = max(len(followers) for row in rows for _, followers in row)
-        prob, discount = torch.zeros(2, len(asked), self.num_actions, K, dtype=torch.float64)
-        child = torch.zeros(len(asked), self.num_actions, K, dtype=torch.int64)
+        prob, discount = torch.zeros(2, len(queried), self.num_actions, K, dtype=torch.float64)
+        child = torch.zeros(len(queried), self.num_actions, K, dtype=torch.int64)
         for n, row in enumerate(rows):
             for a, (_, followers) in enumerate(row):
                 for k, (p, gamma, state) in enumerate(followers):
@@ -72,7 +72,7 @@ class InterningModel(EnumeratingModel):
 
 
 class Critic:
-    """The rows of a table, with the leaves that were asked about, call by call."""
+    """The rows of a table, with the states of its calls, call by call."""
 
     def __init__(self, table: Tensor) -> None:
         self.table = table

@@ -1,4 +1,4 @@
-"""Tree search as it is told: node by node, one simulation after another."""
+"""Tree search node by node, one simulation after another."""
 
 import math
 from typing import Any, Self
@@ -92,9 +92,9 @@ class SlowTree:
             node["q"][a] = self.backed_up(node, a)
             return None
         has_weight = sum(p for (b, _), (p, _, _) in node["outcomes"].items() if b == a)
-        seen = node["reward"][a] + has_weight * gamma * value
-        node["q"][a] += (seen - node["q"][a]) / (1 + node["visits"][a])
-        return seen
+        outcome = node["reward"][a] + has_weight * gamma * value
+        node["q"][a] += (outcome - node["q"][a]) / (1 + node["visits"][a])
+        return outcome
 
     def score(self, node: Node, a: int) -> float:
         total, visits = sum(node["visits"]), node["visits"][a]
@@ -126,8 +126,8 @@ class SlowTree:
             return self
         survivors, width, phases = list(range(self.A)), self.A, max(1, math.ceil(math.log2(self.A)))
         for phase in range(phases):
-            shut = [a for a in range(self.A) if not self.open(self.root, a)]
-            survivors = [*self.ranked(survivors), *shut][:width]
+            exhausted = [a for a in range(self.A) if not self.open(self.root, a)]
+            survivors = [*self.ranked(survivors), *exhausted][:width]
             last, passes = phase + 1 == phases, max(1, (simulations - 1) // (phases * width))
             while left > 0 and (last or passes > 0) and self.ranked(survivors):
                 for a in self.ranked(survivors)[: min(width, left)]:

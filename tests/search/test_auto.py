@@ -12,7 +12,7 @@ from pgts_torch.options import Auto, Sampled
 from pgts_torch.search import Lookahead, auto
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.seeding import stream
-from tests.search.test_engine import DrawingModel, ListingModel
+from tests.search.test_engine import EnumeratingOnly, SamplingOnly
 from tests.support import zoo
 
 TOO_LARGE = 10**9
@@ -24,7 +24,7 @@ def found(nodes: int, root_B: Tensor) -> Lookahead:
     return Lookahead(q_BA, q_BA, q_BA + 1, model_calls=0, critic_calls=1, nodes_per_level=(nodes,))
 
 
-def asked(search: AutoSearch, roots: int = 1, depth: int = 1) -> None:
+def search_once(search: AutoSearch, roots: int = 1, depth: int = 1) -> None:
     """One search whose leaves are valued by v: depth + 1 levels are expanded."""
     search(torch.zeros(roots, dtype=torch.int64), depth=depth, v_leaf=torch.zeros_like, generator=stream(0, "search"))
 
@@ -53,12 +53,12 @@ def widths(monkeypatch) -> Callable[[Callable[[int], int]], list[int | None]]:
 def tries(tried: list[int | None], search: AutoSearch, **larger: int) -> list[int | None]:
     """The widths that one search tries."""
     before = len(tried)
-    asked(search, **larger)
+    search_once(search, **larger)
     return tried[before:]
 
 
 def test_a_width_is_halved_until_the_search_fits(widths):
-    search, tried = AutoSearch(ListingModel(zoo("ladder")), Auto(max_nodes=300)), widths(lambda width: 6 * width)
+    search, tried = AutoSearch(EnumeratingOnly(zoo("ladder")), Auto(max_nodes=300)), widths(lambda width: 6 * width)
     assert tries(tried, search) == [None, 300, 150, 75, 37]
     assert "37 states a level" in str(search)
 
@@ -66,7 +66,7 @@ def test_a_width_is_halved_until_the_search_fits(widths):
 @pytest.mark.parametrize(("nodes", "following"), [(150, 74), (151, 37)])
 def test_the_width_is_doubled_where_twice_as_many_nodes_would_fit(nodes, following, widths):
     tried = widths(lambda width: nodes if width <= 37 else TOO_LARGE)
-    search = AutoSearch(ListingModel(zoo("ladder")), Auto(max_nodes=300))
+    search = AutoSearch(EnumeratingOnly(zoo("ladder")), Auto(max_nodes=300))
     assert tries(tried, search)[-1] == 37
     assert tries(tried, search)[0] == following
 
@@ -74,7 +74,7 @@ def test_the_width_is_doubled_where_twice_as_many_nodes_would_fit(nodes, followi
 @pytest.mark.parametrize(("fits", "max_nodes", "following"), [(150, 300, 300), (300, 300, 300), (149, 299, 298)])
 def test_a_width_is_never_more_than_the_nodes_of_a_search(fits, max_nodes, following, widths):
     tried = widths(lambda width: 10 if width <= fits else TOO_LARGE)
-    search = AutoSearch(ListingModel(zoo("ladder")), Auto(max_nodes=max_nodes))
+    search = AutoSearch(EnumeratingOnly(zoo("ladder")), Auto(max_nodes=max_nodes))
     assert tries(tried, search)[-1] == fits
     assert tries(tried, search)[0] == following
 
@@ -85,7 +85,7 @@ def test_a_width_is_never_more_than_the_nodes_of_a_search(fits, max_nodes, follo
 )
 def test_full_width_is_tried_again_for_fewer_roots_or_levels_only(roots, depth, again, widths):
     tried = widths(lambda width: width)
-    search = AutoSearch(ListingModel(zoo("ladder")), Auto(max_nodes=300))
+    search = AutoSearch(EnumeratingOnly(zoo("ladder")), Auto(max_nodes=300))
     assert tries(tried, search, roots=3, depth=3)[0] is None
     assert (tries(tried, search, roots=roots, depth=depth)[0] is None) == again
 
@@ -114,10 +114,10 @@ def samples(monkeypatch) -> Callable[[Callable[[int], int]], list[int]]:
 
 
 @pytest.mark.parametrize(("max_nodes", "first"), [(20, 1), (21, 2), (72, 2), (73, 4), (10**9, 32)])
-def test_at_first_so_many_samples_are_drawn_as_fit_if_no_two_paths_meet(max_nodes, first, samples):
+def test_the_first_number_of_samples_fits_even_if_no_two_paths_meet(max_nodes, first, samples):
     # 2 actions, 2 levels below the root: 1 + 2 C + 4 C^2 nodes, 21 for C = 2 and 73 for C = 4.
     tried = samples(lambda C: 10)
-    asked(AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=max_nodes)))
+    search_once(AutoSearch(SamplingOnly(zoo("ladder")), Auto(max_nodes=max_nodes)))
     assert tried == [first]
 
 
@@ -125,37 +125,38 @@ def test_at_first_so_many_samples_are_drawn_as_fit_if_no_two_paths_meet(max_node
 def test_samples_are_doubled_where_paths_met_so_often_that_twice_as_many_would_fit(nodes, following, samples):
     # Twice as many samples have at most 4 times as many nodes on 2 levels: 60 and 64 of 60.
     tried = samples(lambda C: nodes)
-    search = AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=60))
-    asked(search)
-    asked(search)
+    search = AutoSearch(SamplingOnly(zoo("ladder")), Auto(max_nodes=60))
+    search_once(search)
+    search_once(search)
     assert tried == [2, following]
 
 
 def test_samples_are_never_more_than_32(samples):
     tried = samples(lambda C: 1)
-    search = AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=60))
+    search = AutoSearch(SamplingOnly(zoo("ladder")), Auto(max_nodes=60))
     for _ in range(7):
-        asked(search)
+        search_once(search)
     assert tried == [2, 4, 8, 16, 32, 32, 32]
 
 
 @pytest.mark.parametrize(("roots", "depth", "again"), [(2, 2, False), (1, 1, False), (3, 2, True), (2, 3, True)])
 def test_a_search_of_more_roots_or_of_more_levels_chooses_its_samples_again(roots, depth, again, samples):
     tried = samples(lambda C: 1)
-    search = AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=200))
+    search = AutoSearch(SamplingOnly(zoo("ladder")), Auto(max_nodes=200))
     for _ in range(3):
-        asked(search, roots=2, depth=2)
+        search_once(search, roots=2, depth=2)
     assert tried == [2, 4, 8]
-    asked(search, roots=roots, depth=depth)
+    search_once(search, roots=roots, depth=depth)
     assert (tried[-1] < 8) == again
 
 
 def test_a_sampled_search_that_turns_out_too_large_is_done_again_with_half(samples):
     tried = samples(lambda C: 10 * C)
-    search = AutoSearch(DrawingModel(zoo("ladder")), Auto(max_nodes=300))
-    asked(search)  # 8 samples have 273 nodes if no two paths meet
+    search = AutoSearch(SamplingOnly(zoo("ladder")), Auto(max_nodes=300))
+    search_once(search)  # 8 samples have 273 nodes if no two paths meet
     assert tried == [8]
     tried.clear()
-    search._samples = 32
-    asked(search)
+    state = search.state_dict(with_states=False)
+    search.load_state_dict(state | {"choices": state["choices"] | {"_samples": 32}})
+    search_once(search)
     assert tried == [32, 16]

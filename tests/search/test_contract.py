@@ -15,7 +15,7 @@ from pgts_torch.models import EnumeratingModel, SimulatorModel, TabularModel
 from pgts_torch.search import Lookahead, expectimax, mcts, sampled
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, exact, ladder
-from tests.search.models import some_q, some_v
+from tests.search.models import some_q, some_v, zeros
 from tests.support import mdps, zoo
 
 Engine = Callable[..., Lookahead]
@@ -54,7 +54,7 @@ def test_a_search_that_leaves_nothing_out_is_exact_for_both_kinds_of_leaves(engi
 
 @every_engine
 @pytest.mark.parametrize("depth", [0, 1, 4])
-def test_without_slack_in_the_discount_nothing_after_the_first_reward_counts(engine, depth):
+def test_with_discount_0_nothing_after_the_first_reward_counts(engine, depth):
     mdp = zoo("garnet")
     blind = TabularMDP(
         Outcomes(
@@ -75,7 +75,37 @@ def test_without_slack_in_the_discount_nothing_after_the_first_reward_counts(eng
     assert depth == 4 or not torch.allclose(seeing.q_BA, look.q_BA)
 
 
-class Cage(EnumeratingModel):
+@every_engine
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_one_state_with_one_action_earns_a_geometric_series(engine, dtype):
+    one = TabularModel(TabularMDP.from_transitions([[[(1.0, 0, 1.0, False)]]], 0.5), dtype=dtype)
+    for depth in range(6):
+        look = engine(one, torch.tensor([0]), depth=depth, v_leaf=zeros)
+        assert look.q_BA.dtype == look.pruned_BA.dtype == dtype
+        assert look.q_BA.item() == pytest.approx(2 - 0.5**depth, rel=1e-15)
+
+
+@every_engine
+def test_enormous_values_do_not_become_nan(engine):
+    mdp = TabularMDP.from_transitions(
+        [[[(0.5, 0, 1e300, False), (0.5, 1, -1e300, True)], [(1.0, 1, 0.0, False)]], [[(1.0, 0, 0.0, False)]] * 2], 0.5
+    )
+    q_SA = torch.tensor([[1e300, -1e300], [1e300, 1e300]], dtype=torch.float64)
+    for depth in range(5):
+        look = engine(TabularModel(mdp), torch.tensor([0, 1]), depth=depth, q_leaf=lambda s: q_SA[s])
+        torch.testing.assert_close(look.q_BA / 1e300, exact.lookahead(mdp, q_SA, depth) / 1e300)
+
+
+@every_engine
+def test_values_carry_no_gradient_and_can_be_part_of_a_loss(engine):
+    v_S, logits = some_v(ladder(5)).requires_grad_(), torch.zeros(5, 2, dtype=torch.float64, requires_grad=True)
+    look = engine(TabularModel(ladder(5)), torch.arange(5), depth=2, v_leaf=lambda s: v_S[s])
+    assert not look.q_BA.requires_grad
+    (logits.softmax(-1) * look.q_BA).sum().backward()
+    assert bool(logits.grad.abs().sum() > 0)
+
+
+class Gated(EnumeratingModel):
     """Two states; action 1 is allowed in state 0 alone, and pays enormously there."""
 
     num_states, num_actions = 2, 2
@@ -95,12 +125,12 @@ class Cage(EnumeratingModel):
 @every_engine
 @pytest.mark.parametrize("pay", [3.0, 1e300, -1e300])
 def test_an_action_that_is_not_allowed_is_minus_infinity_and_never_the_best(engine, pay):
-    look = engine(Cage(pay), torch.tensor([1, 0]), depth=1, v_leaf=lambda s: torch.zeros(len(s), dtype=torch.float64))
+    look = engine(Gated(pay), torch.tensor([1, 0]), depth=1, v_leaf=zeros)
     best_of_0 = max(1.0, pay)
     expected = [[2 + best_of_0 / 2, -torch.inf], [1 + best_of_0 / 2, pay + 0.5 * 2]]
     torch.testing.assert_close(look.q_BA, torch.tensor(expected, dtype=torch.float64))
     leaf_SA = torch.tensor([[0.0, 4.0], [6.0, -torch.inf]], dtype=torch.float64)
-    look = engine(Cage(pay), torch.tensor([1, 0]), depth=1, q_leaf=lambda s: leaf_SA[s])
+    look = engine(Gated(pay), torch.tensor([1, 0]), depth=1, q_leaf=lambda s: leaf_SA[s])
     expected = [[2 + 4.0 / 2, -torch.inf], [1 + 4.0 / 2, pay + 6.0 / 2]]
     torch.testing.assert_close(look.q_BA, torch.tensor(expected, dtype=torch.float64))
 
@@ -116,7 +146,7 @@ def test_an_action_that_is_not_allowed_is_minus_infinity_and_never_the_best(engi
     ],
 )
 def test_a_model_whose_answers_make_no_sense_is_refused_by_the_state(engine, changed, message):
-    class Broken(Cage):
+    class Broken(Gated):
         def outcomes(self, state_N: Tensor) -> Outcomes:
             answer = super().outcomes(state_N)
             for name, value in changed.items():
@@ -129,12 +159,12 @@ def test_a_model_whose_answers_make_no_sense_is_refused_by_the_state(engine, cha
             return answer
 
     with pytest.raises(PgtsError, match=message):
-        engine(Broken(1.0), torch.tensor([1]), depth=1, v_leaf=lambda s: torch.zeros(len(s), dtype=torch.float64))
+        engine(Broken(1.0), torch.tensor([1]), depth=1, v_leaf=zeros)
 
 
 @every_engine
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_critic_that_does_not_answer_with_numbers_is_named_by_the_state(engine, bad):
+def test_a_value_of_the_critic_that_is_not_finite_is_refused_by_the_state(engine, bad):
     v_S = torch.zeros(5, dtype=torch.float64)
     v_S[2] = bad
     with pytest.raises(PgtsError, match=f"state 2 is {bad}"):
@@ -153,11 +183,11 @@ def test_a_critic_that_does_not_answer_with_numbers_is_named_by_the_state(engine
         ({"v_leaf": lambda s: torch.zeros(len(s), 3)}, "values have shape"),
     ],
 )
-def test_bad_questions_are_refused(engine, changed, message):
-    asked = {"root_B": torch.tensor([0]), "depth": 2, "v_leaf": lambda s: torch.zeros(len(s), dtype=torch.float64)}
-    asked |= changed
+def test_arguments_that_make_no_sense_are_refused(engine, changed, message):
+    arguments = {"root_B": torch.tensor([0]), "depth": 2, "v_leaf": zeros}
+    arguments |= changed
     with pytest.raises(PgtsError, match=message):
-        engine(TabularModel(ladder(5)), asked.pop("root_B"), **asked)
+        engine(TabularModel(ladder(5)), arguments.pop("root_B"), **arguments)
 
 
 BUDGETS: dict[str, Engine] = {
@@ -166,7 +196,7 @@ BUDGETS: dict[str, Engine] = {
     "mcts, tree": lambda *args, **kwargs: mcts(*args, simulations=20, **kwargs),
     "mcts, graph": lambda *args, **kwargs: mcts(*args, simulations=20, merge=True, **kwargs),
 }
-"""Searches that see a part, and list outcomes."""
+"""Searches that expand a part, of models that enumerate outcomes."""
 
 
 @pytest.mark.parametrize("engine", BUDGETS.values(), ids=BUDGETS)
@@ -178,8 +208,8 @@ def test_no_planner_beats_the_optimum_on_the_lake(engine, share):
     root_B = torch.arange(mdp.num_states)
     look = engine(TabularModel(mdp), root_B, depth=6, v_leaf=lambda s: (1 - share) * optimum.v_S[s])
     assert bool((look.q_BA <= optimum.q_SA + 1e-12).all())
-    foreseen = engine(TabularModel(mdp), root_B, depth=6, v_leaf=lambda s: optimum.v_S[s] + 0.1)
-    assert bool((foreseen.q_BA > optimum.q_SA + 1e-3).any())
+    too_high = engine(TabularModel(mdp), root_B, depth=6, v_leaf=lambda s: optimum.v_S[s] + 0.1)
+    assert bool((too_high.q_BA > optimum.q_SA + 1e-3).any())
 
 
 @pytest.mark.parametrize("kind", ["expectimax", "sampled", "mcts"])
@@ -192,7 +222,7 @@ def test_searching_leaves_the_environment_and_its_generator_as_they_are(kind):
         made = []
         for _ in range(30):
             if look:
-                ask = {"depth": 2, "v_leaf": lambda s: torch.zeros(len(s), dtype=torch.float64)}
+                ask = {"depth": 2, "v_leaf": zeros}
                 if kind == "sampled":
                     root_B = simulator.roots([env], [observation])
                     sampled(simulator, root_B, samples=2, generator=stream(0, "look"), **ask)

@@ -17,8 +17,8 @@ from tests.search.models import some_v, watched
 from tests.support import zoo
 
 
-class DrawingModel(SamplingModel):
-    """A tabular model that does not list its outcomes."""
+class SamplingOnly(SamplingModel):
+    """A tabular model that does not enumerate its outcomes."""
 
     def __init__(self, mdp: TabularMDP) -> None:
         self._model = TabularModel(mdp)
@@ -48,7 +48,7 @@ def truth(depth: int = 3) -> Tensor:
 @pytest.mark.parametrize(
     "make", [ExpectimaxSearch, AutoSearch, lambda model: MCTSSearch(model, MCTS(simulations=10**5))]
 )
-def test_a_search_that_can_see_everything_is_exact_and_asks_nothing_twice(make):
+def test_a_search_that_expands_everything_is_exact_and_queries_nothing_twice(make):
     search = make(TabularModel(GARNET))
     first, second = look(search), look(search, seed=1)
     torch.testing.assert_close(first.q_BA, truth())
@@ -59,7 +59,7 @@ def test_a_search_that_can_see_everything_is_exact_and_asks_nothing_twice(make):
 
 
 def test_a_sampled_search_is_the_function_of_that_name_and_counts_its_calls():
-    search = SampledSearch(DrawingModel(GARNET), Sampled(samples=3, share="search"))
+    search = SampledSearch(SamplingOnly(GARNET), Sampled(samples=3, share="search"))
     v_S = some_v(GARNET)
     expected = sampled(
         TabularModel(GARNET),
@@ -78,14 +78,14 @@ def test_a_sampled_search_is_the_function_of_that_name_and_counts_its_calls():
     assert search.model_calls == first.model_calls + again.model_calls + other.model_calls
 
 
-def test_where_all_paths_fit_the_automatic_search_looks_at_all_of_them_and_says_so():
+def test_where_all_paths_fit_the_automatic_search_expands_all_of_them_and_says_so():
     search = AutoSearch(TabularModel(GARNET))
     assert str(search) == "nothing yet"
     nodes = look(search).nodes
     assert str(search) == f"expectimax: the model enumerates its outcomes, and {nodes} nodes hold all paths"
 
 
-def test_where_they_do_not_fit_it_keeps_to_the_budget_and_asks_nothing_twice():
+def test_where_they_do_not_fit_it_keeps_to_the_budget_and_queries_nothing_twice():
     model = watched(GARNET)
     search = AutoSearch(model, Auto(max_nodes=300))
     first = look(search)
@@ -95,14 +95,14 @@ def test_where_they_do_not_fit_it_keeps_to_the_budget_and_asks_nothing_twice():
     calls = len(model.calls)
     assert torch.equal(look(search).q_BA, first.q_BA)
     assert len(model.calls) == calls
-    assert len(model.asked) == len(set(model.asked))
+    assert len(model.queried) == len(set(model.queried))
     # A shallower search fits, and is exact.
     torch.testing.assert_close(look(search, depth=0).q_BA, truth(0))
     assert str(search).startswith("expectimax: ")
 
 
-def test_a_model_that_only_draws_is_sampled_and_more_often_where_paths_met():
-    search = AutoSearch(DrawingModel(ladder(5)), Auto(max_nodes=400))
+def test_a_model_that_only_samples_is_sampled_more_often_where_paths_met():
+    search = AutoSearch(SamplingOnly(ladder(5)), Auto(max_nodes=400))
     samples = []
     for seed in range(6):
         search(torch.tensor([0]), depth=3, v_leaf=torch.zeros_like, generator=stream(seed, "search"))
@@ -115,22 +115,22 @@ def test_a_model_that_only_draws_is_sampled_and_more_often_where_paths_met():
 
 
 def test_the_samples_of_a_model_in_which_paths_rarely_meet_stay_within_the_budget():
-    search = AutoSearch(DrawingModel(random_mdp(5000, 4, branching=50, seed=2)), Auto(max_nodes=2_000))
+    search = AutoSearch(SamplingOnly(random_mdp(5000, 4, branching=50, seed=2)), Auto(max_nodes=2_000))
     for seed in range(5):
         root_B = torch.arange(3)
-        seen = search(
+        found = search(
             root_B,
             depth=2,
             v_leaf=lambda s: torch.zeros(len(s), dtype=torch.float64),
             generator=stream(seed, "search"),
         )
-        assert seen.nodes <= 2_000
+        assert found.nodes <= 2_000
 
 
 def test_an_automatic_search_counts_also_the_calls_of_what_turned_out_too_large():
     model = watched(GARNET)
     search = AutoSearch(model, Auto(max_nodes=300))
-    assert look(search).model_calls == search.model_calls == len(model.asked) * GARNET.num_actions > 0
+    assert look(search).model_calls == search.model_calls == len(model.queried) * GARNET.num_actions > 0
 
 
 def test_one_search_that_was_too_large_does_not_make_the_automatic_one_narrow_for_good():
@@ -138,39 +138,39 @@ def test_one_search_that_was_too_large_does_not_make_the_automatic_one_narrow_fo
     v_S = some_v(GARNET)
 
     def pruned(root_B: Tensor, depth: int) -> float:
-        seen = search(root_B, depth=depth, v_leaf=lambda s: v_S[s], generator=stream(0, "search"))
-        assert ("nodes hold all paths" in str(search)) == (float(seen.pruned_BA.max()) == 0)
-        return float(seen.pruned_BA.max())
+        found = search(root_B, depth=depth, v_leaf=lambda s: v_S[s], generator=stream(0, "search"))
+        assert ("nodes hold all paths" in str(search)) == (float(found.pruned_BA.max()) == 0)
+        return float(found.pruned_BA.max())
 
     assert pruned(torch.arange(20), 2) > 0
     assert pruned(torch.arange(1), 1) == 0
     assert pruned(torch.arange(20), 2) > 0
 
 
-def test_a_larger_search_of_a_model_that_only_draws_takes_fewer_samples():
-    search = AutoSearch(DrawingModel(random_mdp(5000, 4, branching=50, seed=2)), Auto(max_nodes=2_000))
+def test_a_larger_search_of_a_model_that_only_samples_takes_fewer_samples():
+    search = AutoSearch(SamplingOnly(random_mdp(5000, 4, branching=50, seed=2)), Auto(max_nodes=2_000))
     samples = []
     for roots, depth in ((1, 0), (3, 2)):
-        seen = search(
+        found = search(
             torch.arange(roots),
             depth=depth,
             v_leaf=lambda s: torch.zeros(len(s), dtype=torch.float64),
             generator=stream(0, "search"),
         )
-        assert seen.nodes <= 2_000
+        assert found.nodes <= 2_000
         samples.append(int(str(search).split()[1]))
     assert samples[0] > samples[1]
 
 
-@pytest.mark.parametrize("model", [TabularModel(GARNET), DrawingModel(GARNET)])
+@pytest.mark.parametrize("model", [TabularModel(GARNET), SamplingOnly(GARNET)])
 def test_a_budget_that_is_too_small_for_anything_is_an_error(model):
     with pytest.raises(NodeBudgetExceeded):
         look(AutoSearch(model, Auto(max_nodes=2)))
 
 
-def test_a_tree_search_of_a_model_that_only_draws_is_one_of_what_was_drawn():
+def test_a_tree_search_of_a_model_that_only_samples_searches_fixed_samples():
     """With enough simulations it is the sampled lookahead with one set of samples for each state."""
-    search = MCTSSearch(DrawingModel(GARNET), MCTS(simulations=100_000, samples=2))
+    search = MCTSSearch(SamplingOnly(GARNET), MCTS(simulations=100_000, samples=2))
     v_S = some_v(GARNET)
     expected = sampled(
         TabularModel(GARNET),
@@ -182,12 +182,12 @@ def test_a_tree_search_of_a_model_that_only_draws_is_one_of_what_was_drawn():
         generator=stream(0, "search"),
         replicates=0,
     )
-    seen = look(search)
-    torch.testing.assert_close(seen.q_BA, expected.q_BA)
-    assert seen.model_calls <= expected.model_calls
-    assert not torch.equal(look(search, seed=1).q_BA, seen.q_BA)
+    found = look(search)
+    torch.testing.assert_close(found.q_BA, expected.q_BA)
+    assert found.model_calls <= expected.model_calls
+    assert not torch.equal(look(search, seed=1).q_BA, found.q_BA)
     assert str(search) == "mcts, 100000 simulations, merged, 2 sampled outcomes of each action"
-    assert torch.equal(look(MCTSSearch(TabularModel(GARNET), MCTS(simulations=100_000, samples=2))).q_BA, seen.q_BA)
+    assert torch.equal(look(MCTSSearch(TabularModel(GARNET), MCTS(simulations=100_000, samples=2))).q_BA, found.q_BA)
     with pytest.raises(PgtsError, match="samples is 0"):
         MCTS(samples=0)
 
@@ -262,8 +262,8 @@ def test_a_search_from_the_prior_of_the_policy_needs_the_policy():
         look(MCTSSearch(TabularModel(GARNET), MCTS(prior="policy")))
 
 
-class ListingModel(EnumeratingModel):
-    """A tabular model that does not draw."""
+class EnumeratingOnly(EnumeratingModel):
+    """A tabular model that does not sample."""
 
     def __init__(self, mdp: TabularMDP) -> None:
         self._model = TabularModel(mdp)
@@ -279,13 +279,13 @@ class ListingModel(EnumeratingModel):
     [
         (
             ExpectimaxSearch,
-            DrawingModel,
-            "'expectimax' needs a model that enumerates its outcomes; DrawingModel does not",
+            SamplingOnly,
+            "'expectimax' needs a model that enumerates its outcomes; SamplingOnly does not",
         ),
-        (SampledSearch, ListingModel, "'sampled' needs a model that samples outcomes; ListingModel does not"),
+        (SampledSearch, EnumeratingOnly, "'sampled' needs a model that samples outcomes; EnumeratingOnly does not"),
     ],
 )
-def test_a_search_asks_for_what_its_model_can_do(make, model, message):
+def test_a_search_refuses_a_model_that_cannot_do_what_it_needs(make, model, message):
     with pytest.raises(MissingModel, match=message):
         make(model(zoo("ladder")))
 

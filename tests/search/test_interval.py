@@ -53,7 +53,7 @@ def test_intervals_of_one_level_hold_the_truth_and_normal_ones_do_not(C, chances
 
 
 @pytest.mark.parametrize("confidence", [0.5, 0.95])
-def test_where_all_samples_agree_the_range_of_values_has_the_word(confidence):
+def test_where_all_samples_agree_the_interval_comes_from_the_range_of_values(confidence):
     mdp, v_S = bernoulli(200)
     look = looked(mdp, v_S, 4)
     low, high = look.interval(confidence)
@@ -75,7 +75,7 @@ def test_without_a_range_samples_that_agree_bound_nothing():
     assert bool(low[~agree].isfinite().all() and high[~agree].isfinite().all())
 
 
-def test_where_every_action_has_one_outcome_samples_that_agree_say_all():
+def test_where_every_action_has_one_outcome_the_interval_is_a_point():
     model = TabularModel(ladder())
     assert model.is_certain
     assert not TabularModel(bernoulli(3)[0]).is_certain

@@ -1,6 +1,5 @@
 """Tree search: exact once the tree is complete, an honest bound before, and the same tree as one by one."""
 
-import itertools
 import math
 
 import gymnasium
@@ -51,7 +50,7 @@ waves = st.sampled_from([None, 1, 3])
 
 
 @given(mdps(max_actions=2, max_outcomes=2), st.integers(0, 2), st.integers(0, 99), roots, rules, st.booleans(), waves)
-def test_enough_simulations_see_T_to_the_m(mdp, depth, seed, root, rule, merge, wave):
+def test_enough_simulations_give_T_to_the_m(mdp, depth, seed, root, rule, merge, wave):
     options = {"root": root, "rule": rule, "merge": merge, "simulations": 100, "wave": wave}
     model = TabularModel(mdp)
     q_SA, v_S = some_q(mdp, seed), some_v(mdp, seed)
@@ -66,7 +65,7 @@ def test_enough_simulations_see_T_to_the_m(mdp, depth, seed, root, rule, merge, 
 
 @pytest.mark.parametrize("name", ["ladder", "tightrope", "garnet", "deep_sea", "FrozenLake"])
 @pytest.mark.parametrize("merge", [False, True])
-def test_the_zoo_is_seen_as_by_full_width_and_one_simulation_less_may_not_be_enough(name, merge):
+def test_enough_simulations_are_exact_on_the_zoo_and_one_is_not(name, merge):
     mdp = zoo(name)
     root, v_S = torch.tensor([0]), some_v(mdp)
 
@@ -80,7 +79,7 @@ def test_the_zoo_is_seen_as_by_full_width_and_one_simulation_less_may_not_be_eno
 
 
 @given(mdps(), st.integers(0, 3), st.integers(0, 99), roots)
-def test_complete_graphs_equal_complete_trees_and_ask_the_model_no_more(mdp, depth, seed, root):
+def test_complete_graphs_equal_complete_trees_and_query_the_model_no_more(mdp, depth, seed, root):
     critic, options = Critic(some_v(mdp, seed)), {"depth": depth, "root": root}
     graph = mcts(TabularModel(mdp), all_states(mdp), v_leaf=critic, simulations=200, merge=True, **options)
     full = expectimax(TabularModel(mdp), all_states(mdp), depth=depth, v_leaf=critic)
@@ -110,7 +109,7 @@ def test_a_graph_is_complete_when_a_tree_of_as_many_simulations_is_not():
 
 
 @given(mdps(), st.integers(0, 4), st.integers(1, 40), st.integers(0, 99), roots, st.booleans(), waves)
-def test_the_error_is_at_most_the_unseen_mass_times_the_error_of_the_critic(
+def test_the_error_is_at_most_the_pruned_mass_times_the_error_of_the_critic(
     mdp, depth, simulations, seed, root, merge, wave
 ):
     v_S = some_v(mdp, seed)
@@ -132,7 +131,7 @@ def test_the_error_is_at_most_the_unseen_mass_times_the_error_of_the_critic(
     assert bool((look.pruned_BA <= 1 + 1e-12).all())
 
 
-def test_the_bound_of_one_simulation_is_what_an_action_puts_on_nodes_that_go_on():
+def test_the_pruned_mass_of_one_simulation_is_that_of_outcomes_with_weight():
     mdp = random_mdp(20, 3, branching=3)
     look = mcts(TabularModel(mdp), all_states(mdp), depth=2, v_leaf=zeros, simulations=1)
     assert_close(look.pruned_BA, torch.from_numpy(weights(mdp).sum(-1)))
@@ -175,7 +174,7 @@ def test_splitting_and_permuting_the_roots_changes_no_bit(mdp, depth, simulation
     assert torch.equal(torch.cat([look(root_B[:3]), look(root_B[3:])]), together)
 
 
-def test_the_noise_moves_a_search_and_is_drawn_once_whatever_the_batch():
+def test_the_noise_changes_a_search_and_takes_one_number_of_the_generator_whatever_the_batch():
     mdp = random_mdp(50, 4, branching=3)
     options = {"depth": 5, "v_leaf": Critic(some_v(mdp)), "simulations": 9}
 
@@ -262,12 +261,12 @@ def test_large_waves_err_little_more_than_waves_of_one():
 # What a search costs
 
 
-def test_the_nodes_of_a_deep_sea_are_a_binary_tree_and_its_calls_those_of_its_cells():
+def test_a_deep_sea_has_the_nodes_of_a_binary_tree_and_the_model_calls_of_its_cells():
     model = watched(deep_sea(6))
     critic = Critic(some_v(deep_sea(6)))
     look = mcts(model, torch.tensor([0]), depth=2, v_leaf=critic, simulations=100)
     assert look.nodes_per_level == (1, 2, 4, 8)
-    assert look.model_calls == (1 + 2 + 3) * 2 == len(model.asked) * 2
+    assert look.model_calls == (1 + 2 + 3) * 2 == len(model.queried) * 2
     assert look.critic_calls == len(critic.calls)
     graph = mcts(model, torch.tensor([0]), depth=2, v_leaf=critic, simulations=100, merge=True)
     assert graph.nodes_per_level == (1, 2, 3, 4)
@@ -280,7 +279,7 @@ def test_every_simulation_expands_one_node_until_there_is_none_left(simulations,
     assert look.nodes == 1 + 2 * min(simulations, 2 ** (depth + 1) - 1)
 
 
-def test_roots_that_stand_twice_are_searched_once():
+def test_repeated_roots_are_searched_once():
     mdp = zoo("grid")
     options = {"depth": 4, "v_leaf": Critic(some_v(mdp)), "simulations": 20}
     once = mcts(TabularModel(mdp), torch.tensor([3, 55]), **options)
@@ -289,7 +288,7 @@ def test_roots_that_stand_twice_are_searched_once():
     assert twice.nodes_per_level == once.nodes_per_level
 
 
-def test_a_topology_that_knows_the_states_leaves_nothing_to_ask():
+def test_a_topology_that_knows_the_states_saves_all_model_calls():
     mdp, model = zoo("garnet"), TabularModel(zoo("garnet"))
     topology, options = Topology(model), {"depth": 5, "v_leaf": zeros, "simulations": 30}
     first = mcts(model, all_states(mdp), topology=topology, **options)
@@ -330,7 +329,7 @@ def test_depth_0_with_q_is_q():
 
 @pytest.mark.parametrize("merge", [False, True])
 @pytest.mark.parametrize("backup", ["max", "mean"])
-def test_a_root_from_which_everything_ends_sees_its_reward_alone(merge, backup):
+def test_a_root_from_which_everything_ends_has_its_reward_alone(merge, backup):
     if merge and backup == "mean":
         return
     frozen = TabularMDP.from_gymnasium(gymnasium.make("FrozenLake-v1"), 0.99)
@@ -338,23 +337,6 @@ def test_a_root_from_which_everything_ends_sees_its_reward_alone(merge, backup):
     look = mcts(TabularModel(frozen), torch.tensor([5]), v_leaf=lambda s: zeros(s) + math.nan, **options)
     assert torch.equal(look.q_BA, torch.zeros(1, 4, dtype=torch.float64))
     assert look.critic_calls == 0
-
-
-@pytest.mark.parametrize("merge", [False, True])
-@pytest.mark.parametrize("root", ["gumbel", "rule"])
-def test_one_state_with_one_action_earns_a_geometric_series(merge, root):
-    one = TabularMDP.from_transitions([[[(1.0, 0, 1.0, False)]]], 0.5)
-    for depth in range(6):
-        look = mcts(
-            TabularModel(one), torch.tensor([0]), depth=depth, v_leaf=zeros, simulations=20, merge=merge, root=root
-        )
-        assert look.q_BA.item() == pytest.approx(2 - 0.5**depth, rel=1e-15)
-
-
-def test_gamma_0_sees_the_reward_alone():
-    mdp = random_mdp(6, 3, gamma=0.0)
-    look = mcts(TabularModel(mdp), all_states(mdp), depth=3, v_leaf=Critic(some_v(mdp)), simulations=30)
-    assert torch.equal(look.q_BA, mdp.outcomes.reward_NA)
 
 
 def gated(state: int, action: int) -> tuple[float, list[tuple[float, float, int]]]:
@@ -383,7 +365,7 @@ def test_actions_that_are_not_allowed_are_never_taken(root, backup):
 
 
 @pytest.mark.parametrize("merge", [False, True])
-def test_states_that_are_numbered_as_they_are_met_with_K_of_their_own_see_what_the_tree_sees(merge):
+def test_states_numbered_as_they_are_met_with_differing_K_have_the_values_of_the_tree(merge):
     def fans_out(x: int, action: int) -> tuple[float, list[tuple[float, float, int]]]:
         wide = 1 + x % 4
         return math.cos(x + action), [(1 / wide, 0.9, 2 * x + action + k + 1) for k in range(wide)]
@@ -398,81 +380,24 @@ def test_states_that_are_numbered_as_they_are_met_with_K_of_their_own_see_what_t
     assert_close(look.q_BA, torch.tensor(expected, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("merge", [False, True])
-def test_enormous_values_pass_without_becoming_nan(merge):
-    mdp = TabularMDP.from_transitions(
-        [[[(0.5, 0, 1e300, False), (0.5, 1, -1e300, True)], [(1.0, 1, 0.0, False)]], [[(1.0, 0, 0.0, False)]] * 2], 0.5
-    )
-    q_SA = torch.tensor([[1e300, -1e300], [1e300, 1e300]], dtype=torch.float64)
-    for depth in range(1, 5):
-        look = mcts(
-            TabularModel(mdp), torch.tensor([0, 1]), depth=depth, q_leaf=Critic(q_SA), simulations=60, merge=merge
-        )
-        assert_close(look.q_BA / 1e300, exact.lookahead(mdp, q_SA, depth) / 1e300)
-
-
-def test_no_plan_beats_the_optimum_on_the_frozen_lake():
-    frozen = TabularMDP.from_gymnasium(gymnasium.make("FrozenLake-v1"), 0.99)
-    optimal = exact.optimal(frozen)
-    for simulations, root in itertools.product((1, 10, 100), ("gumbel", "rule")):
-        options = {"depth": 7, "v_leaf": Critic(optimal.v_S), "simulations": simulations, "root": root}
-        look = mcts(TabularModel(frozen), all_states(frozen), **options)
-        assert bool((look.q_BA <= optimal.q_SA + 1e-9).all())
-    too_high = mcts(TabularModel(frozen), all_states(frozen), depth=7, v_leaf=Critic(optimal.v_S + 0.1), simulations=10)
-    assert not bool((too_high.q_BA <= optimal.q_SA + 1e-9).all())
-
-
-def test_a_float32_model_answers_in_float32():
-    mdp = zoo("garnet")
-    v_S, model = some_v(mdp), TabularModel(mdp, dtype=torch.float32)
-    look = mcts(model, all_states(mdp), depth=1, v_leaf=Critic(v_S), simulations=50, generator=stream(0, "g"))
-    assert look.q_BA.dtype == look.pruned_BA.dtype == torch.float32
-    assert_close(look.q_BA.double(), exact.lookahead(mdp, q_of(mdp, v_S), 1), tolerance=1e-4)
-
-
-def test_values_carry_no_gradient_and_can_be_part_of_a_loss():
-    mdp = zoo("ladder")
-    v_table = some_v(mdp).requires_grad_()
-    logits = torch.zeros(5, 2, dtype=torch.float64, requires_grad=True)
-    look = mcts(TabularModel(mdp), all_states(mdp), depth=2, v_leaf=lambda s: v_table[s], simulations=9)
-    assert not look.q_BA.requires_grad
-    (logits.softmax(-1) * look.q_BA).sum().backward()
-    assert bool(logits.grad.abs().sum() > 0)
-
-
 # Mistakes of the caller
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_leaf_value_that_is_not_finite_is_refused_and_its_state_is_named(bad):
-    v_S = some_v(ladder(5))
-    v_S[3] = bad
-    options = {"depth": 5, "v_leaf": Critic(v_S), "simulations": 50}
-    with pytest.raises(PgtsError, match=rf"value of state 3 is {bad}; it must be finite"):
-        mcts(TabularModel(ladder(5)), torch.tensor([0]), **options)
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"simulations": 0}, "simulations is 0"),
-        ({"simulations": True}, "simulations is true"),
-        ({"simulations": 2.0}, r"simulations is 2\.0"),
-        ({"root": "best"}, "root is 'best'; it must be gumbel or rule"),
+        ({"root": "best"}, "root is 'best'"),
         ({"rule": "ucb"}, "rule is 'ucb'"),
         ({"backup": "sum"}, "backup is 'sum'"),
-        ({"rule": "puct", "exploration": -1.0}, r"exploration is -1\.0"),
-        ({"exploration": 1.0}, "search.rule gumbel has none, it must be puct or uct"),
-        ({"wave": 0}, "wave is 0"),
+        ({"exploration": 1.0}, "exploration is 1"),
         ({"wave": True}, "wave is true"),
-        ({"rule": "puct", "exploration": math.nan}, "exploration is nan"),
-        ({"merge": True, "backup": "mean"}, "search.merge is true, which needs search.backup max"),
+        ({"merge": True, "backup": "mean"}, "merge is true"),
         ({"root": "rule", "generator": torch.Generator()}, "only root='gumbel' draws"),
-        ({"root": "rule", "rule": "uct", "prior": zeros}, "does not use"),
+        ({"root": "rule", "rule": "uct", "prior": zeros}, "prior is policy"),
         ({"prior": lambda s: torch.ones(len(s), 2)}, r"prior of state 0 is \[1\.0, 1\.0\]"),
         ({"prior": zeros}, r"prior has shape \(1,\); for 1 states it must be \(1, 2\)"),
         ({"max_nodes": 4}, r"has 7 nodes; max_nodes is 4"),
-        ({"depth": -1}, "depth is -1"),
     ],
 )
 def test_options_that_make_no_sense_are_refused_and_named(wrong, message):
@@ -480,13 +405,6 @@ def test_options_that_make_no_sense_are_refused_and_named(wrong, message):
     with pytest.raises(PgtsError, match=message) as caught:
         mcts(TabularModel(ladder(5)), torch.tensor([0]), **options)
     assert isinstance(caught.value, NodeBudgetExceeded) == ("max_nodes" in wrong)
-
-
-@pytest.mark.usefixtures("unchecked_shapes")
-def test_roots_that_are_no_states_are_refused():
-    for bad in (torch.tensor([7]), torch.tensor([], dtype=torch.int64), torch.tensor([0.0])):
-        with pytest.raises(PgtsError, match="root_B"):
-            mcts(TabularModel(ladder(5)), bad, depth=1, v_leaf=zeros, simulations=3)
 
 
 @pytest.mark.parametrize("merge", [False, True])
@@ -499,7 +417,7 @@ def test_the_roots_count_among_the_nodes_from_the_start(merge):
 
 
 @pytest.mark.parametrize("rule", ["puct", "uct"])
-def test_rules_with_exploration_hand_out_the_whole_budget_and_no_more_also_where_it_ends_in_a_fraction(rule):
+def test_rules_with_exploration_split_the_whole_budget_also_where_it_ends_in_a_fraction(rule):
     """In a graph it may: paths that meet share what was used below."""
     budget_N, zero_NA = torch.tensor([0.25, 3.5, 2.0], dtype=torch.float64), torch.zeros(3, 2, dtype=torch.float64)
     given_NA = Selection(rule, 1.25).split(
@@ -510,7 +428,7 @@ def test_rules_with_exploration_hand_out_the_whole_budget_and_no_more_also_where
 
 @pytest.mark.parametrize("rule", ["puct", "uct"])
 @given(st.integers(1, 5), st.integers(1, 20), st.integers(0, 999))
-def test_rules_with_exploration_give_to_one_after_another_and_never_to_a_shut_or_full_action(rule, A, budget, seed):
+def test_rules_with_exploration_select_one_by_one_and_never_an_exhausted_or_full_action(rule, A, budget, seed):
     generator = stream(seed, "selection")
     q_A, prior_A = (torch.rand(A, dtype=torch.float64, generator=generator) for _ in range(2))
     visits_A, most_A = (torch.randint(0, 6, (A,), generator=generator).double() for _ in range(2))
@@ -528,8 +446,8 @@ def test_rules_with_exploration_give_to_one_after_another_and_never_to_a_shut_or
             else ((1 + total).log() / (1 + given_A)).sqrt()
         )
         given_A[torch.where(open_A, worth_A + 1.25 * bonus_A, -math.inf).argmax()] += 1
-    asked = {"q_NA": q_A, "visits_NA": visits_A, "prior_NA": prior_A, "exhausted_NA": exhausted_A, "most_NA": most_A}
+    given_NA = {"q_NA": q_A, "visits_NA": visits_A, "prior_NA": prior_A, "exhausted_NA": exhausted_A, "most_NA": most_A}
     split_NA = Selection(rule, 1.25).split(
-        torch.tensor([budget]).double(), **{name: x[None] for name, x in asked.items()}
+        torch.tensor([budget]).double(), **{name: x[None] for name, x in given_NA.items()}
     )
     assert split_NA[0].tolist() == (given_A - visits_A).tolist()

@@ -16,10 +16,9 @@ from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
 from pgts_torch.search.known import KnownStates
 from pgts_torch.search.lookahead import Leaves, Lookahead
-from pgts_torch.search.memory import Sizes
-from pgts_torch.search.split import Selection
-from pgts_torch.search.topology import Topology, tree_nodes
-from pgts_torch.search.tree import Tree
+from pgts_torch.search.memory import Sizes, tree_nodes
+from pgts_torch.search.nodes import Nodes
+from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import random_mdp
 from tests.memory import peak_bytes
@@ -106,7 +105,7 @@ def test_a_search_that_goes_deeper_again_and_over_other_roots_stays_below_the_li
     assert not all(made)
 
 
-def test_the_outcomes_of_a_model_that_does_not_say_how_many_there_are_are_counted_from_its_first_answer():
+def test_where_the_model_does_not_say_K_it_is_counted_from_its_first_answer():
     class Silent(WatchedModel):
         def __init__(self, model: EnumeratingModel) -> None:
             super().__init__(model)
@@ -129,9 +128,9 @@ def test_rows_of_tables_are_what_they_take():
     assert 7 * sizes.outcomes == sum(column.numel() * column.element_size() for column in columns)
     known = KnownStates(Topology(model), Leaves(model, 2, None, zeros))
     known.rows(ROOT)
-    tree = Tree(known, 3, Selection("gumbel", 1.25), backup="max", merge=False, max_nodes=100, room=1)
-    assert sizes.node == bytes_of(tree.nodes, "_N", "_NA", "_NE")
-    assert sizes.known == bytes_of(known, "_T", "_TA", "_TE")
+    nodes = Nodes(known, 3, merge=False, revisits=False, max_nodes=100, room=1)
+    assert sizes.node == bytes_of(nodes, "_N", "_NA", "_NAK")
+    assert sizes.known == bytes_of(known, "_T", "_TA", "_TAK")
 
 
 def bytes_of(tables: object, *endings: str) -> int:
@@ -140,7 +139,7 @@ def bytes_of(tables: object, *endings: str) -> int:
 
 
 @pytest.mark.fault("lookahead larger than memory")
-def test_a_lookahead_is_refused_before_the_level_that_would_not_fit_is_asked_for(monkeypatch):
+def test_a_lookahead_is_refused_before_the_model_is_queried_for_a_level_that_would_not_fit(monkeypatch):
     model = WatchedModel(TabularModel(GARNET))
     shallower = expectimax(TabularModel(GARNET), ROOT, depth=2, v_leaf=zeros).model_calls
     topology = Topology(model, max_bytes=10**6)
@@ -148,10 +147,10 @@ def test_a_lookahead_is_refused_before_the_level_that_would_not_fit_is_asked_for
         NodeBudgetExceeded, match=r"outcomes of level 3 of the 4 of the lookahead \(\d+ nodes, 3 actions, 4"
     ):
         expectimax(model, ROOT, depth=3, v_leaf=zeros, topology=topology)
-    assert len(model.asked) * A == shallower
+    assert len(model.queried) * A == shallower
 
 
-def test_the_search_that_chooses_narrows_until_it_fits():
+def test_the_automatic_search_narrows_until_it_fits():
     search = AutoSearch(TabularModel(GARNET), Auto(max_bytes=10**6))
     look = search(ROOT, depth=5, v_leaf=zeros, generator=stream(0, "search"))
     assert max(look.nodes_per_level) > 50
@@ -159,14 +158,14 @@ def test_the_search_that_chooses_narrows_until_it_fits():
     assert str(search).startswith("expectimax, ")
 
 
-def test_roots_that_would_not_fit_are_refused_before_the_model_is_asked():
+def test_roots_that_would_not_fit_are_refused_before_the_model_is_queried():
     model = WatchedModel(TabularModel(GARNET))
     for search in (mcts, expectimax):
         options = {"simulations": 9} if search is mcts else {}
         topology = Topology(model, max_bytes=200_000)
         with pytest.raises(NodeBudgetExceeded):
             search(model, torch.arange(500), depth=3, v_leaf=zeros, topology=topology, **options)
-    assert len(model.asked) == 0
+    assert len(model.queried) == 0
 
 
 def test_a_tree_of_more_levels_than_memory_is_refused_at_once():
@@ -174,7 +173,7 @@ def test_a_tree_of_more_levels_than_memory_is_refused_at_once():
         mcts(TabularModel(GARNET), ROOT, depth=10**9, v_leaf=zeros, simulations=2)
 
 
-def test_samples_that_would_not_fit_are_refused_before_one_is_drawn(monkeypatch):
+def test_samples_that_would_not_fit_are_refused_before_the_model_is_sampled(monkeypatch):
     model = TabularModel(GARNET)
     monkeypatch.setattr(TabularModel, "sample", lambda *_, **__: pytest.fail("it was drawn from"))
     with pytest.raises(NodeBudgetExceeded, match="1 nodes, 3 actions, 900000 outcomes of each"):
@@ -211,7 +210,7 @@ def test_too_many_nodes_are_refused_with_how_many_there_may_be_at_that_depth():
     assert f"has 13 nodes on levels 0 to 1; max_nodes is 12, and levels 0 to 31 hold up to {most:.3g}: set" in str(
         caught.value
     )
-    assert len(model.asked) == 1
+    assert len(model.queried) == 1
 
 
 @pytest.mark.parametrize(("children", "expansions"), [(1, 5), (2, 0), (3, 4), (12, 10)])

@@ -1,4 +1,4 @@
-"""What a search asks of its model, how many nodes it makes of the answers, and what it remembers."""
+"""For what a search queries its model, how many nodes it has, and what it remembers."""
 
 import time
 import weakref
@@ -60,18 +60,18 @@ def test_a_deep_sea_has_as_many_nodes_at_each_level_as_its_row_has_cells_within_
     assert nodes_per_level(deep_sea(n), 0, 9) == [*rows, *[sum(rows)] * 3]
 
 
-def test_a_deep_sea_of_50_asks_for_each_cell_within_reach_once():
+def test_a_deep_sea_of_50_is_queried_once_for_each_cell_within_reach():
     m, model = 50, watched(deep_sea(50))
     look = expectimax(model, torch.tensor([0]), depth=m, v_leaf=zeros)
     assert look.model_calls == m * (m + 1)
-    assert sorted(model.asked) == [50 * row + column for row in range(m) for column in range(row + 1)]
+    assert sorted(model.queried) == [50 * row + column for row in range(m) for column in range(row + 1)]
 
 
-# Asking
+# Queries
 
 
 @given(mdps(max_states=8), st.data())
-def test_in_however_many_searches_no_state_is_asked_about_twice_and_each_sees_T_to_the_m(mdp, data):
+def test_in_however_many_searches_no_state_is_queried_twice_and_each_is_T_to_the_m(mdp, data):
     model = watched(mdp)
     topology, q_SA = Topology(model), some_q(mdp)
     roots = st.lists(st.integers(0, mdp.num_states - 1), min_size=1, max_size=3)
@@ -84,18 +84,18 @@ def test_in_however_many_searches_no_state_is_asked_about_twice_and_each_sees_T_
         assert look.nodes_per_level == fresh.nodes_per_level
         torch.testing.assert_close(look.q_BA, exact.lookahead(mdp, q_SA, depth)[root_B], rtol=1e-11, atol=1e-11)
         reported += look.model_calls
-    assert len(model.asked) == len(set(model.asked))
-    assert reported == topology.model_calls == mdp.num_actions * len(model.asked)
+    assert len(model.queried) == len(set(model.queried))
+    assert reported == topology.table.model_calls == mdp.num_actions * len(model.queried)
 
 
-def test_without_a_topology_each_search_asks_anew():
+def test_without_a_topology_each_search_queries_the_model_again():
     model = watched(ladder(4))
     first, second = (expectimax(model, torch.tensor([0]), depth=9, v_leaf=zeros) for _ in range(2))
     assert first.model_calls == second.model_calls == 8
-    assert sorted(model.asked) == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert sorted(model.queried) == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
-def test_the_same_roots_again_and_other_roots_in_known_territory_ask_nothing():
+def test_the_same_roots_again_and_other_known_states_need_no_queries():
     model = watched(zoo("grid"))
     topology = Topology(model)
     first = expectimax(model, torch.tensor([0, 99]), depth=9, v_leaf=zeros, topology=topology)
@@ -106,14 +106,14 @@ def test_the_same_roots_again_and_other_roots_in_known_territory_ask_nothing():
     assert len(model.calls) == calls
 
 
-def test_a_deeper_look_asks_only_about_what_is_new():
+def test_a_deeper_lookahead_queries_only_new_states():
     model = watched(ladder(9))
     topology, root = Topology(model), torch.tensor([0])
     calls = [expectimax(model, root, depth=m, v_leaf=zeros, topology=topology).model_calls for m in (2, 1, 4, 2, 20)]
     assert calls == [2 * 3, 0, 2 * 2, 0, 2 * 4]
 
 
-def test_doubling_the_depth_on_a_closed_set_asks_nothing():
+def test_doubling_the_depth_on_a_closed_set_needs_no_queries():
     model = watched(grid())
     topology = Topology(model)
     looks = [
@@ -122,16 +122,16 @@ def test_doubling_the_depth_on_a_closed_set_asks_nothing():
     assert looks == [4 * 100, 0]
 
 
-def test_depth_0_asks_nothing_for_a_q_and_about_the_roots_alone_for_a_v():
+def test_depth_0_needs_no_queries_with_q_and_those_of_the_roots_with_v():
     mdp = zoo("garnet")
-    for leaf, asked in [({"q_leaf": Critic(some_q(mdp))}, []), ({"v_leaf": Critic(some_v(mdp))}, [4, 21])]:
+    for leaf, queried in [({"q_leaf": Critic(some_q(mdp))}, []), ({"v_leaf": Critic(some_v(mdp))}, [4, 21])]:
         model = watched(mdp)
         expectimax(model, torch.tensor([21, 4, 21]), depth=0, **leaf)
-        assert model.asked == asked
+        assert model.queried == queried
 
 
 @pytest.mark.parametrize("depth", [0, 1, 5, 40])
-def test_the_critic_is_asked_once_about_distinct_states(depth):
+def test_the_critic_is_called_once_for_distinct_states(depth):
     mdp = zoo("garnet")
     for critic, name in [(Critic(some_q(mdp)), "q_leaf"), (Critic(some_v(mdp)), "v_leaf")]:
         look = expectimax(TabularModel(mdp), torch.tensor([0, 5, 0]), depth=depth, **{name: critic})
@@ -149,12 +149,12 @@ def test_what_follows_a_terminal_outcome_alone_is_no_node(ends):
         ],
         0.9,
     )
-    seen = set[int]()
+    met = set[int]()
     for depth in range(6):
         model, critic = watched(mdp), Critic(some_v(mdp))
         expectimax(model, torch.tensor([0]), depth=depth, v_leaf=critic)
-        seen.update(critic.calls[0], model.asked)
-    assert (2 in seen) == (not ends)
+        met.update(critic.calls[0], model.queried)
+    assert (2 in met) == (not ends)
 
 
 # Memory
@@ -177,7 +177,7 @@ def test_two_batches_of_roots_that_take_turns_do_not_disturb_each_other():
             torch.testing.assert_close(look.q_BA, expected[depth][roots], rtol=1e-11, atol=1e-11)
 
 
-def test_more_batches_of_roots_than_are_remembered_are_answered_and_the_oldest_is_forgotten():
+def test_levels_of_the_oldest_batch_of_roots_are_dropped():
     mdp = zoo("garnet")
     model, q_SA = watched(mdp), some_q(mdp)
     topology = Topology(model)
@@ -188,10 +188,10 @@ def test_more_batches_of_roots_than_are_remembered_are_answered_and_the_oldest_i
         look = expectimax(model, torch.tensor([root]), depth=4, q_leaf=Critic(q_SA), topology=topology)
         torch.testing.assert_close(look.q_BA[0], expected[root], rtol=1e-11, atol=1e-11)
     assert oldest() is None
-    assert len(model.asked) == len(set(model.asked))
+    assert len(model.queried) == len(set(model.queried))
 
 
-def test_a_batch_of_roots_that_is_used_again_is_not_forgotten():
+def test_levels_of_a_batch_of_roots_that_is_used_again_are_kept():
     model = TabularModel(zoo("garnet"))
     topology, root = Topology(model), torch.tensor([0])
     levels = topology.levels(root, 3, max_nodes=1000)
@@ -204,7 +204,7 @@ def test_a_batch_of_roots_that_is_used_again_is_not_forgotten():
 
 
 @pytest.mark.fault("lookahead of too many nodes")
-def test_a_lookahead_beyond_its_budget_is_refused_before_the_model_is_asked_about_the_level_that_breaks_it():
+def test_a_lookahead_beyond_its_budget_is_refused_before_the_model_is_queried_for_the_level_that_breaks_it():
     model = WatchedModel(InterningModel(paths, [()], num_actions=2))
     topology, root = Topology(model), torch.tensor([0])
 
@@ -213,16 +213,16 @@ def test_a_lookahead_beyond_its_budget_is_refused_before_the_model_is_asked_abou
 
     with pytest.raises(NodeBudgetExceeded, match=r"has 21 nodes on levels 0 to 2; max_nodes is 20"):
         look(20)
-    assert len(model.asked) == 1 + 4
+    assert len(model.queried) == 1 + 4
     with pytest.raises(NodeBudgetExceeded, match=r"has 85 nodes on levels 0 to 3; max_nodes is 84"):
         look(84)
-    assert len(model.asked) == 1 + 4 + 16
+    assert len(model.queried) == 1 + 4 + 16
     # The leaves count as well, and nobody asks the model about them.
     with pytest.raises(NodeBudgetExceeded, match=r"has 341 nodes on levels 0 to 4; max_nodes is 340"):
         look(340)
-    assert len(model.asked) == 1 + 4 + 16 + 64
+    assert len(model.queried) == 1 + 4 + 16 + 64
     assert look(341) == 0
-    assert len(model.asked) == len(set(model.asked)) == 1 + 4 + 16 + 64
+    assert len(model.queried) == len(set(model.queried)) == 1 + 4 + 16 + 64
 
 
 def test_the_budget_of_a_closed_set_is_one_node_for_each_state_and_level():
@@ -239,14 +239,14 @@ def test_an_absurd_depth_on_a_closed_set_is_refused_at_once():
         with pytest.raises(NodeBudgetExceeded, match=f"has {5 * (depth - 3) + 15} nodes"):
             expectimax(model, torch.arange(1), depth=depth, v_leaf=zeros, topology=Topology(model))
     assert time.process_time() - started < 5  # the sweeps alone would take an hour
-    assert len(model.asked) == 2 * 5
+    assert len(model.queried) == 2 * 5
 
 
-def test_more_distinct_roots_than_the_budget_are_refused_unasked():
+def test_more_distinct_roots_than_the_budget_are_refused_before_a_query():
     model = watched(ladder(5))
     with pytest.raises(NodeBudgetExceeded, match="has 5 nodes on levels 0 to 0; max_nodes is 4"):
         expectimax(model, torch.arange(5), depth=3, v_leaf=zeros, max_nodes=4)
-    assert model.asked == []
+    assert model.queried == []
 
 
 # Models that break their word
@@ -272,8 +272,8 @@ class Liar(EnumeratingModel):
     ("change", "message"),
     [
         ("rows", r"model returned outcomes of \(1, 2\) states and actions; they must be of \(3, 2\)"),
-        ("far", "model leads from state 4 by action 1 to 5; states are 0 to 4"),
-        ("negative", "model leads from state 4 by action 1 to -1; states are 0 to 4"),
+        ("far", "child of outcome 0 of state 4 and action 1 is 5; states are 0 to 4"),
+        ("negative", "child of outcome 0 of state 4 and action 1 is -1"),
     ],
 )
 def test_an_answer_that_cannot_be_true_is_refused_and_named(change, message):
@@ -300,4 +300,4 @@ def test_a_search_that_failed_in_its_model_can_be_repeated():
         expectimax(model, root, depth=6, q_leaf=Critic(q_SA), topology=topology)
     look = expectimax(model, root, depth=6, q_leaf=Critic(q_SA), topology=topology)
     torch.testing.assert_close(look.q_BA[0], exact.lookahead(mdp, q_SA, 6)[44], rtol=1e-11, atol=1e-11)
-    assert len(model.asked) == len(set(model.asked))
+    assert len(model.queried) == len(set(model.queried))
