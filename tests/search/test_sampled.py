@@ -598,7 +598,7 @@ def test_a_C_that_is_no_count_is_refused_and_named(samples):
 @pytest.mark.parametrize(
     ("knobs", "message"),
     [
-        ({"samples": []}, r"samples is \[\]"),
+        ({"samples": []}, "samples is a list"),
         ({"share": "all"}, "share is 'all'"),
         ({"share": "search", "samples": [3, 4]}, r"samples is \[3, 4\]; with share='search' a state has one C"),
         ({"share": "search", "samples": [None, 4]}, "one C at all levels"),
