@@ -13,6 +13,8 @@ from pgts_torch.bellman import Outcomes, backup
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.tabular.mdp import TabularMDP
 
+Matrix = scipy.sparse.csr_array | scipy.sparse.csc_array
+
 DENSE_LIMIT = 1500
 """Up to this many states a policy is evaluated by a dense solve, beyond it by a sparse iterative one."""
 
@@ -83,12 +85,7 @@ def occupancy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S"
 def support(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Bool[Tensor, "S"]:
     """sigma_pi = {s : d^pi(s) > 0} as a mask, by reachability, which does not round.        [PGTS Sec. 4]"""
     matrix = _policy_matrix(mdp, check_policy(mdp, pi_SA))
-    reached = mdp.start_S.numpy() > 0
-    frontier = reached
-    while frontier.any():
-        frontier = ((matrix.T @ frontier.astype(np.float64)) > 0) & ~reached
-        reached = reached | frontier
-    return torch.from_numpy(reached)
+    return torch.from_numpy(_closure(matrix.T, mdp.start_S.numpy() > 0))
 
 
 def bellman(mdp: TabularMDP, q_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S A"]:
@@ -183,24 +180,31 @@ def _ending_actions(outcomes: Outcomes, action_S: Tensor) -> Tensor:
 
 def _check_ends(outcomes: Outcomes, pi_SA: Tensor, matrix: scipy.sparse.csr_array) -> None:
     """PgtsError unless every state can reach one where the policy discounts or terminates: else I - M is singular."""
-    found = (ends(outcomes) & (pi_SA > 0)).any(-1).numpy()
+    found = _closure(matrix, (ends(outcomes) & (pi_SA > 0)).any(-1).numpy())
+    if not found.all():
+        raise PgtsError(
+            f"the policy has no finite value in state {int(np.argmin(found))}: from there on it neither discounts "
+            f"(gamma is 1) nor terminates"
+        )
+
+
+def _closure(matrix: Matrix, found: np.ndarray) -> np.ndarray:
+    """The states found, and those with a path of positive entries to one of them: rows lead to columns."""
     while not found.all():
         grown = found | ((matrix @ found.astype(np.float64)) > 0)
         if (grown == found).all():
-            raise PgtsError(
-                f"the policy has no finite value in state {int(np.argmin(found))}: from there on it neither "
-                f"discounts (gamma is 1) nor terminates"
-            )
+            break
         found = grown
+    return found
 
 
-def _solve_dense(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array, b: np.ndarray) -> np.ndarray:
+def _solve_dense(matrix: Matrix, b: np.ndarray) -> np.ndarray:
     # By torch, which keeps to the threads it was given: on busy cores those of numpy made it hundreds of times slower.
     identity = torch.eye(len(b), dtype=torch.float64)
     return torch.linalg.solve(identity - torch.from_numpy(matrix.toarray()), torch.from_numpy(b)).numpy()
 
 
-def _solve_iterative(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array, b: np.ndarray) -> np.ndarray:
+def _solve_iterative(matrix: Matrix, b: np.ndarray) -> np.ndarray:
     """BiCGSTAB, restarted until the residual b - (I - M) x is within SOLVE_TOLERANCE of b."""
 
     def identity_minus(x: np.ndarray) -> np.ndarray:

@@ -141,12 +141,11 @@ class TabularMDP:
             start = getattr(unwrapped, "initial_state_distrib", None)
         shape = getattr(unwrapped, "shape", (getattr(unwrapped, "nrow", 0), getattr(unwrapped, "ncol", 0)))
         try:
-            laid_out = len(shape) == 2 and int(shape[0]) * int(shape[1]) == len(table)
+            rows, columns = map(int, shape)
         except (TypeError, ValueError):  # attributes of another meaning
-            laid_out = False
-        return cls.from_transitions(
-            table, gamma, start=start, shape=(int(shape[0]), int(shape[1])) if laid_out else (0, 0)
-        )
+            rows = columns = 0
+        shape = (rows, columns) if rows * columns == len(table) else (0, 0)
+        return cls.from_transitions(table, gamma, start=start, shape=shape)
 
     def save_npz(self, path: str | Path) -> None:
         """Write the MDP as `load_npz` reads it, without names and shape of the picture. Only a file that `load_npz`

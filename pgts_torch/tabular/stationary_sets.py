@@ -93,7 +93,7 @@ def enumerate_sets(
     _check_all_end(mdp.outcomes)
     optimum = exact.optimal(mdp)
     slack = _slack(mdp, optimum, tolerance)
-    weight_SAS = _dense_weight(mdp.outcomes)
+    weight_SAS = mdp.outcomes.weight.to_dense().view(S, A, S)
     free = next(n for n in range(S, 0, -1) if S * A**n <= BATCH_ENTRIES or n == 1)
     parts = []
     for first in range(0, A**S, A**free):
@@ -210,10 +210,6 @@ def _policies(low: int, high: int, num_states: int, num_actions: int) -> Int[Ten
 def _slack(mdp: TabularMDP, optimum: exact.Optimum, tolerance: float) -> float:
     """The tolerance in reward units; multiplying all rewards by a number changes no stationary set."""
     return tolerance * float(torch.maximum(optimum.q_SA.abs().max(), mdp.outcomes.reward_NA.abs().max()))
-
-
-def _dense_weight(outcomes: Outcomes) -> Float[Tensor, "S A S"]:
-    return outcomes.weight.to_dense().view(outcomes.num_states, outcomes.num_actions, -1)
 
 
 def _check_all_end(outcomes: Outcomes) -> None:
