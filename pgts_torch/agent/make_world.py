@@ -78,11 +78,13 @@ def make_world(
         return world
     if not plain:
         raise MissingModel("; ".join(reversed(reasons)) + _NO_MODEL_NEEDED)
-    if name := _normalizing_wrapper(env):
-        raise PgtsError(
-            f"{env_name(env)} is wrapped in {name}, whose running statistics are neither saved nor used in "
-            "evaluations: leave it out, and set normalize of the network or normalize_returns of the critic"
-        )
+    for wrapper in wrappers_of(each_of(env)[0]):
+        if isinstance(wrapper, NormalizeObservation | NormalizeReward):
+            raise PgtsError(
+                f"{env_name(env)} is wrapped in {type(wrapper).__name__}, whose running statistics are neither saved "
+                "nor used in evaluations: leave it out, and set normalize of the network or normalize_returns of the "
+                "critic"
+            )
     _check_single(action_repeat, "without a model")
     return World(env, gamma=discount, observation_key=observation_key, device=device)
 
@@ -237,12 +239,6 @@ def _simulator(request: _Request) -> SimulatedWorld:
         device=request.device,
     )
     return SimulatedWorld(request.envs, model, observation_key=key, device=request.device)
-
-
-def _normalizing_wrapper(env: VectorEnv) -> str:
-    """The name of a wrapper that normalises by running statistics; empty where there is none."""
-    kinds = NormalizeObservation, NormalizeReward
-    return next((type(wrapper).__name__ for wrapper in wrappers_of(each_of(env)[0]) if isinstance(wrapper, kinds)), "")
 
 
 def _own(request: _Request, names: Iterable[str]) -> str:

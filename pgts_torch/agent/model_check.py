@@ -110,7 +110,7 @@ class ModelCheck:
             self.model_calls += each.calls
             if each.samples_only:
                 self._warn(
-                    "drawn",
+                    "random",
                     f"{self._name} has random steps whose outcomes its {self._kind} does not enumerate: whether these "
                     "steps are possible, and with which probability, is not checked",
                 )

@@ -1,4 +1,7 @@
-"""Attributes of environments as values that can be compared: are two instances alike, and what does a step change?"""
+"""Attributes of environments as values that can be compared: are two instances alike, and what does a step change?
+
+An error of an environment that is stepped is `Failed`.
+"""
 
 import collections
 import contextlib
@@ -67,10 +70,9 @@ def attributes(env: gymnasium.Env, *, but: Set[str] = _NONE) -> dict[str, Any]:
         met[type(layer)] += 1
         number = f"{met[type(layer)]}." if met[type(layer)] > 1 else ""
         start = "" if layer is layers[-1] else f"{type(layer).__name__}.{number}"
-        own = {name: value for cls in reversed(_classes_outside(type(layer))) for name, value in _data_of(cls).items()}
-        named = {name: value for name, value in (own | vars(layer)).items() if name not in but}
+        named = (_class_attributes(type(layer)) | vars(layer)).items()
         # A function among the attributes may enclose one of the layers, which is not compared again there.
-        held |= {start + name: fingerprint(value, besides=layers) for name, value in named.items()}
+        held |= {start + name: fingerprint(value, besides=layers) for name, value in named if name not in but}
     return held
 
 
@@ -82,9 +84,6 @@ def changing(
     Args:
         env: an instance for this alone; it is stepped.
         but: as in `attributes`.
-
-    Raises:
-        Failed: the environment raises.
     """
     now, found, age = attributes(env, but=but), collections.Counter[str](), 0
     for taken in random_walk(env, actions, generator, steps=0, longest=_LONGEST, seconds=_SECONDS):
@@ -96,7 +95,7 @@ def changing(
 
 
 class Unlike(NamedTuple):
-    """An environment that differs from other instances: its position, and the attribute in words."""
+    """The position of an environment that differs from other instances, and in which attribute, in words."""
 
     number: int
     what: str
@@ -121,9 +120,6 @@ def unlike(
         new: instances that are not changed.
         make: makes an instance for this alone; it is stepped, and rendered if it can be.
         apart: attributes of which each instance has its own.
-
-    Raises:
-        Failed: an environment raises.
     """
     pairs = [(attributes(env), attributes(other)) for env, other in zip(envs, new, strict=False)]
     left = [different(*pair) - apart for pair in pairs]
@@ -144,16 +140,24 @@ def unlike(
             break
         reset(walked, seed=int(generator.integers(2**31)))
         of_state |= different(now, attributes(walked))
-    return next((Unlike(k, in_words(min(names), pairs[k][0], now)) for k, names in enumerate(left) if names), None)
+    for k, names in enumerate(left):
+        if names:
+            name, held = min(names), pairs[k][0]
+            plain = all(
+                name in each and isinstance(each[name], bool | int | float | str | None) for each in (held, now)
+            )
+            what = f"{name} = {held[name]!r}, where another instance has {now[name]!r}" if plain else f"another {name}"
+            return Unlike(k, what)
+    return None
 
 
 def own_to_each(make: Callable[[], gymnasium.Env]) -> set[str]:
     """The names of the attributes in which a few new instances differ, for instance a map that is random."""
     until, first, found = time.monotonic() + _SECONDS, attributes(make()), set[str]()
-    for k in range(_INSTANCES - 1):
-        if k and time.monotonic() > until:
-            break
+    for _ in range(_INSTANCES - 1):
         found |= different(first, attributes(make()))
+        if time.monotonic() > until:
+            break
     return found
 
 
@@ -161,12 +165,6 @@ def different(held: dict[str, Any], other: dict[str, Any]) -> set[str]:
     """The names under which two environments hold different values, or only one of them holds any."""
     missing = object()
     return {name for name in held.keys() | other.keys() if held.get(name, missing) != other.get(name, missing)}
-
-
-def in_words(name: str, held: dict[str, Any], other: dict[str, Any]) -> str:
-    """An attribute that differs between two environments, in words; with its values where they are short."""
-    plain = [name in each and isinstance(each[name], bool | int | float | str | None) for each in (held, other)]
-    return f"{name} = {held[name]!r}, where another instance has {other[name]!r}" if all(plain) else f"another {name}"
 
 
 def fingerprint(value: Any, *, besides: Sequence[Any] = ()) -> Any:
@@ -260,13 +258,9 @@ def _parts_of(value: Any, left_out: Set[str]) -> list[tuple[Any, Any]]:
         return []
 
 
-def _classes_outside(cls: type) -> list[type]:
-    """The classes among the bases of an environment that are not Gymnasium's or Python's own."""
-    return [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("gymnasium", "typing", "builtins")]
-
-
-def _data_of(cls: type) -> dict[str, Any]:
-    """The attributes of a class that are not code."""
+def _class_attributes(cls: type) -> dict[str, Any]:
+    """The attributes that are not code, of a class and of its bases outside of Gymnasium."""
     code = (types.FunctionType, staticmethod, classmethod, property, functools.cached_property, type)
-    plain = {name: value for name, value in vars(cls).items() if not name.startswith("__")}
-    return {name: value for name, value in plain.items() if not isinstance(value, code) and name != "metadata"}
+    own = [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("gymnasium", "typing", "builtins")]
+    named = {name: value for base in reversed(own) for name, value in vars(base).items() if not name.startswith("__")}
+    return {name: value for name, value in named.items() if not isinstance(value, code) and name != "metadata"}

@@ -102,18 +102,20 @@ def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> None:
         MissingModel: snapshots of the environment cannot be trusted; the message says why.
         PgtsError: the environment fails.
     """
-    beside_snapshots(setup)
-    longest = int(np.clip(seconds / (_STEPS_IN_ALL * _seconds_of_a_step(setup)), 2, _LONG_LENGTH))
-    few = setup.actions[: max(2, min(longest, ACTIONS_TRIED))]
-    short = replace(setup, longest=longest, actions=few)
     # Making an instance may take long: where all are alike three take turns, one for each part of a check.
-    three = itertools.cycle([setup.make() for _ in range(3)]) if setup.alike else None
-    many, turns = (_WALKS_APART, short) if three is None else (_SHORT_WALKS, replace(short, make=three.__next__))
+    take_turns = itertools.cycle([setup.make() for _ in range(3)]).__next__ if setup.alike else setup.make
+    turns = replace(setup, make=take_turns)
+    beside_snapshots(turns)
+    longest = int(np.clip(seconds / (_STEPS_IN_ALL * _seconds_of_a_step(turns)), 2, _LONG_LENGTH))
+    turns = replace(turns, longest=longest, actions=setup.actions[: max(2, min(longest, ACTIONS_TRIED))])
+    many = _SHORT_WALKS if setup.alike else _WALKS_APART
     for count, length in ((many, min(longest, _SHORT_LENGTH)), (1, longest)):
         walks = walks_of(turns, count, length)
         chance(turns, walks)
         restored(walks, repeated(turns, walks))
-    untouched(short, min(longest, _SHORT_LENGTH), width=max(1, min(_WIDTH, longest // _WIDTH)))
+    # Real environments have not been in other states.
+    new = replace(turns, make=setup.make)
+    untouched(new, min(longest, _SHORT_LENGTH), width=max(1, min(_WIDTH, longest // _WIDTH)))
 
 
 def _seconds_of_a_step(setup: Setup) -> float:
@@ -132,11 +134,12 @@ def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
     """Walks without a restored state in between, each from the state that some random steps have led to."""
     env, walks = setup.fresh(), list[Walk]()
     for _ in range(count):
-        reset(env, seed=setup.number())
+        # Without seeds: some emulators load their program anew for each seed.
         for _ in range(int(setup.random.integers(setup.longest))):
             if step(env, setup.action()).ends:
-                reset(env, seed=setup.number())
+                reset(env)
         walks.append(_recorded(setup, env, setup.number(), tuple(setup.action() for _ in range(length))))
+        reset(env)
     return walks
 
 
@@ -186,9 +189,10 @@ def _bits_of(env: gymnasium.Env, taken: Taken) -> bytes:
 
 def beside_snapshots(setup: Setup) -> None:
     """MissingModel if a subclass has attributes that change and are not in the snapshots of its family."""
-    env, known = setup.fresh(), setup.adapter.restored
+    env, known = setup.make(), setup.adapter.restored
     if known is None or type(env).__module__.split(".")[0] in ("gymnasium", "ale_py"):
         return
+    reset(env, seed=setup.number())
     if names := changing(env, setup.actions, setup.random, but=known):
         raise MissingModel(
             f"{min(names)} changes in its steps or resets and is in no snapshot of {setup.adapter.name}: "
@@ -236,9 +240,7 @@ def untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
     """Whether two equal real environments stay equal when a search starts from one of them."""
     real, twin = setup.make(), setup.make()
     seed, actions = setup.number(), [setup.action() for _ in range(2 * length)]
-    for env in (real, twin):
-        reset(env, seed=seed)
-    begun = _live(real, actions[:length]), _live(twin, actions[:length])
+    begun = [[_bits_of(env, reset(env, seed=seed)), *_live(env, actions[:length])] for env in (real, twin)]
     before = _state_of(setup, real)
     model, after = setup.model(), {before}
     with environment_code():

@@ -26,7 +26,7 @@ _COMPARED_STEPS, _LONGEST_EPISODE = 400, 40
 @contextmanager
 def environment_code() -> Iterator[None]:
     """Whatever the code of an environment raises in this context is `Failed`, so that it is told from an error of our
-    own code; Ctrl-C is the user's."""
+    own code; Ctrl-C is passed on."""
     try:
         yield
     except (PgtsError, KeyboardInterrupt):
@@ -77,9 +77,6 @@ def random_walk(
     """Resets and steps of random episodes: three, and more until there are `steps` steps or the time is over.
 
     An episode is ended after `longest` steps, and after its next step once the time is over.
-
-    Raises:
-        Failed: the environment raises.
     """
     until, taken = time.monotonic() + seconds, 0
     for episode in itertools.count():

@@ -39,14 +39,14 @@ def vector_of(*makers: Callable[[], gymnasium.Env]) -> SyncVectorEnv:
 
 
 def reached(world: ModelWorld) -> tuple[torch.Tensor, torch.Tensor]:
-    """The number of the state in which the first copy begins, and what it shows, after a reset with seed 0."""
+    """The number of the state in which the first environment begins, and its observation, after a reset with seed 0."""
     observation, _ = world.env.reset(seed=0)
     encoded = world.encode(observation)
     return world.numbers(world.read(observation, encoded))[:1], encoded[:1]
 
 
 def agrees(world: ModelWorld, actions: Sequence[int]) -> bool:
-    """Whether the model says of each of these steps what then happens in the first copy: reward, and what it shows."""
+    """Whether the model gives the reward and the observation of each of these steps in the first environment."""
     state, _ = reached(world)
     for action in actions:
         outcomes = world.model.outcomes(state)

@@ -1,4 +1,4 @@
-"""What an environment does is held to its model: tables, dynamics and simulators, step by step and in the long run."""
+"""Steps of an environment are compared with its model: tables, dynamics and simulators, one by one and by frequency."""
 
 import pickle
 import warnings
@@ -148,7 +148,7 @@ def test_the_first_step_that_the_model_rules_out_stops_the_training_before_the_p
     assert model.model_check.contradictions > 0
 
 
-def test_dynamics_are_held_within_rounding():
+def test_a_step_that_dynamics_rule_out_stops_the_training():
     model = PGTS("CartPole-v1", depth=1, policy="mlp", **SMALL)
     model.iterate()
     real(model)[2].force_mag = 10 * (1 + 1e-9)  # constants are read when an instance is first met
@@ -158,7 +158,7 @@ def test_dynamics_are_held_within_rounding():
         model.iterate()
 
 
-def test_dynamics_hold_a_step_that_differs_in_the_last_bits_and_no_more():
+def test_a_step_may_differ_from_dynamics_in_the_last_bits_only():
     env = gymnasium.make("CartPole-v1").unwrapped
     env.reset(seed=0)
     model = CartPole(env, gamma=0.9)
@@ -198,7 +198,7 @@ def test_the_tables_and_dynamics_that_come_along_agree_with_their_environments(e
     assert model.model_check.contradictions == 0
 
 
-def test_dynamics_are_held_to_what_the_environment_shows(monkeypatch):
+def test_observations_of_dynamics_are_compared_with_those_of_the_environment(monkeypatch):
     model = PGTS("Acrobot-v1", depth=1, **SMALL)
     before, shown = model.policy.state_dict(), AcrobotEnv._get_ob
     monkeypatch.setattr(AcrobotEnv, "_get_ob", lambda env: shown(env) + np.float32(5e-7))
@@ -300,7 +300,7 @@ def test_a_start_that_is_too_frequent_stops_the_training():
 # Modes, counters, work
 
 
-def test_with_warn_each_kind_is_said_once_and_counted_and_with_off_nobody_looks():
+def test_warn_counts_contradictions_and_warns_once_a_kind_and_off_checks_nothing():
     for mode, said in (("warn", 1), ("off", 0)):
         model = PGTS(Listed, depth=1, model_check=mode, **SMALL)
         for env in real(model):
@@ -318,7 +318,7 @@ def test_with_warn_each_kind_is_said_once_and_counted_and_with_off_nobody_looks(
         PGTS(Listed, model_check="loud")
 
 
-def test_with_sampled_advantages_nothing_is_held():
+def test_with_sampled_advantages_nothing_is_checked():
     model = PGTS(Restored, depth=0, estimator="sampled", policy="mlp", **SMALL)
     for env in real(model):
         env.lie = pays_after(0, 0.25)
@@ -336,17 +336,17 @@ def test_the_check_moves_no_learning_curve(env):
     assert policies[0] == policies[1]
 
 
-def test_a_simulator_is_asked_by_the_check_about_few_steps_and_only_about_those_that_the_lookahead_has_not_asked():
-    asked = {}
+def test_the_check_queries_a_simulator_about_few_steps_and_none_that_the_lookahead_has_queried():
+    queries = {}
     for depth, critic in ((1, {"type": "network", "target": "v"}), (0, {"type": "network", "target": "q"})):
         model = PGTS(Restored, depth=depth, policy="mlp", critic=critic, **{**SMALL, "num_envs": 32})
         model.learn(320)
-        asked[depth] = model.model_check.model_calls
-    assert asked[1] == 0
-    assert 0 < asked[0] <= S * A  # one in 64 of 320, and none of them twice
+        queries[depth] = model.model_check.model_calls
+    assert queries[1] == 0
+    assert 0 < queries[0] <= S * A  # one in 64 of 320, and none of them twice
 
 
-def test_repeated_actions_are_held_by_single_steps():
+def test_repeated_actions_are_checked_by_single_steps():
     model = PGTS(Restored, depth=1, action_repeat=3, policy="mlp", **{**SMALL, "num_envs": 32})
     model.learn(2_000)
     assert model.model_check.contradictions == 0
@@ -357,7 +357,7 @@ def test_repeated_actions_are_held_by_single_steps():
         model.learn(20_000)
 
 
-def test_what_a_simulator_only_draws_cannot_be_held_which_is_said_once():
+def test_steps_that_a_simulator_only_samples_are_not_checked_which_is_one_warning():
     model = PGTS(lambda: Restored(slip=0.3), depth=1, policy="mlp", **{**SMALL, "num_envs": 32})
     with pytest.warns(UserWarning, match="outcomes its simulator does not enumerate.*is not checked") as said:
         model.learn(400)
@@ -365,7 +365,7 @@ def test_what_a_simulator_only_draws_cannot_be_held_which_is_said_once():
     assert model.model_check.contradictions == 0
 
 
-def test_a_step_is_unasked_drawn_or_held_as_the_simulator_can():
+def test_a_step_is_not_queried_or_an_outcome_or_random():
     env = Restored()
     env.reset(seed=0)
     model = SimulatorModel(Restored, gamma=0.9)

@@ -134,7 +134,7 @@ def test_simulators_refuse_such_wrappers_too():
         SimulatorModel(lambda: Skipping(Walk()), gamma=0.9)
 
 
-def test_copies_that_a_wrapper_changes_together_have_no_model():
+def test_a_wrapper_around_several_environments_leaves_them_without_a_model():
     vector = gymnasium.wrappers.vector.TransformReward(
         gymnasium.vector.SyncVectorEnv([Walk], autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED), tenth
     )
