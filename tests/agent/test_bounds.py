@@ -57,6 +57,12 @@ OPTIONS: dict[str, tuple[Any, Range]] = {
     "max_length": (lambda x: {"horizon": {"type": "geometric", "max_length": x}}, COUNT),
     "num_envs": (lambda x: {"num_envs": x}, COUNT),
     "step size of a table": (lambda x: {"update": {"type": "softmax", "step_size": x}}, POSITIVE),
+    "step size of a projected step": (
+        lambda x: {"policy": "simplex", "update": {"type": "projected", "step_size": x}},
+        POSITIVE,
+    ),
+    "step size of a mirror step": (lambda x: {"update": {"type": "mirror", "step_size": x}}, POSITIVE),
+    "initial value of a critic": (lambda x: critic(initial=x), ((-1e300, 0, 1e300), (math.nan, math.inf, -math.inf))),
     "stop_at": (lambda x: {"stop_at": x}, NOT_NEGATIVE),
     "tolerance": (lambda x: {"depth": "adaptive", "tolerance": x}, NOT_NEGATIVE),
     "max_depth": (lambda x: {"depth": "adaptive", "max_depth": x}, ((0, 1), (-1,))),
@@ -77,6 +83,8 @@ OPTIONS: dict[str, tuple[Any, Range]] = {
     "num_epochs": (lambda x: update("ppo", num_epochs=x), COUNT),
     "minibatch_size": (lambda x: update("ppo", minibatch_size=x), COUNT),
     "temperature": (lambda x: update("mirror", temperature=x), POSITIVE),
+    "temperature of cmpo": (lambda x: update("cmpo", temperature=x), POSITIVE),
+    "clip of cmpo": (lambda x: update("cmpo", clip=x), POSITIVE),
     "hidden": (lambda x: {"policy": {"type": "mlp", "hidden": [x]}}, COUNT),
 }
 
@@ -89,6 +97,22 @@ def test_an_option_takes_the_ends_of_its_range_and_nothing_beyond_them(name):
     for value in refused:
         with pytest.raises(PgtsError, match=r"is |holds "):
             PGTS("pgts/Ladder-v0", **options(value))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (critic(initial="median"), "initial is 'median'; it must be a number or mean"),
+        (network(target="u"), "target is 'u'"),
+        (update("gradient", optimizer="lion"), "optimizer is 'lion'"),
+        (update("gradient", state_weight="all"), "state_weight is 'all'"),
+        ({"update": {"type": "mirror", "normalize": "max"}}, "normalize is 'max'; it must be rms or none"),
+        ({"update": {"type": "mirror", "floor": "low"}}, "floor is 'low'; it must be a number > 0 or never"),
+    ],
+)
+def test_an_unknown_word_is_refused(options, message):
+    with pytest.raises(PgtsError, match=message):
+        PGTS("pgts/Ladder-v0", **options)
 
 
 @pytest.mark.parametrize(

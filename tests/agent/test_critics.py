@@ -188,12 +188,6 @@ def test_unvisited_cells_are_0_where_all_targets_are_bootstrapped_in_them():
     assert critic.v(torch.arange(1, 5)).tolist() == [0.0] * 4
 
 
-@pytest.mark.parametrize("initial", [float("nan"), float("inf"), "median"])
-def test_an_invalid_initial_value_is_refused(initial):
-    with pytest.raises(PgtsError, match="it must be a number or mean"):
-        TabularValues(initial=initial)
-
-
 def test_a_step_moves_each_value_toward_the_mean_of_its_targets():
     made = by_hand()
     critic = TabularCritic(4, 1, TabularValues(method=TDLambda(lambda_=0.0), step_size=0.25, initial=0.0))

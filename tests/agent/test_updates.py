@@ -136,15 +136,6 @@ def test_a_policy_that_an_update_can_change_is_accepted(update, kind, step):
     assert isinstance(policy, update().policies)
 
 
-@pytest.mark.parametrize("options", [Projected, SoftmaxGradient, Mirror])
-def test_steps_and_weights_that_make_no_sense_are_refused(options):
-    for step_size in (0, -0.1, float("nan"), float("inf")):
-        with pytest.raises(PgtsError, match=f"step_size is {step_size}"):
-            options(step_size=step_size)
-    with pytest.raises(PgtsError, match="state_weight is 'all'"):
-        options(state_weight="all")
-
-
 def moved(update: MirrorUpdate, advantage: list[list[float]], logits: list[list[float]], noise: float = 0.0):
     """By how much the step changes the differences of the logits to the first action."""
     policy = SoftmaxPolicy(len(logits), len(logits[0]))
@@ -191,11 +182,3 @@ def test_an_action_that_is_not_allowed_stays_so():
     MirrorUpdate()(policy, Batch(torch.arange(1), advantage_NA, torch.ones(1)), generator=None)
     assert policy.probs_SA[0, 2] == 0
     assert policy.probs_SA[0, 0] > policy.probs_SA[0, 1] > 0
-
-
-def test_options_of_the_mirror_step_that_make_no_sense_are_refused():
-    for floor in (0.0, -1.0, math.inf, math.nan):
-        with pytest.raises(PgtsError, match=f"floor is {floor}; it must be a number > 0 or never"):
-            Mirror(floor=floor)
-    with pytest.raises(PgtsError, match="normalize is 'max'; it must be rms or none"):
-        Mirror(normalize="max")
