@@ -2,48 +2,61 @@
 in it is used. It is what `PGTS.save` writes, with notes beside the model: `PGTS.load` reads it."""
 
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from pydantic import BaseModel, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
 
 from pgts_torch import files
 from pgts_torch.agent import saving
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.saving import Damaged
-from pgts_torch.agent.states import NO_STATE, check_keys
-from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.ownership import (
     CHECKPOINTS,
     checkpoint_name,
+    checkpoints,
     read_mark,
     remove_partial,
     write_mark,
 )
-from pgts_torch.experiment.ownership import checkpoints as listed
+from pgts_torch.experiment.summary import EndedBy
 
 
-@dataclass(frozen=True)
-class Notes:
+class Progress(BaseModel, strict=True, extra="forbid"):
+    """What the loop around the algorithm goes on from.
+
+    ended_by: why the training is complete; None: it is not.
+    depth: the largest so far.   certificate: the latest one; None: there is none.   seconds: so far.
+    evaluations: the states of the callbacks that evaluate, by kind.   movement: the state of `Movement`.
+    """
+
+    ended_by: EndedBy | None = None
+    depth: NonNegativeInt = 0
+    certificate: FiniteFloat | None = None
+    seconds: FiniteFloat = 0.0
+    evaluations: dict[str, Any] = {}
+    movement: dict[str, Any] = {}
+
+
+class Notes(BaseModel, strict=True, extra="forbid", frozen=True):
     """What a checkpoint says beside the model, in plain values.
 
-    config: every key of the configuration, dotted, with its value.
+    config: as `Config.model_dump` has it.
     versions: of the packages that numbers depend on.
     world_size: how many processes trained.
     files: length and SHA-256 of the metrics, the events and the best model when it was taken, by name.
-    finished: whether the training had come to its end.
-    progress: what the loop around the algorithm goes on from.
     """
 
-    iterations: int
-    env_steps: int
-    model_calls: int
-    config: Mapping[str, Any]
-    versions: Mapping[str, str]
-    world_size: int
-    files: Mapping[str, Sequence[Any]]
-    finished: bool
-    progress: Mapping[str, Any]
+    iterations: NonNegativeInt
+    env_steps: NonNegativeInt
+    model_calls: NonNegativeInt
+    config: dict[str, Any]
+    versions: dict[str, str | None]
+    world_size: PositiveInt
+    files: dict[str, tuple[NonNegativeInt, str]]
+    progress: Progress
 
 
 def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
@@ -53,7 +66,7 @@ def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
         PgtsError: it cannot be written; then the others are as they were.
     """
     path = run / CHECKPOINTS / checkpoint_name(notes.env_steps)
-    content = algorithm.content() | {"notes": asdict(notes)}
+    content = algorithm.content() | {"notes": notes.model_dump()}
 
     def put() -> None:
         with files.named(f"the checkpoint {path} cannot be written"):
@@ -76,32 +89,16 @@ def read(path: Path) -> tuple[Notes, dict[str, Any]]:
     """
     content = saving.read(path)
     try:
-        notes = _notes(content.pop("notes"))
-    except NO_STATE as error:
-        reason = error if isinstance(error, PgtsError) else f"{type(error).__name__}: {error}"
-        raise PgtsError(f"the checkpoint {path} is not of the form that this version writes: {reason}") from error
+        notes = Notes.model_validate(content.pop("notes", None))
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        where = ".".join(map(str, ("notes", *wrong["loc"])))
+        raise PgtsError(
+            f"the checkpoint {path} is not of the form that this version writes: {where}: {wrong['msg']}"
+        ) from error
     if path.name != checkpoint_name(notes.env_steps):
         raise Damaged(f"{path} is damaged: it is the checkpoint of step {notes.env_steps}")
     return notes, content
-
-
-_NOTES = {"config": dict, "versions": dict, "files": dict, "progress": dict, "finished": bool}
-
-
-def _notes(content: dict[str, Any]) -> Notes:
-    """The notes in a checkpoint; PgtsError where they cannot be."""
-    counts = ("iterations", "env_steps", "model_calls", "world_size")
-    check_keys("its notes", content, {*_NOTES, *counts})
-    for name in counts:
-        check_count(name, content[name], least=name == "world_size")
-    for name, kind in _NOTES.items():
-        if type(content[name]) is not kind:
-            raise PgtsError(f"{name} is {content[name]!r}; it must be a {kind.__name__}")
-    for name, (size, sha256) in content["files"].items():
-        check_count(f"the length of {name}", size, least=0)
-        if not isinstance(sha256, str):
-            raise PgtsError(f"the SHA-256 of {name} is {sha256!r}")
-    return Notes(**content)
 
 
 def newest(run: Path, *, strict: bool = False) -> tuple[Path, Notes, dict[str, Any]] | None:
@@ -113,7 +110,7 @@ def newest(run: Path, *, strict: bool = False) -> tuple[Path, Notes, dict[str, A
     Raises:
         PgtsError: none is intact, or `strict` and the newest is not.
     """
-    paths = listed(run)
+    paths = checkpoints(run)
     for path in reversed(paths):
         try:
             return path, *read(path)
@@ -129,8 +126,8 @@ def newest(run: Path, *, strict: bool = False) -> tuple[Path, Notes, dict[str, A
 def tidy(run: Path, last: Path, *, keep: int) -> None:
     """Remove all checkpoints but `last` and the newest before it, `keep` in all; those ahead of it are damaged. And
     what a process that was killed has left half written: nobody else may be writing."""
-    kept = [path for path in listed(run) if path.name <= last.name][-keep:]
-    for path in listed(run):
+    kept = [path for path in checkpoints(run) if path.name <= last.name][-keep:]
+    for path in checkpoints(run):
         if path not in kept:
             path.unlink(missing_ok=True)
     remove_partial(run)

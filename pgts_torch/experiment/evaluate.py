@@ -8,7 +8,7 @@ from pgts_torch.agent.evaluate import Evaluation, evaluate
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.checkpoint import newest
-from pgts_torch.experiment.ownership import EARLIER_MODEL, earlier_checkpoints
+from pgts_torch.experiment.ownership import is_earlier
 
 KINDS = {"deterministic": True, "sampled": False}
 """The kinds of evaluation: with the most probable actions (True), or with sampled ones."""
@@ -27,8 +27,8 @@ def evaluate_run(run: str | Path, *, episodes: int, seed: int, trust_imports: bo
 def last_checkpoint(run: Path) -> Path:
     """Return the path of the newest intact checkpoint of a run folder; PgtsError if there is none."""
     found = newest(run)
-    if found is None and (earlier := earlier_checkpoints(run)):
-        return earlier[-1] / EARLIER_MODEL
+    if found is None and is_earlier(run):
+        raise PgtsError(f"{run} is the folder of a run of version 0.1; PGTS.load reads its checkpoints/*/model.pt")
     if found is None:
         raise PgtsError(f"{run} holds no checkpoint; it must be the folder of a run")
     return found[0]

@@ -1,15 +1,15 @@
 """Choose, create and clear the folder of a run, without touching files that no run has written."""
 
-import json
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pgts_torch import files
-from pgts_torch.config import Config, dump
+from pgts_torch.config import Config, dump, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.locking import RunLock
@@ -22,10 +22,11 @@ from pgts_torch.experiment.ownership import (
     check_folder,
     clear,
     clear_events,
+    digest,
     listing,
     write_mark,
 )
-from pgts_torch.experiment.resume import Start, is_kept
+from pgts_torch.experiment.resume import Start
 from pgts_torch.experiment.tracking import RunFolder, versions
 
 RUNS = Path("runs")
@@ -42,18 +43,15 @@ def check_dir(config: Config) -> None:
         raise PgtsError("run.dir is not set; torchrun --max-restarts needs it, so that a restart finds the run")
 
 
-def claimed(config: Config) -> RunLock:
-    """The lock of the configured folder, or of a new one; PgtsError as from `check_folder`."""
-    lock = RunLock(Path(config.run.dir) if config.run.dir else _new_folder(config))
-    try:
-        is_kept(config, lock.path, check_folder(lock.path))
-    except BaseException:
-        lock.__exit__(None, None, None)
-        raise
-    return lock
+@contextmanager
+def claimed(config: Config) -> Iterator[RunLock]:
+    """Lock the configured folder, or a new one; PgtsError as from `check_folder`, or for an edited configuration."""
+    with RunLock(Path(config.run.dir) if config.run.dir else new_folder(config)) as lock:
+        _is_edited(config, lock.path, check_folder(lock.path))
+        yield lock
 
 
-def _new_folder(config: Config) -> Path:
+def new_folder(config: Config) -> Path:
     """Create a new folder in runs/. Two processes that do this at the same time get different ones."""
     stem = RUNS / f"{config.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     number = 1
@@ -69,34 +67,50 @@ def _new_folder(config: Config) -> Path:
         number += 1
 
 
+def _is_edited(config: Config, run: Path, mark: Mark) -> bool:
+    """Whether a user has edited config.yaml in a run folder without changing its meaning, so that it is kept.
+
+    Raises:
+        PgtsError: it was edited and has another meaning, so that this run would overwrite the user's changes.
+    """
+    path = run / CONFIG_FILE
+    if files.kind(path) is None or digest(files.read(path)) in mark.configs:
+        return False
+    try:
+        is_same = load(path).model_copy(update={"run": config.run}) == config
+    except PgtsError:
+        is_same = False
+    if not is_same:
+        raise PgtsError(f"{path} is not as a run has written it, and says something else than this one: move it away")
+    return True
+
+
 def opened(config: Config, lock: RunLock, start: Start | None) -> RunFolder:
     """Write the configuration and the versions; files of earlier runs are removed, or kept where the run resumes."""
     path = lock.path
     lock.check()
     mark = check_folder(path)
     text = dump(config).encode()
-    keeps_config = is_kept(config, path, mark)
-    position: dict[str, Any] = {}
+    is_edited = _is_edited(config, path, mark)
+    new_mark = mark.of(text) if start is not None else replace(mark.of(text), has_checkpoints=False)
+    write_mark(path, new_mark)  # first of all: the mark makes this a run folder
     if start is None:
-        mark = replace(mark, has_checkpoints=False)
-    write_mark(path, mark.of(text))  # first of all: the mark makes this a run folder
-    if start is None:
-        if left := [name for name in clear(path, mark) if not (keeps_config and name == CONFIG_FILE)]:
+        if left := [name for name in clear(path, mark) if not (is_edited and name == CONFIG_FILE)]:
             print(f"note: run.dir {path} also holds {listing(left)}, which no run has left; it stays", file=sys.stderr)
-        write_mark(path, Mark(configs=mark.configs).of(text))
     else:
         checkpoint.tidy(path, start.path, keep=config.log.keep)
         print(f"going on from {start.path}", file=sys.stderr)
-        position = {"metrics_bytes": start.notes.files[METRICS_FILE][0], "after_step": start.notes.env_steps}
-        if config.run.tensorboard and not start.has_events:
-            clear_events(path, mark)
-            position |= {"after_step": None, "rebuild": True}
         if start.lost_best:
             (path / BEST_FILE).unlink(missing_ok=True)
+        if config.run.tensorboard and not start.has_events:
+            clear_events(path)
     if config.critic.type == "exact":
         print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
-    if not keeps_config:
+    if not is_edited:
         files.replace(path / CONFIG_FILE, text)
-    folder = RunFolder(path, lock=lock, tensorboard=config.run.tensorboard, **position)
-    folder.text(VERSIONS_FILE, json.dumps(versions() | {"threads": config.threads}, indent=2) + "\n")
+    position: dict[str, int] = {}
+    if start is not None:
+        position = {"metrics_bytes": start.notes.files[METRICS_FILE][0], "after_step": start.notes.env_steps}
+    folder = RunFolder(lock, tensorboard=config.run.tensorboard, **position)
+    folder.json(VERSIONS_FILE, versions() | {"threads": config.threads})
     return folder

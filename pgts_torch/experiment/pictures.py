@@ -1,6 +1,6 @@
 """Pictures of a tabular policy and its values."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -38,34 +38,12 @@ def policy_picture(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], *, title: str =
     figure = Figure(figsize=size, layout="constrained")
     value_axes, policy_axes = figure.subplots(2, 1) if wide else figure.subplots(1, 2)
     _draw_values(value_axes, mdp, evaluation.v_S, evaluation.d_S > 0)
-    _draw_policy(policy_axes, mdp, pi_SA, evaluation.d_S > 0, width=size[0] if wide else size[0] / 2)
+    if rows > 1 and all(name in DIRECTIONS for name in mdp.action_names):
+        _draw_arrows(policy_axes, mdp, pi_SA, evaluation.d_S > 0)
+    else:
+        _draw_columns(policy_axes, mdp, pi_SA, width=size[0] if wide else size[0] / 2)
     figure.suptitle(f"{title}   J = {evaluation.J:.4g}".strip())
     return figure
-
-
-def single_pictures(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> tuple[Figure, Figure]:
-    """Return the two halves of `policy_picture`, v^pi and pi, as separate figures without titles."""
-    evaluation = exact.evaluate(mdp, pi_SA)
-    rows, columns = mdp.shape
-    size = (min(max(5, 2 + 0.7 * columns), 12), 2.5) if columns > 3 * rows else (5.5, 4.5)
-    figures = Figure(figsize=size, layout="constrained"), Figure(figsize=size, layout="constrained")
-    value_axes, policy_axes = (figure.subplots() for figure in figures)
-    _draw_values(value_axes, mdp, evaluation.v_S, evaluation.d_S > 0)
-    _draw_policy(policy_axes, mdp, pi_SA, evaluation.d_S > 0, width=size[0])
-    for axes in (value_axes, policy_axes):
-        axes.set_title("")
-    if rows == 1:
-        value_axes.set_xlabel("state")
-        if columns <= FEW:
-            value_axes.set_xticks(range(columns))
-    return figures
-
-
-def _draw_policy(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, visited_S: Tensor, *, width: float) -> None:
-    if mdp.shape[0] > 1 and all(name in DIRECTIONS for name in mdp.action_names):
-        _draw_arrows(axes, mdp, pi_SA, visited_S)
-    else:
-        _draw_columns(axes, mdp, pi_SA, width=width)
 
 
 def _draw_values(axes: Axes, mdp: TabularMDP, v_S: Tensor, visited_S: Tensor) -> None:
@@ -76,20 +54,11 @@ def _draw_values(axes: Axes, mdp: TabularMDP, v_S: Tensor, visited_S: Tensor) ->
     _draw_marks(axes, mdp)
     if mdp.num_states <= 100:
         low, high = float(v_S.min()), float(v_S.max())
-        few = mdp.num_states <= FEW
+        digits, size = (3, 9) if mdp.num_states <= FEW else (2, 7)
         for s, value in enumerate(v_S.tolist()):
-            dark = value < (low + high) / 2
-            alpha = 1.0 if visited_S[s] else 0.5
-            axes.text(
-                s % columns,
-                s // columns,
-                f"{value:.3g}" if few else f"{value:.2g}",
-                ha="center",
-                va="center",
-                fontsize=9 if few else 7,
-                color="w" if dark else "k",
-                alpha=alpha,
-            )
+            color = "w" if value < (low + high) / 2 else "k"
+            style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": size, "color": color}
+            axes.text(s % columns, s // columns, f"{value:.{digits}g}", alpha=1 if visited_S[s] else 0.5, **style)
     axes.set_title("value of the policy, v(s)")
 
 
@@ -100,19 +69,15 @@ def _draw_arrows(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, visited_S: Tensor) 
     for a, name in enumerate(mdp.action_names):
         dx, dy = DIRECTIONS[name]
         length = 0.45 * pi_SA[:, a].numpy()
-        axes.quiver(
-            state % columns,
-            state // columns,
-            dx * length,
-            -dy * length,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            alpha=shade,
-            color="C0",
-            width=0.004,
-            headwidth=4,
-        )
+        style: dict[str, Any] = {
+            "angles": "xy",
+            "scale_units": "xy",
+            "scale": 1,
+            "color": "C0",
+            "width": 0.004,
+            "headwidth": 4,
+        }
+        axes.quiver(state % columns, state // columns, dx * length, -dy * length, alpha=shade, **style)
     axes.set_xlim(-0.5, columns - 0.5)
     axes.set_ylim(rows - 0.5, -0.5)
     axes.set_aspect("equal")
@@ -143,10 +108,6 @@ def _draw_marks(axes: Axes, mdp: TabularMDP) -> None:
     if len(starts) < mdp.num_states and len(starts) <= MOST_OUTLINED:
         for s in starts:
             corner = (s % columns - 0.5, s // columns - 0.5)
-            axes.add_patch(_outline(corner))
+            axes.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor="tab:orange", linewidth=2.5))
     axes.set_xticks([])
     axes.set_yticks([])
-
-
-def _outline(corner: tuple[float, float]) -> Rectangle:
-    return Rectangle(corner, 1, 1, fill=False, edgecolor="tab:orange", linewidth=2.5)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
-from torch import Tensor
 
 from pgts_torch import files
 from pgts_torch.agent import saving
@@ -22,9 +21,6 @@ from pgts_torch.experiment.ownership import (
     CONFIG_FILE,
     METRICS_FILE,
     SUMMARY_FILE,
-    Mark,
-    digest,
-    earlier_checkpoints,
     is_events,
     read_mark,
 )
@@ -43,39 +39,27 @@ class Start:
 
     state: for `PGTS.load_state_dict`.
     has_events: whether the TensorBoard events are unchanged since the checkpoint.
-    lost_best: what is wrong with the best model; empty if nothing is.
+    lost_best: whether the best model is missing or is another one.
     """
 
     path: Path
     notes: checkpoint.Notes
-    state: Mapping[str, Any]
-    has_events: bool = True
-    lost_best: str = ""
-
-    def check(self, algorithm: PGTS) -> None:
-        """PgtsError, naming each tensor, if shapes differ from the algorithm's: its environment has changed."""
-        own = {  # without the search, whose state grows and can only be read by all ranks together
-            "policy": algorithm.policy.state_dict(),
-            "critic": algorithm.critic.state_dict(),
-            "update": algorithm.update.state_dict(),
-        }
-        now, before = dict(_flat("", own)), dict(_flat("", {name: self.state.get(name) for name in own}))
-        lines = [
-            f"{name} has the shape {tuple(here.shape)}; in {self.path} it is {tuple(there.shape)}"
-            for name, here in now.items()
-            if isinstance(here, Tensor) and isinstance(there := before.get(name), Tensor) and here.shape != there.shape
-        ]
-        if lines:
-            raise PgtsError("\n".join([*lines, f"the environment has changed since; {_ADVICE}"]))
+    state: dict[str, Any]
+    has_events: bool
+    lost_best: bool
 
     def load(self, algorithm: PGTS) -> None:
         """Load the state into the algorithm; PgtsError, naming the part, if it is no state of such a model."""
         try:
-            algorithm.load_state_dict(dict(self.state))
-            if algorithm.num_env_steps != self.notes.env_steps:
-                raise PgtsError(f"its model is of step {algorithm.num_env_steps}, its notes of {self.notes.env_steps}")
+            algorithm.load_state_dict(self.state)
         except PgtsError as error:
-            raise PgtsError(f"{self.path}: {error}") from error
+            raise PgtsError(
+                f"{self.path}: {error}\nif the environment has changed since it was written, {_ADVICE}"
+            ) from error
+        if algorithm.num_env_steps != self.notes.env_steps:
+            raise PgtsError(
+                f"{self.path}: its model is of step {algorithm.num_env_steps}, its notes of {self.notes.env_steps}"
+            )
 
 
 def find(
@@ -100,53 +84,34 @@ def find(
     except PgtsError as error:
         raise PgtsError(f"{error}\n{_ADVICE}") from error
     if found is None:
-        if earlier := earlier_checkpoints(run):
-            raise PgtsError(
-                f"{earlier[-1]} was written by version 0.1, which trains otherwise: go on with that one, or {_ADVICE}"
-            )
         if mark is not None and mark.has_checkpoints:
             raise PgtsError(f"run.dir {run} has lost its checkpoints and cannot go on: bring them back, or {_ADVICE}")
         if files.kind(run / CONFIG_FILE) is not None:
-            _check_config(config, flat(load(run / CONFIG_FILE)), run)
+            _check_config(config, plain(load(run / CONFIG_FILE)), run)
             print(f"note: the run in {run} was ended before its first checkpoint; it starts over", file=sys.stderr)
         return None
     path, notes, content = found
-    _check_config(config, notes.config, run)
-    _check_metrics(run, notes, path)
-    _complain(_other_versions(notes.versions, path), strict=strict)
-    lost_events = config.run.tensorboard and _lost_events(run, notes)
-    lost_best = _lost_best(run, notes) if config.eval.keep_best else ""
-    if lost_events:
-        _complain(
-            [f"{lost_events} since {path} was written: the events are rebuilt from {METRICS_FILE}"], strict=strict
-        )
-    if lost_best:
-        _complain([f"{lost_best}: the model of {path} takes its place until a better one comes"], strict=strict)
+    _check_config(config, _as_now(notes.config), run)
+    if metrics := _changed(run, notes, METRICS_FILE):
+        raise PgtsError(f"{metrics} since {path} was written; {_ADVICE}")
     if notes.world_size != world_size and not any_world_size:
         raise PgtsError(
             f"{path} was written by {notes.world_size} processes, and {world_size} are to go on: start as many, or "
             "give --any-world-size for other bits"
         )
-    has_events = not lost_events and any(map(is_events, notes.files))
-    return Start(path, notes, content["state"], has_events, lost_best)
-
-
-def is_kept(config: Config, run: Path, mark: Mark) -> bool:
-    """Whether config.yaml in a run folder is kept, because a user has edited it without changing its meaning.
-
-    Raises:
-        PgtsError: it was edited and has another meaning, so that this run would overwrite the user's changes.
-    """
-    path = run / CONFIG_FILE
-    if files.kind(path) is None or digest(files.read(path)) in mark.configs:
-        return False
-    try:
-        is_same = load(path).model_copy(update={"run": config.run}) == config
-    except PgtsError:
-        is_same = False
-    if not is_same:
-        raise PgtsError(f"{path} is not as a run has written it, and says something else than this one: move it away")
-    return True
+    complaints = list(_other_versions(notes.versions, path))
+    events = [name for name in notes.files if is_events(name)]
+    lost_events = [change for name in events if (change := _changed(run, notes, name))]
+    if config.run.tensorboard and lost_events:
+        complaints.append(f"{lost_events[0]} since {path} was written: the events are rebuilt from {METRICS_FILE}")
+    lost_best = _lost_best(run, notes) if config.eval.keep_best else ""
+    if lost_best:
+        complaints.append(f"{lost_best}: the model of {path} takes its place until a better one comes")
+    if complaints and strict:
+        raise PgtsError("\n".join(complaints))
+    for line in complaints:
+        print(f"warning: {line}", file=sys.stderr)
+    return Start(path, notes, content["state"], bool(events) and not lost_events, bool(lost_best))
 
 
 def resuming(run: str | Path, world_size: int, env_id: str) -> str:
@@ -156,82 +121,59 @@ def resuming(run: str | Path, world_size: int, env_id: str) -> str:
     return f"{command} --resume {shlex.quote(str(run))}{trust}"
 
 
-def flat(config: Config) -> dict[str, Any]:
-    """Return all keys of a configuration, dotted, with their values in JSON types."""
-    return dict(_flat("", json.loads(json.dumps(config.model_dump(by_alias=True)))))
+def plain(config: Config) -> dict[str, Any]:
+    """Return a configuration in JSON types."""
+    return config.model_dump(mode="json", by_alias=True)
 
 
-def _flat(prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return all keys of nested mappings, dotted, with their values."""
+    found: dict[str, Any] = {}
     for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(f"{prefix}{name}.", value)
-        else:
-            yield f"{prefix}{name}", value
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return found
 
 
-def _check_config(config: Config, earlier: Mapping[str, Any], run: Path) -> None:
-    """PgtsError, with a line for each key, if the earlier run had another configuration."""
-    if differing := list(_differing(flat(config), _read_again(earlier))):
-        lines = (f"{key} is {_shown(now)}; in run.dir {run} it is {_shown(before)}" for key, now, before in differing)
-        raise PgtsError("\n".join([*lines, f"run.dir {run} holds an earlier run of another configuration; {_ADVICE}"]))
-
-
-def _read_again(earlier: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A flat configuration, with what this version adds to it; as it is where this version does not read it."""
-    sections: dict[str, Any] = {}
-    for key, value in earlier.items():
-        *path, name = key.split(".")
-        section = sections
-        for part in path:
-            section = section.setdefault(part, {})
-        section[name] = value
+def _as_now(earlier: dict[str, Any]) -> dict[str, Any]:
+    """The configuration in a checkpoint, with what this version adds; as it is where this version does not read it."""
     try:
-        return flat(Config.model_validate(sections))
+        return plain(Config.model_validate(earlier))
     except ValidationError:
         return earlier
 
 
-def _differing(now: Mapping[str, Any], before: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield (key, value now, value before) for each difference that matters; a missing key has the value None."""
-    for key in dict.fromkeys((*now, *before)):
-        free = key in FREE_KEYS or key.partition(".")[0] in FREE_SECTIONS
-        if not free and now.get(key) != before.get(key):
-            yield key, now.get(key), before.get(key)
+def _check_config(config: Config, earlier: dict[str, Any], run: Path) -> None:
+    """PgtsError, with a line for each key, if the earlier run had another configuration."""
+    now, before = flat(plain(config)), flat(earlier)
+    lines = [
+        f"{key} is {_shown(now.get(key))}; in run.dir {run} it is {_shown(before.get(key))}"
+        for key in dict.fromkeys((*now, *before))
+        if key not in FREE_KEYS and key.partition(".")[0] not in FREE_SECTIONS and now.get(key) != before.get(key)
+    ]
+    if lines:
+        raise PgtsError("\n".join([*lines, f"run.dir {run} holds an earlier run of another configuration; {_ADVICE}"]))
 
 
 def _shown(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _changed(path: Path, size: int, sha256: str) -> str:
-    """Return how a file has changed since it had this length and SHA-256, apart from growing; empty if it has not."""
+def _changed(run: Path, notes: checkpoint.Notes, name: str) -> str:
+    """Return how a file of a run has changed since a checkpoint, apart from growing; empty if it has not."""
+    path, told = run / name, notes.files[name]
     if files.kind(path) != "file":
-        return f"{path} is missing"
-    if (now := path.stat().st_size) < size:
-        return f"{path} has {now} bytes; it had {size}"
-    if GrowingDigest(path).now(size) != (size, sha256):
-        return f"{path} was changed"
-    return ""
-
-
-def _check_metrics(run: Path, notes: checkpoint.Notes, taken: Path) -> None:
-    size, sha256 = notes.files.get(METRICS_FILE, (0, ""))
-    if size and (change := _changed(run / METRICS_FILE, size, sha256)):
-        raise PgtsError(f"{change} when {taken} was written; {_ADVICE}".replace("changed when", "changed since"))
-
-
-def _lost_events(run: Path, notes: checkpoint.Notes) -> str:
-    noted = {name: told for name, told in notes.files.items() if is_events(name)}
-    return next(filter(None, (_changed(run / name, *told) for name, told in noted.items())), "")
+        return f"{path} was removed"
+    now = GrowingDigest(path).now(told[0])
+    if now == told:
+        return ""
+    return f"{path} was changed" if now[0] == told[0] else f"{path} was cut to {now[0]} bytes"
 
 
 def _lost_best(run: Path, notes: checkpoint.Notes) -> str:
     """Return what is wrong with the best model, if there should be one; empty if nothing is. A model that is later than
     the checkpoint is right, because training will save it again."""
     path, told = run / BEST_FILE, notes.files.get(BEST_FILE)
-    evaluations = notes.progress.get("evaluations")
-    greedy = evaluations.get("deterministic") if isinstance(evaluations, Mapping) else None
-    if told is None and not (isinstance(greedy, Mapping) and greedy.get("history")):
+    if told is None and not notes.progress.evaluations.get("deterministic", {}).get("history"):
         return ""
     if files.kind(path) is None:
         return f"{path} is missing"
@@ -241,22 +183,12 @@ def _lost_best(run: Path, notes: checkpoint.Notes) -> str:
         return str(error)
     except (KeyError, TypeError):
         return f"{path} holds no model"
-    is_noted = told is None or GrowingDigest(path).now() == tuple(told)
+    is_noted = told is None or GrowingDigest(path).now() == told
     return "" if is_noted or steps > notes.env_steps else f"{path} was changed"
 
 
-def _other_versions(before: Mapping[str, str], path: Path) -> list[str]:
+def _other_versions(before: Mapping[str, Any], path: Path) -> Iterator[str]:
     now = versions()
-    return [
-        f"{name} is {now.get(name)}; {path} was written with {before.get(name)}: the last bits may differ"
-        for name in dict.fromkeys((*now, *before))
-        if now.get(name) != before.get(name)
-    ]
-
-
-def _complain(lines: list[str], *, strict: bool) -> None:
-    """Print these lines as warnings; with `strict` raise them as an error."""
-    if lines and strict:
-        raise PgtsError("\n".join(lines))
-    for line in lines:
-        print(f"warning: {line}", file=sys.stderr)
+    for name in dict.fromkeys((*now, *before)):
+        if now.get(name) != before.get(name):
+            yield (f"{name} is {now.get(name)}; {path} was written with {before.get(name)}: the last bits may differ")

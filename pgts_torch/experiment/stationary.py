@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -86,7 +85,8 @@ def make(what: str, **options: Any) -> TabularMDP:
         return grid(_size(options, 3, 4, lambda n: n * n), traps=options.pop("traps", ()), **options)
     if what == "deep_sea":
         return deep_sea(_size(options, 3, 2, lambda n: n * n), **options)
-    return _from_file(Path(what), options)
+    mdp = TabularMDP.load_npz(what)
+    return replace(mdp, start_S=start_distribution(options["start"], mdp.num_states)) if "start" in options else mdp
 
 
 def count_policies(mdp: TabularMDP) -> Counts:
@@ -128,13 +128,6 @@ def describe(counts: Counts) -> str:
     return "\n".join(_lines(counts))
 
 
-def _from_file(path: Path, options: dict[str, Any]) -> TabularMDP:
-    mdp = TabularMDP.load_npz(path)
-    if "start" not in options:
-        return mdp
-    return replace(mdp, start_S=start_distribution(options["start"], mdp.num_states))
-
-
 def _size(options: dict[str, Any], default: int, num_actions: int, num_states: Callable[[int], int]) -> int:
     """Return the option n; PgtsError, with the largest n that is possible, if there are too many policies."""
     n = options.pop("n", default)
@@ -152,7 +145,8 @@ def _lines(counts: Counts) -> Iterator[str]:
     yield f"sufficient depth M = {counts.sufficient_depth}: all policies in Pi^{counts.sufficient_depth} are optimal"
     yield ""
     yield "depth     |Pi^m|        b^m   J* - b^m   by values    by reach  closed form"
-    shown = [row for row in counts.depths if len(counts.depths) <= ALL_ROWS or _changes(counts, row.depth)]
+    is_short = len(counts.depths) <= ALL_ROWS
+    shown = [row for row in counts.depths if is_short or row.depth == 0 or row.depth in counts.escape_depths]
     for row in shown:
         bounds = (row.value_bound, row.reachable_bound, row.closed_form_bound)
         value, reach, closed = ("none" if math.isinf(bound) else f"{bound:.5g}" for bound in bounds)
@@ -174,10 +168,6 @@ def _lines(counts: Counts) -> Iterator[str]:
     most = max(counts.escape_depths.values())
     for depth, count in sorted(counts.escape_depths.items(), key=lambda item: (item[0] == NEVER, item[0])):
         yield f"{_depth_name(depth):>10}  {count:>9}  {'#' * math.ceil(BAR * count / most)}"
-
-
-def _changes(counts: Counts, depth: int) -> bool:
-    return depth == 0 or depth in counts.escape_depths
 
 
 def _depth_name(depth: int) -> str:

@@ -1,11 +1,13 @@
 """The summary of a finished run, as data and as text."""
 
 import textwrap
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-from pgts_torch.agent.evaluate import Evaluation, Score
+from pydantic import TypeAdapter, ValidationError
+
+from pgts_torch.agent.evaluate import Evaluation
+from pgts_torch.errors import PgtsError
 
 EndedBy = Literal["total_steps", "certificate", "return"]
 
@@ -57,15 +59,16 @@ class Summary:
     parts: str = ""
 
 
-def from_json(content: Mapping[str, Any]) -> Summary:
-    """Return the summary in the JSON of a run; TypeError or KeyError if it is of another form."""
-    evaluations = {kind: _evaluation(content[kind]) for kind in ("deterministic", "sampled")}
-    return Summary(**{**content, **evaluations, "notes": tuple(content.get("notes", ()))})
+_SUMMARY = TypeAdapter(Summary)
 
 
-def _evaluation(content: Mapping[str, Any]) -> Evaluation:
-    scores = {name: Score(**value) for name, value in content.items() if name != "episodes"}
-    return Evaluation(episodes=content["episodes"], **scores)
+def from_json(raw: bytes) -> Summary:
+    """Return the summary that a run has written; PgtsError if it is of another form."""
+    try:
+        return _SUMMARY.validate_json(raw, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise PgtsError(f"{'.'.join(map(str, first['loc'])) or 'its JSON'}: {first['msg']}") from error
 
 
 def describe(summary: Summary) -> str:

@@ -2,11 +2,10 @@
 
 import io
 import json
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +13,11 @@ from jaxtyping import Float
 from pgts_torch import files
 from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.ownership import CONFIG_FILE, METRICS_FILE, SUMMARY_FILE
 from pgts_torch.experiment.processes import train_all
+
+if TYPE_CHECKING:
+    from pgts_torch.experiment.summary import Summary
 
 CONFIDENCE = 0.95
 RESAMPLES = 1000
@@ -114,7 +117,8 @@ def plan(
             runs.append(Run(depth, seed, load(path, arguments), (*shared, *arguments)))
     for run in runs:
         _summary(run)
-        if (run.folder / "config.yaml").is_file() and not _same(load(run.folder / "config.yaml"), run.config):
+        earlier = run.folder / CONFIG_FILE
+        if earlier.is_file() and load(earlier).model_copy(update={"run": run.config.run}) != run.config:
             raise PgtsError(f"{run.folder} holds a run of another configuration; choose another --out")
     return runs
 
@@ -134,14 +138,15 @@ def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
     for config in {run.depth: run.config for run in waiting}.values():
         build(config)
     failures = train_all({run.name: run.arguments for run in waiting}, jobs=jobs)
-    finished = [run for run in runs if _summary(run) is not None]
-    answer = Sweep(tuple(_rows(finished)), _score_is(finished), failures, str(out))
+    finished = [(run, summary) for run in runs if (summary := _summary(run)) is not None]
+    score_is = "return" if any(summary.J is None for _, summary in finished) else "J"
+    answer = Sweep(tuple(_rows(finished, score_is)), score_is, failures, str(out))
     with files.named(f"--out {out} cannot be written to"):
         out.mkdir(parents=True, exist_ok=True)
     table, curves = _targets(out)
     files.replace(table, (json.dumps(asdict(answer), indent=2) + "\n").encode())
     if finished:
-        files.replace(curves, _curves(finished))
+        files.replace(curves, _curves([run for run, _ in finished]))
     return answer
 
 
@@ -192,53 +197,30 @@ def _is_table(raw: bytes) -> bool:
     return isinstance(content, dict) and {each.name for each in fields(Sweep)} <= content.keys()
 
 
-def _same(first: Config, second: Config) -> bool:
-    """Whether they are, but for where the run is."""
-    return first.model_copy(update={"run": second.run}) == second
-
-
-def _summary(run: Run) -> dict[str, Any] | None:
+def _summary(run: Run) -> "Summary | None":
     """What a finished run came to; None if it is not finished; PgtsError where that is damaged."""
-    path = run.folder / "summary.json"
+    path = run.folder / SUMMARY_FILE
     if files.kind(path) is None:
         return None
+    from pgts_torch.experiment.summary import from_json  # torch waits until the arguments have proved themselves
+
     try:
-        content = json.loads(files.read(path))
-        numbers = [content[name] for name in ("env_steps", "model_calls", "seconds")]
-        numbers += [content[kind]["episodic_return"]["mean"] for kind in ("sampled", "deterministic")]
-        numbers += [] if content["J"] is None else [content["J"]]
-        if not all(isinstance(number, int | float) and math.isfinite(number) for number in numbers):
-            raise TypeError("a number is missing")
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        return from_json(files.read(path))
+    except PgtsError as error:
         raise PgtsError(
             f"{path} is damaged ({error}): remove it, and the run is summed up again from its last checkpoint"
         ) from error
-    return dict(content)
 
 
-def _score_is(runs: Iterable[Run]) -> str:
-    return "J" if all(_finished(run)["J"] is not None for run in runs) else "return"
-
-
-def _finished(run: Run) -> dict[str, Any]:
-    summary = _summary(run)
-    assert summary is not None
-    return summary
-
-
-def _rows(runs: Sequence[Run]) -> list[Row]:
-    key = _score_is(runs)
-    rows = []
-    for depth in dict.fromkeys(run.depth for run in runs):
-        summaries = [_finished(run) for run in runs if run.depth == depth]
-        scores = [each["J"] if key == "J" else each["sampled"]["episodic_return"]["mean"] for each in summaries]
-        greedy = [each["deterministic"]["episodic_return"]["mean"] for each in summaries]
-        costs = (
-            float(interquartile_mean(np.array([each[name] for each in summaries], dtype=np.float64)))
-            for name in ("env_steps", "model_calls", "seconds")
-        )
-        rows.append(Row(depth, len(summaries), _mean(scores), _mean(greedy), *costs))
-    return rows
+def _rows(finished: "Sequence[tuple[Run, Summary]]", score_is: str) -> Iterator[Row]:
+    for depth in dict.fromkeys(run.depth for run, _ in finished):
+        summaries = [summary for run, summary in finished if run.depth == depth]
+        returns = [each.sampled.episodic_return.mean for each in summaries]
+        scores = [each.J for each in summaries if each.J is not None] if score_is == "J" else returns
+        greedy = [each.deterministic.episodic_return.mean for each in summaries]
+        costs = [[each.env_steps, each.model_calls, each.seconds] for each in summaries]
+        mean_costs = interquartile_mean(np.array(costs, dtype=np.float64).T).tolist()
+        yield Row(depth, len(summaries), _mean(scores), _mean(greedy), *mean_costs)
 
 
 def _mean(scores: Sequence[float]) -> Mean:
@@ -281,6 +263,6 @@ def _history(run: Run) -> tuple[str, np.ndarray, np.ndarray]:
     tag = "exact/J" if lines and "exact/J" in lines[0] else "charts/episodic_return"
     points = [(line["step"], line[tag]) for line in lines if "step" in line and line.get(tag) is not None]
     if not points:
-        raise PgtsError(f"{run.folder / 'metrics.jsonl'} has no line of {tag}")
+        raise PgtsError(f"{run.folder / METRICS_FILE} has no line of {tag}")
     step_K, value_K = np.array(points, dtype=np.float64).T
     return tag, step_K, value_K

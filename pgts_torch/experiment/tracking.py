@@ -7,12 +7,10 @@ import math
 import os
 import platform
 import threading
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from importlib import metadata
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, final
 
 import numpy as np
@@ -29,99 +27,44 @@ if TYPE_CHECKING:
 _PACKAGES = ("pgts_torch", "torch", "numpy", "scipy", "gymnasium", "tensorboard")
 
 
-class Folder(ABC):
-    """Where a run writes its files."""
-
-    path: Path
-
-    @abstractmethod
-    def log(self, step: int, tags: dict[str, float]) -> None:
-        """Write the metrics of one step."""
-
-    @abstractmethod
-    def flush(self) -> dict[str, tuple[int, str]]:
-        """Flush everything to the disk; the length and SHA-256 of the metrics, event files and best model, by name."""
-
-    @abstractmethod
-    def text(self, name: str, content: str) -> None:
-        """Write a text file atomically."""
-
-    @abstractmethod
-    def picture(self, name: str, figure: "Figure", step: int) -> None:
-        """Write a figure as `name`.png."""
-
-
 @final
-class NoFolder(Folder):
-    """The folder of a process that writes nothing, because rank 0 writes."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def log(self, step: int, tags: dict[str, float]) -> None:
-        """Do nothing."""
-
-    def flush(self) -> dict[str, tuple[int, str]]:
-        """Do nothing."""
-        return {}
-
-    def text(self, name: str, content: str) -> None:
-        """Do nothing."""
-
-    def picture(self, name: str, figure: "Figure", step: int) -> None:
-        """Do nothing."""
-
-
-@final
-class RunFolder(Folder):
+class RunFolder:
     """Writes the files of a run. Use it as a context: leaving it closes the files.
 
     Args:
-        path: the folder; made here, with all parents.
-        tensorboard: write events beside metrics.jsonl.
         lock: of the folder; checked before each write, so that nothing is written into a folder that replaced it.
+        tensorboard: write events beside metrics.jsonl. Where there are none yet, those of the kept metrics come first.
         metrics_bytes: metrics.jsonl is truncated to this length.
-        after_step: the last step whose events are kept; TensorBoard hides later ones of a process that was killed.
-        rebuild: write the events again, from the kept part of metrics.jsonl.
+        after_step: the step that the run resumes from; TensorBoard hides later events of a process that was killed.
 
     Raises:
         PgtsError: from every method that writes, if the disk is full.
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        tensorboard: bool,
-        lock: RunLock | None = None,
-        metrics_bytes: int = 0,
-        after_step: int | None = None,
-        rebuild: bool = False,
+        self, lock: RunLock, *, tensorboard: bool, metrics_bytes: int = 0, after_step: int | None = None
     ) -> None:
-        self.path, self._lock = path, lock
-        path.mkdir(parents=True, exist_ok=True)
+        self.path, self._lock = lock.path, lock
+        path = self.path
         (path / FAILURE_FILE).unlink(missing_ok=True)
         self._metrics = (path / METRICS_FILE).open("ab", buffering=0)
         self._metrics.truncate(metrics_bytes)
-        self._growing = {METRICS_FILE: GrowingDigest(path / METRICS_FILE)}
-        purge_step = None if after_step is None else after_step + 1
+        self._growing: dict[str, GrowingDigest] = {}
         self._thread_hook = threading.excepthook
-        with self._writing("events"):
-            self._events = (
-                event_writer()(str(path), purge_step=purge_step, filename_suffix=EVENTS_SUFFIX) if tensorboard else None
-            )
-
-        if self._events is not None and rebuild:
-            for line in read_metrics(path):
+        self._events: SummaryWriter | None = None
+        if tensorboard:
+            is_rebuilt = not self._event_files()
+            purge_step = None if after_step is None or is_rebuilt else after_step + 1
+            with self._writing("events"):
+                self._events = event_writer()(str(path), purge_step=purge_step, filename_suffix=EVENTS_SUFFIX)
+            for line in read_metrics(path) if is_rebuilt else ():
                 self._add_scalars(line.pop("step"), line)
 
     def __enter__(self) -> Self:
         threading.excepthook = self._on_thread_error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._metrics.close()
         try:
             if self._events is not None:
@@ -138,15 +81,13 @@ class RunFolder(Folder):
         if not isinstance(failed.exc_value, OSError):
             self._thread_hook(failed)
 
-    @contextmanager
-    def _writing(self, what: str) -> Iterator[None]:
-        """Turn an OSError into a PgtsError that names the file; check the lock first."""
-        if self._lock is not None:
-            self._lock.check()
-        try:
-            yield
-        except OSError as error:
-            raise PgtsError(f"{self.path / what} cannot be written to: {error.strerror}") from error
+    def _writing(self, what: str) -> AbstractContextManager[None]:
+        """Check the lock, then turn an OSError into a PgtsError that names the file."""
+        self._lock.check()
+        return files.named(f"{self.path / what} cannot be written to")
+
+    def _event_files(self) -> list[str]:
+        return [path.name for path in self.path.iterdir() if is_events(path.name)]
 
     def log(self, step: int, tags: dict[str, float]) -> None:
         """Write one line of metrics.jsonl, and the same numbers as TensorBoard scalars."""
@@ -158,32 +99,32 @@ class RunFolder(Folder):
             is_written = False
         if not is_written:
             raise PgtsError(f"{self.path / METRICS_FILE} cannot be written to at step {step}; is the disk full?")
-        if self._events is not None:
-            self._add_scalars(step, tags)
+        self._add_scalars(step, tags)
 
     def _add_scalars(self, step: int, tags: Mapping[str, float | None]) -> None:
-        assert self._events is not None
-        with self._writing("events"):
-            for tag, value in tags.items():
-                self._events.add_scalar(tag, math.nan if value is None else value, step)
+        if self._events is not None:
+            with self._writing("events"):
+                for tag, value in tags.items():
+                    self._events.add_scalar(tag, math.nan if value is None else value, step)
 
     def flush(self) -> dict[str, tuple[int, str]]:
-        with self._writing(METRICS_FILE):
-            os.fsync(self._metrics.fileno())
+        """Flush everything to the disk; the length and SHA-256 of the metrics, event files and best model, by name."""
+        names = [METRICS_FILE]
         if self._events is not None:
             with self._writing("events"):
                 self._events.flush()
-        names = [path.name for path in self.path.iterdir() if self._events is not None and is_events(path.name)]
+            names += self._event_files()
         with self._writing("its files"):
+            os.fsync(self._metrics.fileno())
             states = {name: self._growing.setdefault(name, GrowingDigest(self.path / name)).now() for name in names}
-            states[METRICS_FILE] = self._growing[METRICS_FILE].now()
             if files.kind(self.path / BEST_FILE) is not None:
                 states[BEST_FILE] = GrowingDigest(self.path / BEST_FILE).now()
         return states
 
-    def text(self, name: str, content: str) -> None:
+    def json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a file of JSON atomically."""
         with self._writing(name):
-            files.replace(self.path / name, content.encode())
+            files.replace(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
 
     def picture(self, name: str, figure: "Figure", step: int) -> None:
         """Write `name`.png, and the same picture to TensorBoard."""

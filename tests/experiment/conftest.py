@@ -12,5 +12,5 @@ from pgts_torch.experiment import pictures
 def small_pictures() -> Iterator[None]:
     """At its end a run draws a blank stamp: a whole picture takes longer than the trainings of these tests do."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pictures, "policy_picture", lambda mdp, pi_SA, *, title: Figure(figsize=(0.2, 0.2)))
+        patch.setattr(pictures, "policy_picture", lambda mdp, pi_SA, *, title="": Figure(figsize=(0.2, 0.2)))
         yield

@@ -1,4 +1,4 @@
-"""A small run of the command line, what it leaves, and how it is struck while it trains."""
+"""A small run of the command line, what it leaves, and signals to it while it trains."""
 
 import io
 import json
@@ -11,12 +11,23 @@ import torch
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.cli.main import main
-from pgts_torch.experiment import checkpoint, run
+from pgts_torch.experiment import checkpoint, ownership, run
 from pgts_torch.experiment.tracking import read_metrics
 
 assert run.train  # imported before any process is forked, so that none has to
 SMALL = ["--env.id", "CartPole-v1", "--policy.type", "mlp", "--policy.hidden", "[8]", "--search.depth", "1"]
 SHORT = ["--total_steps", "100", "--rollout.num_envs", "3", "--rollout.horizon.length", "8", "--eval.episodes", "2"]
+TAGS = {
+    "charts/episodic_return",
+    "charts/discounted_return",
+    "charts/episodic_length",
+    "charts/SPS",
+    "losses/entropy",
+    "losses/value",
+    "search/depth",
+    "search/model_calls",
+}
+"""What every run logs."""
 OFTEN = ["--log.checkpoint_every", "1", "--eval.every", "20", "--eval.keep_best", "--run.tensorboard", "false"]
 
 
@@ -24,7 +35,7 @@ def arguments(folder: Path, *more: str) -> list[str]:
     return ["train", *SMALL, *SHORT, *OFTEN, "--run.dir", str(folder), *more]
 
 
-def train_under_fire(folder: Path, *numbers: int, rank: int = 0) -> int:
+def train_with_signals(folder: Path, *numbers: int, rank: int = 0) -> int:
     """Train, and get these signals in the third iteration; the exit code. Only for a process that ends after it.
 
     Args:
@@ -32,12 +43,12 @@ def train_under_fire(folder: Path, *numbers: int, rank: int = 0) -> int:
     """
     iterate = PGTS.iterate
 
-    def iterate_under_fire(self: PGTS) -> Iteration:
+    def iterate_with_signals(self: PGTS) -> Iteration:
         for number in numbers if self.num_iterations == 2 and self.ranks.rank == rank else ():
             os.kill(os.getpid(), number)
         return iterate(self)
 
-    PGTS.iterate = iterate_under_fire  # type: ignore[method-assign]
+    PGTS.iterate = iterate_with_signals  # type: ignore[method-assign]
     return main(arguments(folder))
 
 
@@ -51,7 +62,7 @@ def dumped(content: Any) -> bytes:
 def left(folder: Path) -> dict[str, Any]:
     """Every byte that a run leaves, without what the clock, the process and the name of the folder change."""
     files: dict[str, Any] = {name: (folder / name).read_bytes() for name in ("best.pt", "versions.json")}
-    files |= {path.name: dumped(checkpoint.read(path)[1]) for path in checkpoint.listed(folder)}
+    files |= {path.name: dumped(checkpoint.read(path)[1]) for path in ownership.checkpoints(folder)}
     summary = json.loads((folder / "summary.json").read_text())
     lines = read_metrics(folder)
     for line in lines:

@@ -1,6 +1,5 @@
 """A run that learned little says so at its end, and one that had nothing to learn does not."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -36,7 +35,7 @@ def test_a_run_of_tiny_steps_says_so_and_what_to_set(tmp_path: Path, env_id: str
     assert note.startswith("the policy hardly moved: 0.0% of its probability is elsewhere than at the start")
     assert "a larger update.step_size than 1e-06" in note
     assert "search.depth above 4" in note
-    assert from_json(json.loads((tmp_path / "run" / "summary.json").read_text())) == summary
+    assert from_json((tmp_path / "run" / "summary.json").read_bytes()) == summary
     assert "note                        the policy hardly moved" in describe(summary)
     page = write(tmp_path / "run", None)["page"]
     assert "the policy hardly moved" in Path(page).read_text()

@@ -1,7 +1,6 @@
 """The command `pgts check-model`."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,6 @@ from typing import Any
 import pytest
 
 from pgts_torch.cli.main import main
-from tests.forks import PATIENCE
 
 HELP = "(see pgts check-model --help)"
 
@@ -146,21 +144,6 @@ def test_a_missing_extra_is_named(monkeypatch, capsys):
         monkeypatch.setitem(sys.modules, module, None)
         assert main(["check-model", id]) == 2
         assert capsys.readouterr().err == f"error: {id} needs {module}: pip install 'pgts_torch[{extra}]'\n"
-
-
-TORCH_FREE = """
-import sys
-from pgts_torch.cli.main import main
-assert [main(["check-model", *arguments.split()]) for arguments in ("--help", "", "X --seed x")] == [0, 2, 2]
-sys.exit(3 if "torch" in sys.modules else 0)
-"""
-
-
-def test_help_and_mistakes_do_not_wait_for_torch(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", TORCH_FREE], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE
-    )
-    assert done.returncode == 0, done.stderr
 
 
 def test_the_help_tells_the_protocol_within_80_columns(capsys):

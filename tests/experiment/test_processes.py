@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from pgts_torch.cli.main import main
-from pgts_torch.experiment import checkpoint
+from pgts_torch.experiment import checkpoint, ownership
 from pgts_torch.experiment.tracking import read_metrics
 from tests import reliability
-from tests.experiment.runs import arguments, left, train_under_fire
+from tests.experiment.runs import arguments, left, train_with_signals
 from tests.forks import PATIENCE, in_child, started
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -51,7 +51,7 @@ def training(folder: Path, *, kill_at: int = -1, counted: Path | None = None) ->
 
 def signalled(folder: Path, *numbers: int) -> int:
     """Train in a process that gets these signals in its third iteration; its exit code."""
-    return in_child(lambda: train_under_fire(folder, *numbers))
+    return in_child(lambda: train_with_signals(folder, *numbers))
 
 
 @pytest.fixture(scope="module")
@@ -92,15 +92,15 @@ def test_after_kills_while_a_checkpoint_is_written_the_one_before_is_intact(kill
         if calls == kill_at:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def write_under_fire(folder: Path, *args: Any, **kwargs: Any) -> Path:
-        sys.setprofile(count if checkpoint.listed(folder) else None)
+    def write_and_count(folder: Path, *args: Any, **kwargs: Any) -> Path:
+        sys.setprofile(count if ownership.checkpoints(folder) else None)
         try:
             return write(folder, *args, **kwargs)
         finally:
             sys.setprofile(None)
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "write", write_under_fire)
+        patch.setattr(checkpoint, "write", write_and_count)
         for number in range(kills):
             folder, kill_at = tmp_path / str(number), int(random.integers(1, 3000))
             assert in_child(lambda folder=folder: main(arguments(folder))) == -signal.SIGKILL
@@ -131,7 +131,7 @@ def test_a_signal_finishes_the_iteration_saves_and_says_how_to_go_on(numbers, co
 def test_under_nohup_a_training_outlives_its_terminal(whole, tmp_path):
     def work() -> int:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        return train_under_fire(tmp_path / "run", signal.SIGHUP)
+        return train_with_signals(tmp_path / "run", signal.SIGHUP)
 
     assert in_child(work) == 0
     assert left(tmp_path / "run") == whole[0]
@@ -149,12 +149,19 @@ def test_a_second_signal_ends_the_process_at_once(whole, tmp_path, capfd):
 
 @pytest.mark.fault("disk full")
 @pytest.mark.parametrize(
-    ("most_bytes", "named"), [(3_000, ".pt cannot be written"), (8_000, "events cannot be written to")]
+    ("most_bytes", "more", "named"),
+    [
+        (3_000, [], ".pt cannot be written: File too large"),
+        (8_000, [], "events cannot be written to: File too large"),
+        (3_000, ["--log.checkpoint_every=100", "--run.tensorboard=false"], "; is the disk full?"),
+    ],
 )
-def test_a_file_that_cannot_grow_is_one_line_and_with_more_room_the_run_goes_on(most_bytes, named, tmp_path, capfd):
+def test_a_file_that_cannot_grow_is_one_line_and_with_more_room_the_run_goes_on(
+    most_bytes, more, named, tmp_path, capfd
+):
     folder = tmp_path / "run"
     steps = ["--total_steps", "600", "--rollout.num_envs", "4", "--rollout.horizon.length", "15"]
-    ladder = ["train", *steps, "--eval.episodes", "2", "--log.checkpoint_every", "1", "--run.dir", str(folder)]
+    ladder = ["train", *steps, "--eval.episodes", "2", "--log.checkpoint_every", "1", "--run.dir", str(folder), *more]
 
     def short_of_room() -> int:
         resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
@@ -164,8 +171,8 @@ def test_a_file_that_cannot_grow_is_one_line_and_with_more_room_the_run_goes_on(
     complaint = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("step ")]
     assert len(complaint) == 2  # one of them says that there was no --config
     assert complaint[1].startswith(f"error: {folder}/")
-    assert complaint[1].endswith(f"{named}: File too large")
-    assert (checkpoint.newest(folder, strict=True) is None) == (".pt" in named)
+    assert complaint[1].endswith(named)
+    assert (checkpoint.newest(folder, strict=True) is None) == ("events" not in named)
     assert main(ladder) == 0
     assert [line["step"] for line in read_metrics(folder)] == list(range(60, 601, 60))
 
@@ -174,7 +181,7 @@ def test_a_file_that_cannot_grow_is_one_line_and_with_more_room_the_run_goes_on(
 def test_the_command_stops_at_a_signal_and_goes_on(tmp_path):
     command = [sys.executable, "train.py", *arguments(tmp_path / "run")[1:], "--total_steps", "100000"]
     with started(command, cwd=ROOT) as process:
-        while not checkpoint.listed(tmp_path / "run"):
+        while not ownership.checkpoints(tmp_path / "run"):
             assert process.poll() is None
             time.sleep(0.05)
         process.terminate()

@@ -259,7 +259,7 @@ def test_an_environment_that_cannot_be_made_costs_only_the_pictures(run, monkeyp
     assert "Value v(s) of the policy" not in page.text
     assert len(page.named("img")) > 5
     [note] = answer["notes"]
-    assert note.endswith("there are no pictures of it: env 'pgts/Ladder-v0' cannot be made.")
+    assert note.endswith("there is no picture of it: env 'pgts/Ladder-v0' cannot be made.")
 
 
 @pytest.mark.parametrize("content", ["{", "[]", "{}", '{"deterministic": 1}'])

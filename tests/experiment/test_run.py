@@ -18,30 +18,18 @@ from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import diagnostics, pictures, run
 from pgts_torch.experiment.evaluate import last_checkpoint
+from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.pictures import policy_picture  # before conftest.py puts a smaller one in its place
 from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.tabular import exact, stationary
 from pgts_torch.tabular.ascent import mirror_step
+from tests.experiment.runs import TAGS
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
-TAGS = {
-    "charts/episodic_return",
-    "charts/discounted_return",
-    "charts/episodic_length",
-    "charts/SPS",
-    "losses/entropy",
-    "losses/value",
-    "search/depth",
-    "search/nodes",
-    "search/model_calls",
-    "search/stationarity_gap",
-    "exact/J",
-    "exact/optimality_gap",
-    "exact/lookahead_error",
-}
+EXACT_TAGS = {"search/nodes", "search/stationarity_gap", "exact/J", "exact/optimality_gap", "exact/lookahead_error"}
 
 
 def few_iterations(folder: Path, *arguments: str, config: Path = ROOT / "configs" / "ladder.yaml") -> Config:
@@ -68,7 +56,7 @@ def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(config, tmp_p
     folder = tmp_path / "run"
     lines = read_metrics(folder)
     is_table = load(config).policy.type in ("softmax", "simplex")
-    tags = TAGS if is_table else {tag for tag in TAGS if not tag.startswith("exact/")}
+    tags = TAGS | {tag for tag in EXACT_TAGS if is_table or not tag.startswith("exact/")}
     assert len(lines) == summary.iterations >= 2
     for line in lines:
         assert set(line) >= tags | {"step"}
@@ -186,32 +174,6 @@ def test_nothing_shipped_learns_from_exact_values(tmp_path):
         assert load(str(path)).critic.type in ("tabular", "network")
 
 
-def test_the_exact_critic_says_that_it_is_for_validation(tmp_path, capsys):
-    run.train(few_iterations(tmp_path, "--critic", "{type: exact}"))
-    assert "for validation" in capsys.readouterr().err
-
-
-@pytest.mark.fault("folder that holds something else")
-def test_a_folder_that_holds_something_is_left_as_it_is(tmp_path):
-    folder = tmp_path / "run"
-    folder.mkdir()
-    (folder / "thesis.txt").write_text("mine")
-    for arguments in ([], ["--run.overwrite"]):
-        with pytest.raises(PgtsError, match="holds files that no run has left"):
-            run.train(few_iterations(tmp_path, *arguments))
-    assert [path.name for path in folder.iterdir()] == ["thesis.txt"]
-
-
-def test_an_earlier_run_is_replaced_only_when_asked(tmp_path):
-    run.train(few_iterations(tmp_path))
-    before = (tmp_path / "run" / "metrics.jsonl").read_bytes()
-    with pytest.raises(PgtsError, match=r"set run\.overwrite"):
-        run.train(few_iterations(tmp_path, "--seed", "1"))
-    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == before
-    run.train(few_iterations(tmp_path, "--seed", "1", "--run.overwrite"))
-    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() != before
-
-
 @pytest.mark.fault("unknown environment")
 @pytest.mark.parametrize(
     "arguments", [["--env.id", "pgts/Nowhere-v0"], ["--env.id", "CartPole-v1", "--env.kwargs", "{}"]]
@@ -222,8 +184,9 @@ def test_what_cannot_be_built_leaves_nothing_behind(arguments, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_summary_states_exact_numbers(tmp_path):
-    summary = run.train(few_iterations(tmp_path))
+def test_the_summary_states_exact_numbers_and_an_exact_critic_is_said_to_be_for_validation(tmp_path, capsys):
+    summary = run.train(few_iterations(tmp_path, "--critic", "{type: exact}"))
+    assert "for validation" in capsys.readouterr().err
     algorithm = PGTS.load(last_checkpoint(tmp_path / "run"))
     pi_SA = algorithm.policy.table()
     assert summary.J == exact.evaluate(algorithm.mdp, pi_SA).J
@@ -251,7 +214,7 @@ def test_one_episode_has_no_confidence_interval():
 
 
 def test_a_value_that_is_not_finite_is_written_as_null(tmp_path):
-    with RunFolder(tmp_path / "run", tensorboard=False) as folder:
+    with RunLock(tmp_path / "run") as lock, RunFolder(lock, tensorboard=False) as folder:
         folder.log(3, {"losses/value": math.nan})
     assert read_metrics(tmp_path / "run") == [{"step": 3, "losses/value": None}]
 

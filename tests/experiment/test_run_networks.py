@@ -3,11 +3,10 @@
 import json
 import math
 import sys
+from copy import deepcopy
 from pathlib import Path
-from typing import Any
 
 import pytest
-import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pgts_torch.agent.evaluate import evaluate
@@ -19,22 +18,12 @@ from pgts_torch.experiment import run
 from pgts_torch.experiment.evaluate import evaluate_run, last_checkpoint
 from pgts_torch.experiment.summary import describe
 from pgts_torch.experiment.tracking import read_metrics
+from tests.experiment.runs import TAGS
+from tests.support import same_values
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
-TAGS = {
-    "charts/episodic_return",
-    "charts/discounted_return",
-    "charts/episodic_length",
-    "charts/SPS",
-    "losses/entropy",
-    "losses/value",
-    "losses/explained_variance",
-    "losses/policy",
-    "losses/kl",
-    "search/depth",
-    "search/model_calls",
-}
+NETWORK_TAGS = TAGS | {"losses/explained_variance", "losses/policy", "losses/kl"}
 LOOKAHEAD_TAGS = {"search/nodes", "search/pruned", "search/stationarity_gap", "search/certificate"}
 
 
@@ -43,28 +32,6 @@ def small(folder: Path, *arguments: str, env: str = "CartPole-v1") -> Config:
     steps = ["--total_steps", "100", "--rollout.num_envs", "3", "--rollout.horizon.length", "12", "--search.depth", "1"]
     network = ["--policy.type", "mlp", "--policy.hidden", "[8]", "--policy.normalize", "--eval.episodes", "3"]
     return load(None, ["--env.id", env, *steps, *network, "--run.dir", str(folder / "run"), *arguments])
-
-
-def state_of(model: PGTS) -> dict[str, Any]:
-    """Every tensor that training goes on from, by name."""
-    found: dict[str, Any] = {}
-
-    def walk(name: str, value: Any) -> None:
-        for key, inner in value.items() if isinstance(value, dict) else ():
-            walk(f"{name}.{key}", inner)
-        if not isinstance(value, dict):
-            found[name] = value
-
-    walk("", model.state_dict())
-    return found
-
-
-def same_bits(first: dict[str, Any], second: dict[str, Any]) -> bool:
-    assert first.keys() == second.keys()
-    return all(
-        torch.equal(value, second[name]) if isinstance(value, torch.Tensor) else value == second[name]
-        for name, value in first.items()
-    )
 
 
 def trained(folder: Path) -> PGTS:
@@ -78,14 +45,14 @@ def test_a_network_run_leaves_a_whole_folder_and_claims_nothing_exact(tmp_path):
     lines = read_metrics(folder)
     assert len(lines) == summary.iterations >= 3
     for line in lines:
-        assert set(line) >= TAGS | LOOKAHEAD_TAGS
+        assert set(line) >= NETWORK_TAGS | LOOKAHEAD_TAGS
         assert not [tag for tag in line if tag.startswith("exact/")]
-        assert all(math.isfinite(line[tag]) for tag in TAGS)
+        assert all(math.isfinite(line[tag]) for tag in NETWORK_TAGS)
     assert load(folder / "config.yaml") == config
     assert not (folder / "policy.png").exists()
     assert (summary.J, summary.J_optimal, summary.stationarity_gap) == (None,) * 3
     assert json.loads((folder / "summary.json").read_text())["J"] is None
-    assert set(EventAccumulator(str(folder)).Reload().Tags()["scalars"]) >= TAGS
+    assert set(EventAccumulator(str(folder)).Reload().Tags()["scalars"]) >= NETWORK_TAGS
     text = describe(summary)
     assert "optimal return" not in text
     assert all(len(line) <= 80 for line in text.splitlines()[:-1])
@@ -102,13 +69,13 @@ def test_evaluating_the_folder_of_a_run_gives_the_numbers_of_its_summary(tmp_pat
 @pytest.mark.parametrize("estimator", [[], ["--search.depth", "0", "--estimator.type", "sampled"]])
 def test_what_is_logged_and_evaluated_does_not_move_a_bit_of_training(estimator, tmp_path):
     run.train(small(tmp_path, *estimator, "--log.every", "1000", "--run.tensorboard", "false"))
-    quiet = state_of(trained(tmp_path))
+    quiet = trained(tmp_path).state_dict()
     loud = ["--eval.every", "1", "--log.checkpoint_every", "1", "--run.overwrite", *estimator]
     run.train(small(tmp_path, *loud))
-    assert same_bits(quiet, state_of(trained(tmp_path)))
+    assert same_values(quiet, trained(tmp_path).state_dict())
     assert any("eval/sampled_return" in line for line in read_metrics(tmp_path / "run"))
     run.train(small(tmp_path, *loud, "--seed", "1"))
-    assert not same_bits(quiet, state_of(trained(tmp_path)))
+    assert not same_values(quiet, trained(tmp_path).state_dict())
 
 
 def test_a_pendulum_is_trained_by_a_knob_and_measured_again_from_its_folder(tmp_path):
@@ -128,10 +95,10 @@ def test_an_evaluation_leaves_statistics_and_states_as_they_are(tmp_path):
     assert norm is not None
     model = algorithm.world.model
     assert model is not None
-    before, rows, states = state_of(algorithm), float(norm.count), model.num_states
+    before, rows, states = deepcopy(algorithm.state_dict()), float(norm.count), model.num_states
     for deterministic in (True, False):
         evaluate(algorithm, episodes=3, deterministic=deterministic, seed=5)
-    assert same_bits(before, state_of(algorithm))
+    assert same_values(before, deepcopy(algorithm.state_dict()))
     assert float(norm.count) == rows > 0
     assert model.num_states == states > 0
     algorithm.iterate()
@@ -149,7 +116,7 @@ def test_sampled_advantages_train_without_a_model_or_a_lookahead(tmp_path):
     summary = run.train(small(tmp_path, "--search.depth", "0", "--estimator.type", "sampled"))
     assert (summary.search, summary.model_calls, summary.depth) == ("none", 0, 0)
     for line in read_metrics(tmp_path / "run"):
-        assert set(line) >= TAGS
+        assert set(line) >= NETWORK_TAGS
         assert not set(line) & LOOKAHEAD_TAGS
 
 

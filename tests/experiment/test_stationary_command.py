@@ -1,8 +1,6 @@
 """The command `pgts stationary`."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,6 @@ import pytest
 from pgts_torch.cli.commands import STATIONARY_OPTIONS
 from pgts_torch.cli.main import main
 from pgts_torch.tabular import deep_sea, exact, grid, ladder, random_mdp, stationary_sets, tightrope
-from tests.forks import PATIENCE
 
 LADDER = """\
 5 states, 2 actions, 32 deterministic policies
@@ -183,23 +180,6 @@ def test_a_mistake_is_one_line_with_exit_code_2(arguments, npz, capsys):
     np.savez("broken.npz", P=np.eye(2)[:, None], R=np.zeros((2, 1)))
     np.savez("large.npz", P=np.full((21, 2, 21), 1 / 21), R=np.zeros((21, 2)), gamma=0.9)
     assert refusal(capsys, *arguments.split()) == MISTAKES[arguments]
-
-
-TORCH_FREE = """
-import sys
-from pgts_torch.cli.main import main
-codes = [main(["stationary", *arguments.split()]) for arguments in
-         ("--help", "laddr", "none.npz", "ladder --n x", "tightrope --n 3", "ladder --gamma 2")]
-assert codes == [0, 2, 2, 2, 2, 2], codes
-sys.exit(3 if "torch" in sys.modules else 0)
-"""
-
-
-def test_help_and_mistakes_do_not_wait_for_torch(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", TORCH_FREE], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE
-    )
-    assert done.returncode == 0, done.stderr
 
 
 def test_the_help_tells_the_names_and_the_arrays_of_a_file(capsys):

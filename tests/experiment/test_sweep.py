@@ -15,13 +15,15 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from pgts_torch.agent.evaluate import Evaluation, Score
 from pgts_torch.cli.main import main
 from pgts_torch.config import dump
 from pgts_torch.errors import PgtsError, Stopped
-from pgts_torch.experiment import checkpoint, run, sweep
+from pgts_torch.experiment import ownership, run, sweep
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.processes import train_all
-from tests.forks import PATIENCE, ForkedCommand, in_child, started
+from pgts_torch.experiment.summary import Summary
+from tests.forks import PATIENCE, ForkedCommand, in_child
 
 HELP = "(see pgts sweep --help)"
 SMALL = ["--total_steps", "60", "--rollout.num_envs", "3", "--rollout.horizon.length", "10", "--eval.episodes", "2"]
@@ -48,13 +50,31 @@ def test_every_depth_meets_every_seed_in_a_folder_of_its_own(here):
     assert planned(depths=("adaptive",), num_seeds=1)[0].config.search.depth == "adaptive"
 
 
-def finish(each: sweep.Run, *, J: float | None, seconds: float = 1.0) -> None:
+def finish(each: sweep.Run, *, J: float | None) -> None:
     """What a finished run with this result leaves."""
     each.folder.mkdir(parents=True)
     (each.folder / "config.yaml").write_text(dump(each.config))
-    sampled, greedy = ({"episodic_return": {"mean": mean}} for mean in (10.0 + each.seed, 20.0 + each.seed))
-    summary = {"J": J, "env_steps": 60 + each.seed, "model_calls": 7, "seconds": seconds}
-    (each.folder / "summary.json").write_text(json.dumps(summary | {"sampled": sampled, "deterministic": greedy}))
+    length = Score(20.0, None)
+    sampled, greedy = (Evaluation(2, Score(mean + each.seed, 1.0), Score(0.5, 1.0), length) for mean in (10.0, 20.0))
+    summary = Summary(
+        run=str(each.folder),
+        seed=each.seed,
+        depth=int(each.depth),
+        search="none",
+        J=J,
+        J_optimal=J,
+        stationarity_gap=J,
+        certificate=None,
+        certificate_is_proved=False,
+        ended_by="total_steps",
+        iterations=3,
+        env_steps=60 + each.seed,
+        model_calls=7,
+        seconds=1.0,
+        deterministic=greedy,
+        sampled=sampled,
+    )
+    (each.folder / "summary.json").write_text(json.dumps(asdict(summary)))
     tag = "charts/episodic_return" if J is None else "exact/J"
     lines = [{"step": step + each.seed, tag: value} for step, value in ((30, 0.0), (45, None), (60, J))]
     (each.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -105,26 +125,30 @@ def until(done: Callable[[], bool]) -> None:
 
 @pytest.mark.fault("SIGTERM")
 @pytest.mark.usefixtures("unchecked_shapes")
-def test_a_sweep_that_is_stopped_saves_and_the_same_command_ends_with_the_table_of_one_that_was_not(here, monkeypatch):
+def test_a_sweep_that_is_stopped_saves_and_the_same_command_ends_with_the_table_of_one_that_was_not(
+    here, monkeypatch, capfd
+):
+    monkeypatch.setattr(subprocess, "Popen", ForkedCommand)
     long = ["--total_steps", "1500", "--log.checkpoint_every", "1", "--log.keep", "999", "--run.tensorboard", "false"]
     whole = sweep.plan(None, [*SMALL, *long], depths=(1,), num_seeds=1, out=Path("whole"))
     run.train(whole[0].config)
     expected = asdict(sweep.sweep(whole, jobs=1, out=Path("whole")))
     arguments = ["sweep", "--out", "out", "--depths", "1", "--seeds", "1", *SMALL, *long]
     folder = Path("out/depth-1/seed-0")
-    command = [sys.executable, "-m", "pgts_torch.cli", *arguments]
-    with started(command) as process:
-        until(lambda: bool(checkpoint.listed(folder)))
-        process.terminate()
-        assert "stopped: 0 of 1 runs are done; the same command goes on\n" in process.communicate(timeout=PATIENCE)[1]
-        assert process.returncode == 143
+
+    def stopped() -> int:
+        signal_when(lambda: bool(ownership.checkpoints(folder)), signal.SIGTERM)
+        return main(arguments)
+
+    assert in_child(stopped) == 143
+    assert "stopped: 0 of 1 runs are done; the same command goes on\n" in capfd.readouterr().err
     assert not (folder / "summary.json").exists()
-    RunLock(folder).__exit__(None, None, None)  # nobody has it any more
-    first = checkpoint.listed(folder)[0]
+    with RunLock(folder):  # nobody else has it any more
+        pass
+    first = ownership.checkpoints(folder)[0]
     written = first.stat().st_mtime_ns
-    monkeypatch.setattr(subprocess, "Popen", ForkedCommand)
     assert main(arguments) == 0
-    assert first.stat().st_mtime_ns == written  # it did not begin anew
+    assert first.stat().st_mtime_ns == written  # it did not start from the beginning
     answer = json.loads(Path("out/table.json").read_text())
     for row in (*answer["rows"], *expected["rows"]):
         del row["seconds"]
@@ -165,7 +189,7 @@ def lines(path: Path) -> list[str]:
 
 @pytest.fixture
 def hang_ups() -> Iterator[None]:
-    """SIGHUP is heard, also where pytest runs under nohup."""
+    """SIGHUP is handled, also where pytest runs under nohup."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)
@@ -284,19 +308,3 @@ def test_the_interval_shrinks_with_the_root_of_the_number_of_runs():
         return float(high - low)
 
     assert width(1600) == pytest.approx(width(100) / 4, rel=0.25)
-
-
-TORCH_FREE = """
-import sys
-from pgts_torch.cli.main import main
-assert [main(["sweep", *arguments.split()]) for arguments in ("--help", "", "--out o --seed 1")] == [0, 2, 2]
-sys.exit(3 if "torch" in sys.modules else 0)
-"""
-
-
-def test_help_and_mistakes_do_not_wait_for_torch(here):
-    done = subprocess.run(
-        [sys.executable, "-c", TORCH_FREE], cwd=here, capture_output=True, text=True, timeout=PATIENCE
-    )
-    assert done.returncode == 0, done.stderr
-    assert max(map(len, done.stdout.splitlines())) < 80

@@ -18,7 +18,7 @@ from pgts_torch.cli.main import main
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.search.lookahead import check_finite
-from tests.experiment.runs import SHORT, SMALL, arguments, left, train_under_fire
+from tests.experiment.runs import SHORT, SMALL, arguments, left, train_with_signals
 from tests.forks import PATIENCE, launched
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -30,9 +30,9 @@ def trained(folder: Path, *more: str, size: int = 2) -> list[int]:
     return launched(size, lambda: main(arguments(folder, *more)))
 
 
-def struck(folder: Path, number: int, *, rank: int) -> list[int]:
+def signalled(folder: Path, number: int, *, rank: int) -> list[int]:
     """The exit codes where one process gets a signal in its third iteration."""
-    return launched(2, lambda: train_under_fire(folder, number, rank=rank))
+    return launched(2, lambda: train_with_signals(folder, number, rank=rank))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_one_process_makes_other_episodes(whole, tmp_path):
 @pytest.mark.parametrize("rank", [0, 1])
 def test_a_lost_rank_ends_all_and_the_same_command_goes_on_bit_for_bit(rank, whole, tmp_path, capfd):
     folder = tmp_path / "run"
-    codes = struck(folder, signal.SIGKILL, rank=rank)
+    codes = signalled(folder, signal.SIGKILL, rank=rank)
     assert codes[rank] == -signal.SIGKILL
     assert codes[1 - rank] == 1
     said = capfd.readouterr().err
@@ -79,7 +79,7 @@ def test_a_lost_rank_ends_all_and_the_same_command_goes_on_bit_for_bit(rank, who
 @pytest.mark.parametrize("rank", [0, 1])
 def test_a_signal_to_one_process_stops_all_after_the_iteration(rank, whole, tmp_path, capfd):
     folder = tmp_path / "run"
-    assert struck(folder, signal.SIGTERM, rank=rank) == [143, 143]
+    assert signalled(folder, signal.SIGTERM, rank=rank) == [143, 143]
     assert capfd.readouterr().err.count(f"`torchrun --nproc-per-node=2 train.py --resume {folder}` goes on") == 1
     assert checkpoint.newest(folder, strict=True)[1].iterations == 3
     assert trained(folder) == [0, 0]
@@ -89,7 +89,7 @@ def test_a_signal_to_one_process_stops_all_after_the_iteration(rank, whole, tmp_
 @pytest.mark.fault("other world size at resume")
 def test_another_world_size_is_refused_unless_it_is_asked_for(tmp_path, capfd):
     folder = tmp_path / "run"
-    assert struck(folder, signal.SIGTERM, rank=0) == [143, 143]
+    assert signalled(folder, signal.SIGTERM, rank=0) == [143, 143]
     capfd.readouterr()
     for size in (1, 3):
         assert trained(folder, size=size) == [2] * size

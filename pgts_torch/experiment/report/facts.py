@@ -11,7 +11,7 @@ from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint, ownership
 from pgts_torch.experiment.report.curves import panels
-from pgts_torch.experiment.resume import flat
+from pgts_torch.experiment.resume import flat, plain
 from pgts_torch.experiment.summary import Summary, from_json, rows
 from pgts_torch.files import PARTIAL
 from pgts_torch.options.schema import schema_of
@@ -38,9 +38,9 @@ def gather(run: Path, *, trust_imports: bool = False) -> tuple[dict[str, Any], P
         PgtsError: the configuration cannot be read.
     """
     config, notes = load(run / ownership.CONFIG_FILE), list[str]()
-    summary = _read(run / ownership.SUMMARY_FILE, _summary, notes)
-    failure = _read(run / ownership.FAILURE_FILE, dict, notes)
-    versions = _read(run / ownership.VERSIONS_FILE, dict, notes)
+    summary = _read(run / ownership.SUMMARY_FILE, from_json, notes)
+    failure = _read(run / ownership.FAILURE_FILE, _mapping, notes)
+    versions = _read(run / ownership.VERSIONS_FILE, _mapping, notes)
     lines = _metrics(run, notes)
     latest = {tag: value for line in lines for tag, value in line.items()}
     curves, constant, never_finite = panels(lines)
@@ -50,7 +50,7 @@ def gather(run: Path, *, trust_imports: bool = False) -> tuple[dict[str, Any], P
         if last is not None:
             algorithm = PGTS.load(path, device="cpu", trust_imports=trust_imports)
     except PgtsError as error:
-        notes.append(f"The trained policy cannot be loaded, so there are no pictures of it: {error}.")
+        notes.append(f"The trained policy cannot be loaded, so there is no picture of it: {error}.")
     facts = {
         "run": str(run),
         "name": config.name,
@@ -79,20 +79,18 @@ def number(value: Any) -> float | None:
     return value if isinstance(value, int | float) and abs(value) <= 1e300 else None
 
 
-def _read(path: Path, parse: Callable[[Any], Any], notes: list[str]) -> Any:
-    """Return the result of `parse` on the JSON in a file; None where there is no file, or it has another form."""
+def _read(path: Path, parse: Callable[[bytes], Any], notes: list[str]) -> Any:
+    """Return the result of `parse` on the bytes of a file; None where there is no file, or it has another form."""
     try:
-        return parse(json.loads(path.read_bytes()))
+        return parse(path.read_bytes())
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, RecursionError, TypeError, KeyError, AttributeError):
+    except (OSError, ValueError, RecursionError, TypeError):
         notes.append(f"{path.name} cannot be read, or is not as this version writes it; it is left out.")
 
 
-def _summary(content: Any) -> Summary:
-    summary = from_json(content)
-    rows(summary)  # raises an error where a value cannot be formatted
-    return summary
+def _mapping(raw: bytes) -> Values:
+    return dict(json.loads(raw))
 
 
 def _metrics(run: Path, notes: list[str]) -> list[Values]:
@@ -114,13 +112,11 @@ def _metrics(run: Path, notes: list[str]) -> list[Values]:
 
 def _last_checkpoint(run: Path, notes: list[str]) -> tuple[Path, checkpoint.Notes | None]:
     """Return the newest intact checkpoint and its notes."""
-    for path in reversed(checkpoint.listed(run)):
+    for path in reversed(ownership.checkpoints(run)):
         try:
             return path, checkpoint.read(path)[0]
         except PgtsError as error:
             notes.append(f"{error}.")
-    if ownership.earlier_checkpoints(run):
-        notes.append("The checkpoints are of version 0.1, which `pgts evaluate` reads and this page does not.")
     notes.append("There is no intact checkpoint, so nothing can be said about the trained policy itself.")
     return run, None
 
@@ -152,7 +148,7 @@ def _certificate(summary: Summary | None, latest: Values) -> Values:
 
 
 def _settings(config: Config) -> Iterator[Values]:
-    values = flat(config)
+    values = flat(plain(config))
     defaults = {option.key: option.default for option in schema_of(Config).options() if option.exists(values)}
     for key, value in values.items():
         is_default = key in defaults and value == defaults[key]
@@ -162,7 +158,7 @@ def _settings(config: Config) -> Iterator[Values]:
 def _files(run: Path) -> Iterator[tuple[str, int]]:
     """Yield name and size in bytes of each file of a run."""
     hidden = (ownership.CHECKPOINTS, ownership.LOCK_FILE, ownership.MARK_FILE, ownership.REPORT_FILE)
-    for path in sorted([*run.iterdir(), *checkpoint.listed(run)]):
+    for path in sorted([*run.iterdir(), *ownership.checkpoints(run)]):
         if path.name not in hidden and not path.name.endswith(PARTIAL):
             with suppress(FileNotFoundError):  # a run that is still training removes old checkpoints
                 yield str(path.relative_to(run)), path.stat().st_size

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from pgts_torch import files
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.experiment.ownership import REPORT_FILE
-from pgts_torch.experiment.pictures import single_pictures
+from pgts_torch.experiment.pictures import policy_picture
 from pgts_torch.experiment.report.curves import INK, draw
 from pgts_torch.experiment.report.facts import gather
 from pgts_torch.experiment.resume import resuming
@@ -32,7 +32,7 @@ def write(run: Path, out: Path | None, *, trust_imports: bool = False) -> dict[s
     """Write the page about a run, by default into its folder.
 
     Returns:
-        The content of the page as plain values, without the pictures of the policy; "page" is its path.
+        The content of the page as plain values, without the picture of the policy; "page" is its path.
 
     Raises:
         PgtsError: the configuration of the run cannot be read, or the page cannot be written, for instance because
@@ -62,7 +62,7 @@ def write(run: Path, out: Path | None, *, trust_imports: bool = False) -> dict[s
 
 
 def _policy(algorithm: PGTS) -> dict[str, Any]:
-    """The template values about a tabular policy, with pictures of v^pi and pi."""
+    """The template values about a tabular policy, with a picture of v^pi and pi."""
     mdp, pi_SA = algorithm.mdp, algorithm.policy_table().cpu()
     return {
         "step": algorithm.num_env_steps,
@@ -70,8 +70,7 @@ def _policy(algorithm: PGTS) -> dict[str, Any]:
         "J_optimal": exact.optimal(mdp).J,
         "num_states": mdp.num_states,
         "actions": ", ".join(mdp.action_names),
-        "is_wide": mdp.shape[1] > 3 * max(mdp.shape[0], 4),
-        "pictures": [image(figure) for figure in single_pictures(mdp, pi_SA)],
+        "picture": image(policy_picture(mdp, pi_SA)),
     }
 
 
