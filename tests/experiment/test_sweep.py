@@ -25,7 +25,6 @@ from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.summary import Summary
 from tests.forks import PATIENCE, ForkedCommand, in_child
 
-HELP = "(see pgts sweep --help)"
 SMALL = ["--total_steps", "60", "--rollout.num_envs", "3", "--rollout.horizon.length", "10", "--eval.episodes", "2"]
 
 
@@ -258,25 +257,27 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(here, capsys, monkeypatc
 
 
 MISTAKES = {
-    "": f"the following arguments are required: --out {HELP}",
+    "": "--out",
     "--out o --seed 3": "--seed is set by the sweep: --seeds says how many",
     "--out o --search.depth=3": "--search.depth is set by the sweep: --depths says which",
     "--out o --run.dir x": "--run.dir is set by the sweep: --out is the folder of all runs",
-    "--out o --seeds 0": f"argument --seeds: '0' is not a whole number >= 1 and below 2**63 {HELP}",
-    "--out o --depths 1,x": f"argument --depths: 'x' is not a whole number >= 0 and below 2**63 {HELP}",
-    "--out o --depths adaptive,2 --search.tolerance 1": "--search.tolerance: search.tolerance is 1.0, which only "
-    "search.depth adaptive uses; search.depth is 2",
-    "--out o --update.step_size -1": "--update.step_size is -1; it must be a number > 0 or null",
-    "--out o --env.id CartPole-v1 --policy.type softmax --depths 0,1": "the policy 'softmax' is a table of numbered "
-    "states, which CartPole-v1 does not have; take a network: mlp or cnn as policy, network as critic",
-    "--out o --config none.yaml": "none.yaml: the configuration cannot be read: No such file or directory",
+    "--out o --seeds 0": "--seeds: '0'",
+    "--out o --depths 1,x": "--depths: 'x'",
+    "--out o --depths adaptive,2 --search.tolerance 1": "search.tolerance is 1.0",
+    "--out o --update.step_size -1": "--update.step_size is -1",
+    "--out o --env.id CartPole-v1 --policy.type softmax --depths 0,1": "the policy 'softmax' is a table",
+    "--out o --config none.yaml": "none.yaml: ",
 }
 
 
 @pytest.mark.parametrize("arguments", MISTAKES)
 def test_a_mistake_is_one_line_with_exit_code_2_and_starts_nothing(arguments, here, capsys):
     assert main(["sweep", *arguments.split()]) == 2
-    assert capsys.readouterr() == ("", f"error: {MISTAKES[arguments]}\n")
+    out, err = capsys.readouterr()
+    assert out == ""
+    [mistake] = err.splitlines()
+    assert mistake.startswith("error: ")
+    assert MISTAKES[arguments] in mistake
     assert not list(here.iterdir())
 
 
