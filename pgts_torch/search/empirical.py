@@ -17,7 +17,7 @@ from pgts_torch.search.table import with_room
 from pgts_torch.seeding import mix
 
 Share = Literal["none", "level", "search"]
-"""Which paths of a search see the same samples: only those from equal roots, those that meet in a state at one level,
+"""Which paths of a search share their samples: only those from equal roots, those that meet in a state at one level,
 or all that meet in a state."""
 
 _PATH = 0x70617468

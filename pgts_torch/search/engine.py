@@ -1,4 +1,4 @@
-"""Searches as objects: one way to look ahead in one model, with what it remembers from one search to the next."""
+"""Searches as objects: one kind of lookahead in one model, with what it remembers from one search to the next."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -13,10 +13,9 @@ from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.options.search import MCTS, Expectimax, Sampled
 from pgts_torch.search.empirical import FixedSamples
-from pgts_torch.search.expectimax import full_width
+from pgts_torch.search.expectimax import by_width
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_finite
 from pgts_torch.search.mcts import grow
-from pgts_torch.search.pruned import pruned
 from pgts_torch.search.sampled import plan_levels, sparse
 from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import sample_keys
@@ -136,10 +135,7 @@ class ExpectimaxSearch(Search):
         self.topology: Topology = Topology(enumerating(model, "expectimax"), max_bytes=options.max_bytes)
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
-        max_width, max_nodes = self.options.max_width, self.options.max_nodes
-        if max_width is None:
-            return full_width(leaves, self.topology, root_B, max_nodes=max_nodes)
-        return pruned(leaves, self.topology, root_B, max_width=max_width, max_nodes=max_nodes)
+        return by_width(leaves, self.topology, root_B, self.options)
 
     def __str__(self) -> str:
         width = self.options.max_width
@@ -169,7 +165,7 @@ class SampledSearch(Search):
 
 @final
 class MCTSSearch(Search):
-    """`mcts`, by default with maximum backups and uniform priors: those of the policy look first where it goes already.
+    """`mcts`, by default with maximum backups and uniform priors: those of the policy prefer where it goes already.
 
     Args:
         model: enumerates outcomes, or samples them.

@@ -5,7 +5,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from pgts_torch.models.base import EnumeratingModel
-from pgts_torch.options.search import MAX_NODES
+from pgts_torch.options.search import MAX_NODES, Expectimax
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead
 from pgts_torch.search.pruned import pruned
 from pgts_torch.search.topology import Topology, topology_of
@@ -47,15 +47,20 @@ def expectimax(
             the state).
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
-    leaves, topology = Leaves(model, depth, q_leaf, v_leaf), topology_of(model, topology)
-    if max_width is None:
-        return full_width(leaves, topology, root_B, max_nodes=max_nodes)
-    return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
+    options = Expectimax(max_width=max_width, max_nodes=max_nodes)
+    return by_width(Leaves(model, depth, q_leaf, v_leaf), topology_of(model, topology), root_B, options)
+
+
+def by_width(leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], options: Expectimax) -> Lookahead:
+    """`expectimax`, with leaves and topology at hand."""
+    if options.max_width is None:
+        return full_width(leaves, topology, root_B, max_nodes=options.max_nodes)
+    return pruned(leaves, topology, root_B, max_width=options.max_width, max_nodes=options.max_nodes)
 
 
 @torch.no_grad()
 def full_width(leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_nodes: int) -> Lookahead:
-    """`expectimax` of all states of all levels, with leaves and topology at hand."""
+    """Expand all states of all levels, value the leaves, back up."""
     calls_before, expansions = topology.table.model_calls, leaves.expansions
     levels = topology.levels(root_B, expansions, max_nodes=max_nodes)
     bottom = levels.leaves(expansions)

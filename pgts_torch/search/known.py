@@ -18,7 +18,7 @@ class KnownStates(Table):
     """A row for each state that a search has expanded. The outcomes themselves are in the table of the topology.
 
     table_row_T: the row of the state in `topology.table`.
-    value_TAK: what the critic says of the state that an outcome leads to; 0 where the outcome has no weight.
+    value_TAK: the critic's value of the state that an outcome leads to; 0 where the outcome has no weight.
     q_TA, v_T: r + sum_k p_k gamma_k v(child), and its maximum.
     prior_TA: the policy that the search starts from.
     exhausted_TAK, exhausted_TA, exhausted_T: numbers to add to a score: -inf where the outcome, all outcomes of the
@@ -54,6 +54,7 @@ class KnownStates(Table):
         """
         row_N = self.row_S.index_select(0, state_N)
         if int(row_N.amin()) < 0:
+            # One query of the model and one call of the critic for all new states together.
             new_N = state_N[row_N < 0].unique()
             self.check_memory(len(new_N), **tree)
             self._learn(new_N)
@@ -103,6 +104,7 @@ class KnownStates(Table):
             outcomes, children = self.topology.step(state_N)
             v_C = self._leaves.v(children) if len(children) else None
             prior_NA = self._leaves.prior(state_N)
+        # Terminal outcomes, actions that are not allowed and padding count nothing, whatever their numbers.
         weighs_NAK = has_weight(outcomes)
         zero = torch.zeros((), dtype=self.dtype, device=self.device)
         prob_NAK = torch.where(weighs_NAK, outcomes.prob_NAK, zero)
@@ -110,6 +112,7 @@ class KnownStates(Table):
         # `outcomes.child_NAK` are positions in `children`, 0 where an outcome has no weight.
         value_NAK = zero.expand(weighs_NAK.shape) if v_C is None else v_C[outcomes.child_NAK].where(weighs_NAK, zero)
         q_NA = outcomes.reward_NA + (weight_NAK * value_NAK).sum(-1)
+        # Added to a score, -inf says that there is nothing to select; the maximum is 0 as long as one has weight.
         exhausted_NAK = torch.where(weighs_NAK, zero, -torch.inf)
         exhausted_NA = exhausted_NAK.amax(-1)
         row_N = self._append(

@@ -42,12 +42,14 @@ class Levels:
 
     def leaves(self, expansions: int) -> Int[Tensor, "N"]:
         """The states at the bottom of `expansions` levels."""
+        # The last step leads into the closed set, not into a frontier.
         if self.closed is not None and expansions >= len(self.outcomes):
             return self.closed_states
         return self.frontiers[expansions]
 
     def back_up(self, v_N: Float[Tensor, "leaves"], expansions: int) -> Float[Tensor, "N A"]:
         """Values of all actions in frontier 0, from values v of the leaves below `expansions` >= 1 levels."""
+        # Levels below the last frontier all are the closed set, which needs one table for all of them.
         if sweeps := self.sweeps(expansions):
             assert self.closed is not None
             v_N = sweep(self.closed, v_N, sweeps)
@@ -56,6 +58,7 @@ class Levels:
     def nodes_per_level(self, expansions: int) -> tuple[int, ...]:
         """How many nodes each of the levels 0 .. expansions holds."""
         frontiers = [len(frontier) for frontier in self.frontiers[: expansions + 1]]
+        # Where levels are missing in `frontiers`, they are the closed set.
         return (*frontiers, *[len(self.closed_states)] * (expansions + 1 - len(frontiers)))
 
     def nodes(self, expansions: int) -> int:

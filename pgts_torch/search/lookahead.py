@@ -30,7 +30,7 @@ class Lookahead:
     stderr_BA: standard error of q that comes from sampled outcomes, in reward units: 0 where all outcomes were
         enumerated, NaN where it was not estimated.
     pruned_BA: in [0, 1]: the most discounted probability that any plan after (s, a) puts on nodes above the last level
-        that the critic values in place of a deeper look. If the critic is off by at most e there,
+        that the critic values in place of a deeper search. If the critic is off by at most e there,
         |q - T^m Q| <= pruned * e beside the sampling error; 0 for a search of full width.
     model_calls: for how many (state, action) the model was queried in this search.
     critic_calls: how often the critic was called, each time for many states together.
@@ -76,14 +76,14 @@ class Lookahead:
 
             q - f (q - l)  to  q + f (u - q),        f = 1 - (1 - confidence)^{1 / (C - 1)}
 
-        C draws that agree on a value of probability p < 1 - f do so with a probability of sum p^C <= (1 - f)^{C-1} =
+        C samples that agree on a value of probability p < 1 - f do so with a probability of sum p^C <= (1 - f)^{C-1} =
         1 - confidence; of a larger p the rest, at most f, lies between l and u. So this part is exact with one level.
         Without a range these bounds are infinite.
 
         Measured on random MDPs with two outcomes of each action (`benchmarks/intervals.py`, docs/benchmarks.md), 95 %:
         with one level they hold the truth at least so often for C = 2, 4, 8 and 16. They hold it less often over more
-        levels, where maxima over samples make q too high and `bias_BA` sees a part of that, most among tied actions;
-        and where few of many outcomes carry most of a value and none of these was drawn while others differ. What the
+        levels, where maxima over samples make q too high and `bias_BA` is a part of that, most among tied actions;
+        and where few of many outcomes carry most of a value and none of these was sampled while others differ. What the
         critic gets wrong and what was pruned are not in them.
 
         Raises:
@@ -121,7 +121,7 @@ class Lookahead:
 
 @final
 class Leaves:
-    """What the critic says of the states of one search, and the policy it may start from, both checked.
+    """The critic's values of the states of one search, and the policy it may start from, both checked.
 
     calls: how often the critic was called.
     expansions: how many levels are expanded: with Q at the bottom m, with v one more, for Q = r + gamma P v.

@@ -54,7 +54,7 @@ def mcts(
     exhausted and never selected again, so after finitely many simulations the answer is T^m Q.
 
     Simulations go down in waves (`pgts_torch.search.tree`): those of one wave are split among actions and outcomes as
-    if they came one by one, but do not see each other's values. What a wave could not use is sent again.
+    if they came one by one, but do not know each other's values. What a wave could not use is sent again.
 
     With root="gumbel" the root's actions get simulations by sequential halving of g(a) + log prior(a) + sigma(q(a))
     (Danihelka et al. 2022); the trees below them are separate, so those of one round run side by side. With merge=False
@@ -71,7 +71,7 @@ def mcts(
             less right with as many simulations.
         prior: the policy, states [N] to probabilities [N, A]. Default: uniform.
         backup: "max", or for comparison "mean": q(n, a) = (q_0 + sum_i G_i) / (1 + N_a) over the critic's first
-            estimate q_0 and the returns G_i seen, which does not converge to T^m Q; its `pruned_BA` is inf.
+            estimate q_0 and the returns G_i of simulations, which does not converge to T^m Q; its `pruned_BA` is inf.
         merge: a node is a (level, state), shared by all paths and roots. What a simulation could not update is
             backed up at the end.
         topology: as in `expectimax`. Its `max_bytes` is the most memory that the search may take.
@@ -96,7 +96,7 @@ def mcts(
         max_nodes=max_nodes,
     )
     if root == "rule" and generator is not None:
-        raise PgtsError("only root='gumbel' draws from a generator")
+        raise PgtsError("only root='gumbel' uses a generator")
     return grow(Leaves(model, depth, q_leaf, v_leaf, prior), topology_of(model, topology), root_B, options, generator)
 
 

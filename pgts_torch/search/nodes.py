@@ -92,6 +92,7 @@ class Nodes(Table):
             ("exhausted_N", known.exhausted_T),
         ):
             torch.index_select(of_state, 0, known_N, out=getattr(self, name)[new])
+        # Children at the last level are never expanded; only averages go there, to take their values again.
         if level + 1 == self.bottom and (level == 0 or not self._revisits):
             self.exhausted_N[new], self.exhausted_NA[new] = -torch.inf, -torch.inf
         self._valued[level + 1] += int(known.outcomes_T.index_select(0, known_N).sum())
@@ -108,7 +109,7 @@ class Nodes(Table):
         return node_B
 
     def place(self, state_N: Int[Tensor, "*N"], level: int) -> Int[Tensor, "*N"]:
-        """Where in `node_at` the nodes of these states stand."""
+        """Where in `node_at` the nodes of these states are."""
         return state_N * (self.bottom + 1) + level
 
     def open(self, node_B: Int[Tensor, "B"]) -> Bool[Tensor, "B A"]:
@@ -135,14 +136,16 @@ class Nodes(Table):
         mass_N[0] = 1
         mass_FA = self.q_NA.new_zeros(len(node_F_by_level[0]), self.num_actions)  # of roots at the last level
         for node_F in reversed(node_F_by_level[:-1]):
+            # An action has the mass of its children, a node that of its worst action.
             weight_FAK = known.weight_NAK(self.known_N.index_select(0, node_F))
             mass_FA = (weight_FAK * mass_N.take(self.below_NAK.index_select(0, node_F))).sum(2)
             mass_N[node_F] = mass_FA.amax(1)
         return mass_FA
 
     def nodes_per_level(self) -> tuple[int, ...]:
-        """How many nodes have been valued at each level, by the critic or by a look below."""
-        if self.merge:  # then the children of a level are counted without repetition
+        """How many nodes have been valued at each level, by the critic or from below."""
+        if self.merge:
+            # Children of a level are counted without repetition. Row 0 is no node.
             for level in range(self.bottom):
                 known_F = self.known_N[1 : self.count][self.level_N[1 : self.count] == level]
                 weighs_FAK = torch.isfinite(self.known.exhausted_TAK[known_F])

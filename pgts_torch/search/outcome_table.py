@@ -53,6 +53,7 @@ class OutcomeTable(Table):
         Raises:
             PgtsError: the answer cannot be true, see `check_outcomes`.
         """
+        # The states are distinct, so that none is queried, or gets a row, twice.
         missing = self.missing(state_N)
         if len(missing):
             answer = self.model.outcomes(missing)
@@ -104,6 +105,7 @@ def check_outcomes(model: Model, state_N: Int[Tensor, "N"], outcomes: Outcomes) 
             what="reward",
         )
 
+    # What follows is named by the first entry that is off: [state, action] or [state, action, outcome].
     def named(off: list[int]) -> str:
         return f"of outcome {off[2]} " * (len(off) > 2) + f"of state {int(state_N[off[0]])} and action {off[1]}"
 
@@ -113,7 +115,7 @@ def check_outcomes(model: Model, state_N: Int[Tensor, "N"], outcomes: Outcomes) 
         raise PgtsError(f"the model's probabilities {named(off)} sum to {float(total_NA[*off])}")
     most = 1 + _TOLERANCE
     for name, x_NAK, highest in (("probability", outcomes.prob_NAK, most), ("discount", outcomes.discount_NAK, 1.0)):
-        # So put that NaN is off too.
+        # Comparisons with NaN are false: it is off too.
         if (off := _first(~((x_NAK >= 0) & (x_NAK <= highest)))) is not None:
             raise PgtsError(f"the model's {name} {named(off)} is {float(x_NAK[*off])}; it must be in [0, 1]")
     if (off := _first((child_NAK < 0) | (child_NAK >= model.num_states))) is not None:

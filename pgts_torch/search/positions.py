@@ -31,7 +31,7 @@ class Positions:
 
     def distinct(self, states: Int[Tensor, "N"]) -> Int[Tensor, "distinct"]:
         """The states without repetition, ascending."""
-        # Every state's entry says where it occurs, in the end at one place only: that occurrence stays.
+        # Of the positions of a state one is written last: that occurrence stays.
         scratch_S, order_N = self._room(), torch.arange(len(states), device=states.device)
         scratch_S[states] = order_N
         return states[scratch_S[states] == order_N].sort().values

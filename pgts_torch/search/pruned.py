@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes, backup
-from pgts_torch.errors import check_count
 from pgts_torch.search.lookahead import Leaves, Lookahead, check_roots, unexpanded
 from pgts_torch.search.memory import check_nodes
 from pgts_torch.search.outcome_table import has_weight
@@ -52,10 +51,9 @@ def pruned(
         max_nodes: the most nodes, summed over levels, pruned ones included.
 
     Raises:
-        PgtsError: a bad width, roots that are no states, critic values of a wrong shape or not finite.
+        PgtsError: roots that are no states, critic values of a wrong shape or not finite.
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
-    check_count("max_width", max_width)
     check_roots(root_B, topology.model.num_states)
     roots, row_B = torch.unique(root_B, return_inverse=True)
     nodes_per_level, calls_before = [len(roots)], topology.table.model_calls
@@ -119,6 +117,7 @@ def _back_up(levels: list[_Level], v_C: Float[Tensor, "C"]) -> tuple[Float[Tenso
         else:
             q_MA = backup(step, v_C)
             pruned_MA = torch.where(step.reward_NA > -torch.inf, step.expected(pruned_C), 0.0)
+        # All of a pruned state's value is that of a pruned state; of an expanded one, as much as of its children.
         v_C = level.v_N.index_copy(0, level.kept_M, q_MA.amax(-1))
         pruned_C = torch.ones_like(v_C).index_copy_(0, level.kept_M, pruned_MA.amax(-1))
     return q_MA, pruned_MA

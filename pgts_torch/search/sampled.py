@@ -37,7 +37,7 @@ def sampled(
 
         q(s, a) = 1/C sum_c [ r_c + gamma_c max_b q(s'_c, b) ]        (Kearns, Mansour and Ng 2002)
 
-    All actions of all nodes are looked at. Leaves are those of `expectimax`, each state once. A sample is named by
+    All actions of all nodes are expanded. Leaves are those of `expectimax`, each state once. A sample is named by
     (search, level, state, action, c), so q is the same bit for bit however the roots are split into batches or ordered,
     as long as the generator is in the same state and the model numbers its states alike.
 

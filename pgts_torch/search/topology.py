@@ -1,6 +1,7 @@
 """Which states a lookahead meets at which level. Transitions do not depend on the policy, so this outlives a search."""
 
 from collections import OrderedDict
+from collections.abc import Hashable
 from dataclasses import replace
 from typing import final
 
@@ -41,8 +42,8 @@ class Topology:
         self.table = OutcomeTable(model)
         self._positions = Positions(model)
         self._generation = model.generation
-        # By the bytes of the roots; the least recently used first.
-        self._levels: OrderedDict[bytes, Levels] = OrderedDict()
+        # By the roots; the least recently used first.
+        self._levels: OrderedDict[Hashable, Levels] = OrderedDict()
 
     def fresh(self) -> "Topology":
         """An empty one of the same model and limits."""
@@ -65,10 +66,10 @@ class Topology:
                 `max_bytes`; the model has not been queried for them.
         """
         self._check_generation()
-        check_roots(root_B, self.model.num_states)
-        key = root_B.cpu().numpy().tobytes()
+        key = root_B.dtype, root_B.shape, root_B.cpu().numpy().tobytes()
         levels = self._levels.get(key)
         if levels is None:
+            check_roots(root_B, self.model.num_states)
             roots = self._positions.distinct(root_B)
             levels = self._levels[key] = Levels([roots], self._positions.of(roots)[root_B])
             if len(self._levels) > _REMEMBERED_ROOTS:
@@ -148,7 +149,7 @@ class Topology:
         self, outcomes: Outcomes, weighs_NAK: Bool[Tensor, "N A K"], states: Int[Tensor, "C"]
     ) -> Outcomes:
         """The same outcomes with children given by their position among `states`; those without weight get 0."""
-        # Children without weight need not be among `states`: what stands at them is anything, and replaced.
+        # Children without weight need not be among `states`: the number read for them is replaced.
         position_NAK = self._positions.of(states)[outcomes.child_NAK]
         return replace(outcomes, child_NAK=torch.where(weighs_NAK, position_NAK, 0), num_children=len(states))
 

@@ -137,7 +137,7 @@ class Tree:
 
     def _expand(self, step: _Step) -> Tensor:
         """Expand new children, which takes one simulation each; how many are left where they can go on."""
-        if step.level + 1 == self.bottom:  # only averages pass edges to the last level, to see its values again
+        if step.level + 1 == self.bottom:  # only averages pass edges to the last level, to average its values again
             step.budget_C = step.used_C = step.budget_L
             step.child_C, step.on_G = torch.zeros_like(step.row_L), step.row_L[:0]
             return step.budget_L[:0]
@@ -154,7 +154,6 @@ class Tree:
         return left_C.index_select(0, step.on_G)
 
     def _expand_tree(self, step: _Step, state_L: Tensor) -> None:
-        """Every edge leads to a node of its own."""
         nodes = self.nodes
         child_L = nodes.below_NAK.view(-1).index_select(0, step.edge(step.arm_M, nodes.num_outcomes))
         new = (child_L == 0).nonzero().squeeze(1)
@@ -205,12 +204,11 @@ class Tree:
         used_M = used_G.new_zeros(len(step.arm_M)).index_add_(0, step.row_L, used_L)
         if self.mean:
             return_G = self._average(step, edge_L, return_G, used_M)
-        elif self.merge:
-            self._back_up(step.node_F, step.level)
         else:
-            # The node of a child replaces the critic's value, and says whether anything is left below the edge.
-            nodes.value_NAK.view(-1).scatter_(0, edge_L, nodes.v_N.index_select(0, step.child_C))
-            nodes.exhausted_NAK.view(-1).scatter_(0, edge_L, nodes.exhausted_N.index_select(0, step.child_C))
+            if not self.merge:
+                # What a child's node knows replaces what the critic and the table said of the edge.
+                nodes.value_NAK.view(-1).scatter_(0, edge_L, nodes.v_N.index_select(0, step.child_C))
+                nodes.exhausted_NAK.view(-1).scatter_(0, edge_L, nodes.exhausted_N.index_select(0, step.child_C))
             self._back_up(step.node_F, step.level)
         nodes.visits_NA.view(-1).scatter_add_(0, step.arm_M, used_M)
         nodes.visits_NAK.view(-1).scatter_add_(0, edge_L, used_L)
@@ -242,7 +240,7 @@ class Tree:
         # p_k gamma_k v_k of each outcome; their sum and the reward are q.
         q_FAK = table.prob_RAK.index_select(0, table_row_F)
         q_FAK *= table.discount_RAK.index_select(0, table_row_F)
-        q_FA = (q_FAK.mul_(value_FAK)).sum(2).add_(table.reward_RA.index_select(0, table_row_F))
+        q_FA = q_FAK.mul_(value_FAK).sum(2).add_(table.reward_RA.index_select(0, table_row_F))
         exhausted_FA = exhausted_FAK.amax(2)
         nodes.q_NA.index_copy_(0, node_F, q_FA)
         nodes.v_N.index_copy_(0, node_F, q_FA.amax(1))
@@ -256,7 +254,7 @@ class Tree:
             The sum of the returns that pass each node.
         """
         nodes, table = self.nodes, self.known.topology.table
-        # Simulations that end here see the child's value, the others bring a return from below.
+        # Simulations that end here take the child's value, the others bring a return from below.
         ended_L = step.budget_L.clone()
         if len(step.on_G):
             ended_L[step.on_G] = step.used_C[step.on_G]
@@ -265,7 +263,7 @@ class Tree:
         else:
             value_L = nodes.v_N.index_select(0, step.child_C)
         return_L = (ended_L * value_L).index_add_(0, step.on_G, return_G)
-        # Only outcomes that have weight are drawn: gamma_k, times the probability that one has.
+        # Only outcomes that have weight are taken: gamma_k, times the probability that one has.
         node_M = step.node_F.index_select(0, step.parent_M)
         known_arm_M = torch.add(step.arm_M, nodes.known_N.index_select(0, node_M) - node_M, alpha=self.A)
         weighed_M = self.known.weighed_TA.view(-1).index_select(0, known_arm_M)

@@ -15,7 +15,7 @@ _WORK, MOST_SWEEPS = 2**20, 256
 """About how many outcomes are swept in one call, and the most sweeps."""
 
 _EVERY = 8
-"""Sweeps from one look at whether they have converged to the next."""
+"""After so many sweeps it is checked whether they have converged."""
 
 _EPS = torch.finfo(torch.float64).eps
 

@@ -1,4 +1,4 @@
-"""Models and critics that keep a record of their queries, and the slow oracle of the search."""
+"""Models and critics that keep a record of their queries, the slow oracle of the search, and what its tests share."""
 
 from collections.abc import Callable, Hashable, Sequence
 
@@ -9,6 +9,7 @@ from pgts_torch.bellman import Outcomes
 from pgts_torch.models import EnumeratingModel, TabularModel
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP
+from tests.support import weights
 
 Step = Callable[[Hashable, int], tuple[float, Sequence[tuple[float, float, Hashable]]]]
 """(state, action) to the expected reward and the outcomes (probability, discount, next state)."""
@@ -100,6 +101,24 @@ def some_v(mdp: TabularMDP, seed: int = 0) -> Tensor:
 def zeros(state_N: Tensor) -> Tensor:
     """The critic that knows nothing of v."""
     return torch.zeros(len(state_N), dtype=torch.float64)
+
+
+def paths(state: tuple[int, ...], action: int) -> tuple[float, list[tuple[float, float, tuple[int, ...]]]]:
+    """Two actions with two outcomes each; a state is the path that led there, so that no two paths meet."""
+    return float(sum(state)), [(0.5, 0.9, (*state, 2 * action)), (0.5, 0.9, (*state, 2 * action + 1))]
+
+
+def assert_close(actual: Tensor, expected: Tensor, tolerance: float = 1e-11) -> None:
+    torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
+
+
+def q_of(mdp: TabularMDP, v_S: Tensor) -> Tensor:
+    """r + gamma P v by a dense product."""
+    return mdp.outcomes.reward_NA + torch.from_numpy(weights(mdp) @ v_S.numpy())
+
+
+def all_states(mdp: TabularMDP) -> Tensor:
+    return torch.arange(mdp.num_states)
 
 
 def walk_the_tree(

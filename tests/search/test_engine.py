@@ -58,19 +58,16 @@ def test_a_search_that_expands_everything_is_exact_and_queries_nothing_twice(mak
     assert not torch.allclose(first.q_BA, truth(2))
 
 
+def of_function(samples: int) -> Lookahead:
+    """The same search by the function `sampled`."""
+    v_S, generator = some_v(GARNET), stream(0, "search")
+    options = {"samples": samples, "share": "search", "generator": generator, "replicates": 0}
+    return sampled(TabularModel(GARNET), ROOTS, depth=3, v_leaf=lambda s: v_S[s], **options)
+
+
 def test_a_sampled_search_is_the_function_of_that_name_and_counts_its_calls():
     search = SampledSearch(SamplingOnly(GARNET), Sampled(samples=3, share="search"))
-    v_S = some_v(GARNET)
-    expected = sampled(
-        TabularModel(GARNET),
-        ROOTS,
-        depth=3,
-        v_leaf=lambda s: v_S[s],
-        samples=3,
-        share="search",
-        generator=stream(0, "search"),
-        replicates=0,
-    )
+    expected = of_function(samples=3)
     first, again, other = look(search), look(search), look(search, seed=1)
     assert torch.equal(first.q_BA, expected.q_BA)
     assert torch.equal(first.q_BA, again.q_BA)
@@ -171,17 +168,7 @@ def test_a_budget_that_is_too_small_for_anything_is_an_error(model):
 def test_a_tree_search_of_a_model_that_only_samples_searches_fixed_samples():
     """With enough simulations it is the sampled lookahead with one set of samples for each state."""
     search = MCTSSearch(SamplingOnly(GARNET), MCTS(simulations=100_000, samples=2))
-    v_S = some_v(GARNET)
-    expected = sampled(
-        TabularModel(GARNET),
-        ROOTS,
-        depth=3,
-        v_leaf=lambda s: v_S[s],
-        samples=2,
-        share="search",
-        generator=stream(0, "search"),
-        replicates=0,
-    )
+    expected = of_function(samples=2)
     found = look(search)
     torch.testing.assert_close(found.q_BA, expected.q_BA)
     assert found.model_calls <= expected.model_calls

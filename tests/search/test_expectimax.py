@@ -15,27 +15,24 @@ from pgts_torch.models import TabularModel
 from pgts_torch.search import Lookahead, Topology, expectimax
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, exact, grid, ladder
-from tests.search.models import Critic, InterningModel, some_q, some_v, walk_the_tree, zeros
-from tests.support import ZOO, mdps, random_policy, tree_lookahead, weights, zoo
+from tests.search.models import (
+    Critic,
+    InterningModel,
+    all_states,
+    assert_close,
+    q_of,
+    some_q,
+    some_v,
+    walk_the_tree,
+    zeros,
+)
+from tests.support import ZOO, mdps, random_policy, tree_lookahead, zoo
 
 DEPTHS = range(11)
 
 
-def assert_close(actual: Tensor, expected: Tensor, tolerance: float = 1e-11) -> None:
-    torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
-
-
 def differs(a: Tensor, b: Tensor, least: float = 1e-6) -> bool:
     return bool((a - b).abs().max() > least)
-
-
-def q_of(mdp: TabularMDP, v_S: Tensor) -> Tensor:
-    """r + gamma P v by a dense product."""
-    return mdp.outcomes.reward_NA + torch.from_numpy(weights(mdp) @ v_S.numpy())
-
-
-def all_states(mdp: TabularMDP) -> Tensor:
-    return torch.arange(mdp.num_states)
 
 
 def few_states(mdp: TabularMDP, count: int = 8) -> list[int]:
@@ -53,33 +50,17 @@ def walkable_depth(mdp: TabularMDP, most_paths: int = 4_000) -> int:
 
 
 @pytest.mark.parametrize("name", ZOO)
-def test_all_states_at_once_have_T_to_the_m_of_any_q_and_v(name):
+def test_all_states_at_once_and_each_alone_have_T_to_the_m_of_any_q_and_v(name):
     mdp, model = zoo(name), TabularModel(zoo(name))
-    topology = Topology(model)
-    q_SA, v_S = some_q(mdp), some_v(mdp)
+    topology, q_SA, v_S = Topology(model), some_q(mdp), some_v(mdp)
     q_of_v = q_of(mdp, v_S)
     for depth in DEPTHS:
-        by_q = expectimax(model, all_states(mdp), depth=depth, q_leaf=Critic(q_SA), topology=topology)
-        by_v = expectimax(model, all_states(mdp), depth=depth, v_leaf=Critic(v_S), topology=topology)
-        assert_close(by_q.q_BA, exact.lookahead(mdp, q_SA, depth))
-        assert_close(by_v.q_BA, exact.lookahead(mdp, q_of_v, depth))
-
-
-@pytest.mark.parametrize("name", ZOO)
-def test_a_state_alone_has_T_to_the_m_of_any_q_and_v(name):
-    mdp, model = zoo(name), TabularModel(zoo(name))
-    topology = Topology(model)
-    q_SA, v_S = some_q(mdp), some_v(mdp)
-    q_of_v = q_of(mdp, v_S)
-    of_q = [exact.lookahead(mdp, q_SA, depth) for depth in DEPTHS]
-    of_v = [exact.lookahead(mdp, q_of_v, depth) for depth in DEPTHS]
-    for s in few_states(mdp):
-        root = torch.tensor([s])
-        for depth in DEPTHS:
-            by_q = expectimax(model, root, depth=depth, q_leaf=Critic(q_SA), topology=topology)
-            by_v = expectimax(model, root, depth=depth, v_leaf=Critic(v_S), topology=topology)
-            assert_close(by_q.q_BA[0], of_q[depth][s])
-            assert_close(by_v.q_BA[0], of_v[depth][s])
+        of_q, of_v = exact.lookahead(mdp, q_SA, depth), exact.lookahead(mdp, q_of_v, depth)
+        for roots in [all_states(mdp), *(torch.tensor([s]) for s in few_states(mdp))]:
+            by_q = expectimax(model, roots, depth=depth, q_leaf=Critic(q_SA), topology=topology)
+            by_v = expectimax(model, roots, depth=depth, v_leaf=Critic(v_S), topology=topology)
+            assert_close(by_q.q_BA, of_q[roots])
+            assert_close(by_v.q_BA, of_v[roots])
 
 
 @pytest.mark.parametrize("name", [name for name in ZOO if name != "Taxi"])

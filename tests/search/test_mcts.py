@@ -16,25 +16,23 @@ from pgts_torch.search.mcts import mcts
 from pgts_torch.search.split import Selection, apportion
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, ladder, random_mdp
-from tests.search.models import Critic, InterningModel, some_q, some_v, walk_the_tree, watched, zeros
+from tests.search.models import (
+    Critic,
+    InterningModel,
+    all_states,
+    assert_close,
+    q_of,
+    some_q,
+    some_v,
+    walk_the_tree,
+    watched,
+    zeros,
+)
 from tests.search.slow_tree import SlowTree
 from tests.support import mdps, random_policy, uniform_policy, weights, zoo
 
 ENOUGH = 300
 """More simulations than a complete tree of the small examples takes."""
-
-
-def assert_close(actual: Tensor, expected: Tensor, tolerance: float = 1e-11) -> None:
-    torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
-
-
-def q_of(mdp: TabularMDP, v_S: Tensor) -> Tensor:
-    """r + gamma P v by a dense product."""
-    return mdp.outcomes.reward_NA + torch.from_numpy(weights(mdp) @ v_S.numpy())
-
-
-def all_states(mdp: TabularMDP) -> Tensor:
-    return torch.arange(mdp.num_states)
 
 
 def states_of(mdp: TabularMDP, seed: int, count: int = 5) -> Tensor:
@@ -393,7 +391,7 @@ def test_states_numbered_as_they_are_met_with_differing_K_have_the_values_of_the
         ({"exploration": 1.0}, "exploration is 1"),
         ({"wave": True}, "wave is true"),
         ({"merge": True, "backup": "mean"}, "merge is true"),
-        ({"root": "rule", "generator": torch.Generator()}, "only root='gumbel' draws"),
+        ({"root": "rule", "generator": torch.Generator()}, "only root='gumbel'"),
         ({"root": "rule", "rule": "uct", "prior": zeros}, "prior is policy"),
         ({"prior": lambda s: torch.ones(len(s), 2)}, r"prior of state 0 is \[1\.0, 1\.0\]"),
         ({"prior": zeros}, r"prior has shape \(1,\); for 1 states it must be \(1, 2\)"),

@@ -22,15 +22,11 @@ from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import random_mdp
 from tests.memory import peak_bytes
-from tests.search.models import WatchedModel
+from tests.search.models import WatchedModel, zeros
 
 A, K = 3, 4
 GARNET = random_mdp(4000, A, branching=K, seed=5)
 ROOT = torch.tensor([0])
-
-
-def zeros(state_N):
-    return torch.zeros(len(state_N), dtype=torch.float64)
 
 
 def look_of(kind: str, model: EnumeratingModel, max_bytes: int) -> tuple[Lookahead, Topology]:

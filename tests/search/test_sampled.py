@@ -17,7 +17,7 @@ from pgts_torch.models import SamplingModel, TabularModel, Transitions
 from pgts_torch.search import Lookahead, bootstrap, expectimax, sampled
 from pgts_torch.seeding import mix, stream, uniform
 from pgts_torch.tabular import TabularMDP, exact, ladder, random_mdp
-from tests.search.models import Critic, InterningModel, some_q, some_v, walk_the_tree, watched, zeros
+from tests.search.models import Critic, InterningModel, all_states, some_q, some_v, walk_the_tree, watched, zeros
 from tests.support import ZOO, mdps, zoo
 
 SHARES = ["none", "level", "search"]
@@ -46,10 +46,6 @@ class Recorder(SamplingModel):
 def look(mdp: TabularMDP, roots: Tensor, seed: int = 0, **knobs: object) -> Lookahead:
     knobs = {"samples": 4, "generator": stream(seed, "search"), "v_leaf": Critic(some_v(mdp))} | knobs
     return sampled(TabularModel(mdp), roots, **knobs)
-
-
-def all_states(mdp: TabularMDP) -> Tensor:
-    return torch.arange(mdp.num_states)
 
 
 def tied(mdp: TabularMDP, num_actions: int) -> TabularMDP:

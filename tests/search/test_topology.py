@@ -14,7 +14,7 @@ from pgts_torch.errors import NodeBudgetExceeded, PgtsError
 from pgts_torch.models import EnumeratingModel, TabularModel
 from pgts_torch.search import Topology, expectimax
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder
-from tests.search.models import Critic, InterningModel, WatchedModel, some_q, some_v, watched, zeros
+from tests.search.models import Critic, InterningModel, WatchedModel, paths, some_q, some_v, watched, zeros
 from tests.support import mdps, zoo
 
 
@@ -28,11 +28,6 @@ def nodes_per_level(mdp: TabularMDP, root: int, expansions: int) -> list[int]:
 
 def zeros_of(mdp: TabularMDP) -> Tensor:
     return torch.zeros(mdp.num_actions, dtype=torch.float64)
-
-
-def paths(state: tuple[int, ...], action: int) -> tuple[float, list[tuple[float, float, tuple[int, ...]]]]:
-    """Two actions with two outcomes each; a state is the path that led there, so that no two paths meet."""
-    return float(sum(state)), [(0.5, 0.9, (*state, 2 * action)), (0.5, 0.9, (*state, 2 * action + 1))]
 
 
 # Merging, by counts against closed forms
