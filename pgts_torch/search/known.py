@@ -46,22 +46,20 @@ class KnownStates(Table):
         """The rows T of these states; the model and the critic are first called for the new ones, together.
 
         Args:
-            tree: what the nodes of the search take, see `check_memory`.
+            tree: as in `check_memory`.
 
         Raises:
             PgtsError: the model, the critic or the prior returns something that cannot be used.
-            NodeBudgetExceeded: see `check_memory`; the model has not been queried.
+            NodeBudgetExceeded: it would be too much, and the model has not been queried.
         """
         row_N = self.row_S.index_select(0, state_N)
-        if int(row_N.amin()) < 0:
-            # One query of the model and one call of the critic for all new states together.
-            new_N = state_N[row_N < 0].unique()
-            self.check_memory(len(new_N), **tree)
-            self._learn(new_N)
-            row_N = self.row_S.index_select(0, state_N)
-        else:
+        if int(row_N.amin()) >= 0:
             self.check_memory(0, **tree)
-        return row_N
+            return row_N
+        new_N = state_N[row_N < 0].unique()
+        self.check_memory(len(new_N), **tree)
+        self._learn(new_N)
+        return self.row_S.index_select(0, state_N)
 
     def check_memory(self, new: int, **tree: int) -> None:
         """NodeBudgetExceeded if so many more states, beside the tree, are too much.
@@ -71,8 +69,7 @@ class KnownStates(Table):
         """
         learned = self.count + new
         needed = self.topology.bytes(new, looked_up=new, kept=new, learned=learned, **tree)
-        nodes = tree.get("nodes", 0)
-        what = f"the search ({nodes} nodes, {learned} states of {self.num_actions} actions)"
+        what = f"the search ({tree.get('nodes', 0)} nodes, {learned} states of {self.num_actions} actions)"
         check_memory(needed, self.topology.max_bytes, what)
 
     def weight_NAK(self, row_N: Int[Tensor, "N"]) -> Float[Tensor, "N A K"]:

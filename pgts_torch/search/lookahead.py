@@ -147,11 +147,7 @@ class Leaves:
         self._model, self._q_leaf, self._v_leaf, self._prior = model, q_leaf, v_leaf, prior
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
-        """v, or max_a Q(s, a).
-
-        Raises:
-            PgtsError: the critic returns a wrong shape, or values that are not finite (naming the state).
-        """
+        """v, or max_a Q(s, a); PgtsError, with the state, if the critic's values are of a wrong shape or not finite."""
         if self._v_leaf is None:
             return self.q(state_N).amax(-1)
         return self._called(self._v_leaf, state_N, (len(state_N),))
@@ -162,11 +158,7 @@ class Leaves:
         return self._called(self._q_leaf, state_N, (len(state_N), self._model.num_actions))
 
     def prior(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
-        """pi(.|s), or uniform probabilities.
-
-        Raises:
-            PgtsError: the policy returns a wrong shape, or what is no distribution (naming the state).
-        """
+        """pi(.|s), or uniform probabilities; PgtsError, with the state, if the policy's are no distribution."""
         N, A = len(state_N), self._model.num_actions
         if self._prior is None:
             return torch.full((N, A), 1 / A, dtype=self._model.dtype, device=self._model.device)

@@ -98,9 +98,8 @@ _SMALLER = "set a smaller depth or max_width, fewer simulations, samples or envi
 def check_memory(needed: int, most: int, what: str) -> None:
     """MemoryBudgetExceeded if a search would take more than that."""
     if needed > most:
-        raise MemoryBudgetExceeded(
-            f"{what} would take up to {gib(needed)}; the limit is {gib(most)}: {_SMALLER} max_bytes"
-        )
+        size, limit = (f"{num_bytes / 2**30:.3g} GiB" for num_bytes in (needed, most))
+        raise MemoryBudgetExceeded(f"{what} would take up to {size}; the limit is {limit}: {_SMALLER} max_bytes")
 
 
 def check_nodes(nodes: int, most: int, where: str = "", more: str = "") -> None:
@@ -124,8 +123,3 @@ def tree_nodes(roots: int, children: int, expansions: int) -> float:
         return roots * (float(children) ** (expansions + 1) - 1) / (children - 1)
     except OverflowError:
         return math.inf
-
-
-def gib(num_bytes: float) -> str:
-    """A number of bytes in GiB, for a message."""
-    return f"{num_bytes / 2**30:.3g} GiB"

@@ -41,18 +41,13 @@ def pruned(
     The batch shares the width: W bounds a level of all roots together, and the roots are all expanded. With W at least
     as large as the largest level the result is that of the full lookahead. pruned is 1 at a pruned state, 0 at the
     last level and max_a sum p gamma pruned(child) at one that is expanded. The critic is called once for each level
-    below the roots; the model is queried for at most (roots + W (levels - 1)) A pairs.
+    below the roots; the model is queried for at most (roots + W (levels - 1)) A pairs. Pruned nodes count as nodes.
 
     Args:
-        leaves: the critic, and how many levels are expanded.
-        topology: what is known of the model; this search adds to it.
-        root_B: states of the model, int64.
-        max_width: W >= 1.
-        max_nodes: the most nodes, summed over levels, pruned ones included.
+        max_width: W, at least 1.
 
     Raises:
-        PgtsError: roots that are no states, critic values of a wrong shape or not finite.
-        NodeBudgetExceeded: more than `max_nodes` would be needed.
+        PgtsError, NodeBudgetExceeded: as `expectimax`.
     """
     check_roots(root_B, topology.model.num_states)
     roots, row_B = torch.unique(root_B, return_inverse=True)

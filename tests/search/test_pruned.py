@@ -222,7 +222,7 @@ def test_a_tree_of_bounded_width_grows_no_longer_and_its_nodes_are_counted_again
     nodes = look(1_000).nodes_per_level
     assert nodes == (1, 4, *[12] * 20)
     assert look(sum(nodes)).model_calls == 2 * (1 + 3 * 20)
-    with pytest.raises(NodeBudgetExceeded, match=r"245 nodes on levels 0 to 21; max_nodes is 244: .*max_width"):
+    with pytest.raises(NodeBudgetExceeded, match=r"max_nodes is 244: .*max_width"):
         look(sum(nodes) - 1)
 
 
@@ -302,7 +302,7 @@ def test_a_critic_value_that_is_not_finite_is_refused_above_the_last_level_too(b
     v_S = some_v(ladder(9))
     v_S[2] = bad
     model, root = TabularModel(ladder(9)), torch.tensor([1])
-    with pytest.raises(PgtsError, match=rf"value of state 2 is {bad}; it must be finite"):
+    with pytest.raises(PgtsError, match=f"value of state 2 is {bad}"):
         expectimax(model, root, depth=4, v_leaf=Critic(v_S), max_width=2)
 
 
