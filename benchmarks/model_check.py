@@ -60,7 +60,7 @@ def cost(name: str, options: dict[str, Any], iterations: int) -> dict[str, float
 
 
 def lake() -> tuple[np.ndarray, np.ndarray]:
-    """The listed probabilities of FrozenLake, and how often each row is visited under the uniform policy."""
+    """The probabilities in the table of FrozenLake, and how often each row is visited under the uniform policy."""
     mdp = TabularMDP.from_gymnasium(gymnasium.make("FrozenLake-v1"), 0.99)
     prob_RK = TabularModel(mdp).frequencies().numpy()
     visits_S = np.array([40, 24, 17, 11, 22, 0, 10, 0, 13, 9, 7, 0, 0, 4, 3, 0], dtype=float)  # roughly its occupancy
@@ -68,9 +68,9 @@ def lake() -> tuple[np.ndarray, np.ndarray]:
     return prob_RK, visits_R / visits_R.sum()
 
 
-def run(listed_RK: np.ndarray, true_RK: np.ndarray, visits_R: np.ndarray, seed: int, steps: int, batch: int) -> Any:
+def run(claimed_RK: np.ndarray, true_RK: np.ndarray, visits_R: np.ndarray, seed: int, steps: int, batch: int) -> Any:
     """The steps until a contradiction, or None; the most log E that there was, and E at the end."""
-    random, test = np.random.default_rng(seed), Frequencies(torch.from_numpy(listed_RK))
+    random, test = np.random.default_rng(seed), Frequencies(torch.from_numpy(claimed_RK))
     cumulative_RK, most = true_RK.cumsum(-1), 0.0
     for step in range(batch, steps + batch, batch):
         row_V = random.choice(len(visits_R), batch, p=visits_R)

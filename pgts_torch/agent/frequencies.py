@@ -1,4 +1,4 @@
-"""A sequential test of the probabilities that a model lists; it is valid after every step of a run."""
+"""A sequential test of the probabilities that a model claims; it is valid after every step of a run."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 MARGINS = 0.02, 0.0
-"""The error of a listed probability that is tolerated: for a contradiction, and for a warning."""
+"""The error of a claimed probability that is tolerated: for a contradiction, and for a warning."""
 
 _STAKES = tuple(2.0**-n for n in range(1, 8))
 """The fractions g of the wealth that are staked, one bet for each."""
@@ -22,27 +22,27 @@ evidence is late by at most that fraction of the steps."""
 
 @dataclass(frozen=True)
 class Worst:
-    """The outcome of a row whose frequency contradicts its listed probability most.
+    """The outcome of a row whose frequency contradicts its claimed probability most.
 
     happened: how often it happened, in `seen` steps of that row.
-    listed: its probability.
+    claimed: its probability in the model.
     """
 
     row: int
     outcome: int
     happened: int
     seen: int
-    listed: float
+    claimed: float
 
 
 @final
 class Frequencies:
-    """Tests listed probabilities by betting against them; the wealth won is evidence that they are wrong.
+    """Tests claimed probabilities by betting against them; the wealth won is evidence that they are wrong.
 
-    Row r lists outcomes k with probabilities p_rk. The hypothesis, for a margin e: in every row the listed probability
-    of each event is within e of the true one. Each batch of steps is bet on using earlier steps only: in row r on the
-    event A_r of the outcomes that were more frequent than listed, and only if their frequency was above m = p_r(A_r) +
-    e. At odds that are fair for the probability m, staking a fraction g of the wealth W_rg changes it to
+    Row r has outcomes k with claimed probabilities p_rk. The hypothesis, for a margin e: in every row the claim about
+    each event is within e of its true probability. Each batch of steps is bet on using earlier steps only: in row r on
+    the event A_r of the outcomes that were more frequent than claimed, and only if their frequency was above
+    m = p_r(A_r) + e. At odds that are fair for the probability m, staking a fraction g of the wealth W_rg changes it to
 
         W_rg <- W_rg * (1 + g (1 - m) / m)    where A_r happens,        W_rg * (1 - g)    elsewhere,
 
@@ -58,7 +58,7 @@ class Frequencies:
     has_chance: whether there is a row with several possible outcomes.
 
     Args:
-        prob_RK: the listed probabilities. Rows with a single possible outcome are not tested.
+        prob_RK: the claimed probabilities. Rows with a single possible outcome are not tested.
     """
 
     def __init__(self, prob_RK: Float[Tensor, "R K"]) -> None:
@@ -94,18 +94,18 @@ class Frequencies:
         new_UK = np.zeros((len(rows), K))
         new_UK[which_E, edge_E % K] = times_E
 
-        # The event A_r of each row: the outcomes that were more frequent than listed.
+        # The event A_r of each row: the outcomes that were more frequent than claimed.
         prob_UK, count_UK = self._prob_RK[rows], self._count_NK[at]
         total_U1 = count_UK.sum(-1, keepdims=True)
         event_UK = count_UK > total_U1 * prob_UK
-        listed_U1 = (prob_UK * event_UK).sum(-1, keepdims=True)
+        claimed_U1 = (prob_UK * event_UK).sum(-1, keepdims=True)
         frequency_U1 = (count_UK * event_UK).sum(-1, keepdims=True) / np.maximum(total_U1, 1)
         won_U1 = (new_UK * event_UK).sum(-1, keepdims=True)
         lost_U1 = new_UK.sum(-1, keepdims=True) - won_U1
 
         # Wealth by margin and stake; no bet (factor 1) where the frequency is within the margin.
-        most_UE = listed_U1 + np.array(MARGINS)
-        bets_UE = (frequency_U1 > most_UE) & (most_UE < 1) & (listed_U1 > 0)
+        most_UE = claimed_U1 + np.array(MARGINS)
+        bets_UE = (frequency_U1 > most_UE) & (most_UE < 1) & (claimed_U1 > 0)
         odds_UE = np.where(bets_UE, (1 - most_UE) / np.where(bets_UE, most_UE, 1), 0)
         stake_G = np.array(_STAKES)
         gain_UEG = won_U1[..., None] * np.log1p(stake_G * odds_UE[..., None]) + lost_U1[..., None] * np.log1p(-stake_G)
@@ -135,7 +135,7 @@ class Frequencies:
         return tuple((np.logaddexp(product_E, mean_E) - math.log(2)).tolist())
 
     def worst(self) -> "Worst":
-        """In the row with the most evidence, the outcome whose frequency is furthest from its listed probability."""
+        """In the row with the most evidence, the outcome whose frequency is furthest from its claimed probability."""
         n = int(_log_sum_exp(self._log_wealth_NEG).sum(-1).argmax())
         row, count_K = int(self._id_N[n]), self._count_NK[n]
         k = int(np.abs(count_K / count_K.sum() - self._prob_RK[row]).argmax())

@@ -199,7 +199,7 @@ class ModelCheck:
             event = model.outcome_text(state, action, worst.outcome)
         return (
             f"{where} {event} in {worst.happened} of {worst.seen} cases ({worst.happened / worst.seen:.4g}); the "
-            f"{self._kind} says with probability {worst.listed:.4g}"
+            f"{self._kind} says with probability {worst.claimed:.4g}"
         )
 
     def _contradicted(self, kind: str, what: str, count: int) -> None:

@@ -240,11 +240,12 @@ def untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
     """Whether two equal real environments stay equal when a search starts from one of them."""
     real, twin = setup.make(), setup.make()
     seed, actions = setup.number(), [setup.action() for _ in range(2 * length)]
-    begun = [[_bits_of(env, reset(env, seed=seed)), *_live(env, actions[:length])] for env in (real, twin)]
+    begun = [[_bits_of(env, reset(env, seed=seed))] for env in (real, twin)]
+    for env, seen in zip((real, twin), begun, strict=True):
+        seen += _live(env, actions[:length])
     before = _state_of(setup, real)
     model, after = setup.model(), {before}
-    with environment_code():
-        frontier_N = model.roots([real])
+    frontier_N = torch.tensor([model.number(setup.snapshot(real))])
     for level in range(_LEVELS):
         state_N = frontier_N[:width].repeat_interleave(len(setup.actions))
         action_N = torch.arange(len(setup.actions)).repeat(len(frontier_N[:width]))

@@ -1,4 +1,4 @@
-"""Evidence against listed probabilities: never against true ones, soon against others, and the same in any order."""
+"""Evidence against claimed probabilities: never against true ones, soon against others, and the same in any order."""
 
 import math
 
@@ -11,7 +11,7 @@ from pgts_torch.agent.frequencies import MARGINS, Frequencies
 from pgts_torch.agent.model_check import ENOUGH
 from tests import reliability
 
-LISTED = np.array([[1 / 3, 1 / 3, 1 / 3], [0.5, 0.5, 0.0], [0.1, 0.2, 0.7], [1.0, 0.0, 0.0]])
+CLAIMED = np.array([[1 / 3, 1 / 3, 1 / 3], [0.5, 0.5, 0.0], [0.1, 0.2, 0.7], [1.0, 0.0, 0.0]])
 
 
 def outcomes(random: np.random.Generator, true_RK: np.ndarray, row_V: np.ndarray) -> np.ndarray:
@@ -21,10 +21,10 @@ def outcomes(random: np.random.Generator, true_RK: np.ndarray, row_V: np.ndarray
 
 def followed(true_RK: np.ndarray, *, seed: int, batches: int, batch: int) -> tuple[Frequencies, np.ndarray]:
     """A test after these batches, and log E after each of them."""
-    random, test = np.random.default_rng(seed), Frequencies(torch.from_numpy(LISTED))
+    random, test = np.random.default_rng(seed), Frequencies(torch.from_numpy(CLAIMED))
     evidence = []
     for _ in range(batches):
-        row_V = random.choice(len(LISTED), batch, p=[0.4, 0.3, 0.2, 0.1])
+        row_V = random.choice(len(CLAIMED), batch, p=[0.4, 0.3, 0.2, 0.1])
         test.observe(row_V, outcomes(random, true_RK, row_V))
         evidence.append(test.log_evidence)
     return test, np.array(evidence)
@@ -32,28 +32,28 @@ def followed(true_RK: np.ndarray, *, seed: int, batches: int, batch: int) -> tup
 
 def by_hand(batches: list[list[tuple[int, int]]], margin: float) -> float:
     """E of one margin, by a loop over steps and shares, every batch bet on at once."""
-    count, wealth = np.zeros(LISTED.shape), {(r, g): 1.0 for r in range(len(LISTED)) for g in range(1, 8)}
+    count, wealth = np.zeros(CLAIMED.shape), {(r, g): 1.0 for r in range(len(CLAIMED)) for g in range(1, 8)}
     for batch in batches:
         before = count.copy()
         for row, outcome in batch:
-            if (LISTED[row] > 0).sum() == 1:
+            if (CLAIMED[row] > 0).sum() == 1:
                 continue
             seen = before[row].sum()
-            event = {k for k in range(3) if before[row, k] > seen * LISTED[row, k]}
-            fair = sum(LISTED[row, k] for k in event) + margin
+            event = {k for k in range(3) if before[row, k] > seen * CLAIMED[row, k]}
+            fair = sum(CLAIMED[row, k] for k in event) + margin
             if event and fair < 1 and sum(before[row, k] for k in event) / seen > fair:
                 for g in range(1, 8):
                     wealth[row, g] *= 1 + 2.0**-g * (1 - fair) / fair if outcome in event else 1 - 2.0**-g
             count[row, outcome] += 1
-    product = np.mean([math.prod(wealth[r, g] for r in range(len(LISTED))) for g in range(1, 8)])
+    product = np.mean([math.prod(wealth[r, g] for r in range(len(CLAIMED))) for g in range(1, 8)])
     return float((product + np.mean(list(wealth.values()))) / 2)
 
 
 def test_the_evidence_is_that_of_bets_made_step_by_step_in_any_order():
-    random, test, batches = np.random.default_rng(1), Frequencies(torch.from_numpy(LISTED)), []
+    random, test, batches = np.random.default_rng(1), Frequencies(torch.from_numpy(CLAIMED)), []
     true_RK = np.array([[0.6, 0.3, 0.1], [0.7, 0.3, 0.0], [0.1, 0.2, 0.7], [1.0, 0.0, 0.0]])
     for size in (5, 9, 20, 60):  # each is large enough to be bet on at once
-        row_V = random.integers(len(LISTED), size=size)
+        row_V = random.integers(len(CLAIMED), size=size)
         batches.append(list(zip(row_V.tolist(), outcomes(random, true_RK, row_V).tolist(), strict=True)))
         rows, seen = map(np.array, zip(*random.permutation(batches[-1]), strict=True))
         test.observe(rows, seen)
@@ -68,13 +68,13 @@ def test_true_probabilities_are_never_called_wrong_and_e_is_as_seldom_large_as_i
     If Prop. 7 holds, P(E ever reaches x) <= 1/x in a run, and each of the five counts is above its limit with a
     probability below 1e-6: the number of runs in which that happens is at most binomial.
     """
-    evidence_RTM = np.stack([followed(LISTED, seed=seed, batches=batches, batch=150)[1] for seed in range(runs)])
+    evidence_RTM = np.stack([followed(CLAIMED, seed=seed, batches=batches, batch=150)[1] for seed in range(runs)])
     highest_RM = evidence_RTM.max(1)
     assert int((highest_RM[:, 0] >= ENOUGH).sum()) == 0
     for x in (20, 1_000):
         counts = (highest_RM >= math.log(x)).sum(0)
         assert counts.max() <= scipy.stats.binom.isf(1e-6, runs, 1 / x)
-    off = followed(LISTED + 0.06 * np.array([[1, -1, 0]] * 3 + [[0, 0, 0]]), seed=0, batches=60, batch=600)[1]
+    off = followed(CLAIMED + 0.06 * np.array([[1, -1, 0]] * 3 + [[0, 0, 0]]), seed=0, batches=60, batch=600)[1]
     assert off.max(0).min() > math.log(1_000)
     if runs >= 2_000:
         reached = (highest_RM[:, 0] >= math.log(20)).sum()
@@ -88,12 +88,12 @@ def test_true_probabilities_are_never_called_wrong_and_e_is_as_seldom_large_as_i
 
 
 def test_e_has_a_mean_of_at_most_1():
-    last_RM = np.exp([followed(LISTED, seed=seed, batches=12, batch=150)[1][-1] for seed in range(150)])
+    last_RM = np.exp([followed(CLAIMED, seed=seed, batches=12, batch=150)[1][-1] for seed in range(150)])
     assert (last_RM.mean(0) <= 1 + 4 * last_RM.std(0) / math.sqrt(len(last_RM))).all()
 
 
 def test_probabilities_within_the_margin_are_never_called_wrong_though_they_are_doubted():
-    true_RK = LISTED + 0.015 * np.array([[1, -1, 0], [1, -1, 0], [1, 0, -1], [0, 0, 0]])
+    true_RK = CLAIMED + 0.015 * np.array([[1, -1, 0], [1, -1, 0], [1, 0, -1], [0, 0, 0]])
     _, evidence = followed(true_RK, seed=0, batches=60, batch=5_000)
     assert evidence[:, 0].max() < 3
     assert evidence[-1, 0] < 0
@@ -102,7 +102,7 @@ def test_probabilities_within_the_margin_are_never_called_wrong_though_they_are_
 
 @pytest.mark.parametrize(("rows", "by", "most"), [((0, 1, 2), 0.06, 40_000), ((2,), 0.2, 20_000), ((1,), 0.45, 2_000)])
 def test_probabilities_that_are_off_are_called_wrong_be_it_a_little_in_all_rows_or_much_in_one(rows, by, most):
-    true_RK = LISTED.copy()
+    true_RK = CLAIMED.copy()
     true_RK[rows, 0] += by
     true_RK[rows, 1] -= np.minimum(by, true_RK[rows, 1])
     true_RK /= true_RK.sum(-1, keepdims=True)
@@ -110,19 +110,19 @@ def test_probabilities_that_are_off_are_called_wrong_be_it_a_little_in_all_rows_
     assert evidence[:, 0].max() > ENOUGH
     worst = test.worst()
     assert worst.row in rows
-    assert abs(worst.happened / worst.seen - worst.listed) > 0.02
+    assert abs(worst.happened / worst.seen - worst.claimed) > 0.02
 
 
 def test_a_loaded_test_goes_on_with_the_same_bits():
-    test, _ = followed(LISTED, seed=0, batches=7, batch=40)
-    other = Frequencies(torch.from_numpy(LISTED))
+    test, _ = followed(CLAIMED, seed=0, batches=7, batch=40)
+    other = Frequencies(torch.from_numpy(CLAIMED))
     other.load_state_dict(test.state_dict())
     assert other.log_evidence == test.log_evidence
     for each in (test, other):
         random = np.random.default_rng(3)
         for _ in range(5):
-            row_V = random.integers(len(LISTED), size=50)
-            each.observe(row_V, outcomes(random, LISTED, row_V))
+            row_V = random.integers(len(CLAIMED), size=50)
+            each.observe(row_V, outcomes(random, CLAIMED, row_V))
     assert other.log_evidence == test.log_evidence
     assert repr(other.state_dict()) == repr(test.state_dict())
 

@@ -8,17 +8,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces
 from gymnasium.envs.classic_control import AcrobotEnv
 
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import ModelMismatch, PgtsError
 from pgts_torch.experiment.diagnostics import metrics
-from pgts_torch.models import CartPole, SimulatorModel, TabularModel
+from pgts_torch.models import SimulatorModel
 from pgts_torch.models.base import Model
-from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, Happened
-from pgts_torch.tabular import TabularMDP
 from tests.forks import on_ranks
 from tests.support import same_values
 
@@ -29,16 +26,16 @@ SMALL = {"num_envs": 4, "horizon": {"type": "fixed", "length": LENGTH}, "seed": 
 class Walk(gymnasium.Env):
     """A row of cells whose last one ends the episode; a step slips to the other side with some probability.
 
-    With a table it publishes P, with a state it is a simulator. What is called a lie is no part of either.
+    `Table` publishes P, `Restored` is a simulator. What `lie` changes is no part of either.
     """
 
     action_space = spaces.Discrete(A)
 
-    def __init__(self, *, slip: float = 0.0, listed: float | None = None, unit: float = 1.0) -> None:
+    def __init__(self, *, slip: float = 0.0, claimed: float | None = None, unit: float = 1.0) -> None:
         self.slip, self.unit, self.position, self.steps = slip, unit, 0, 0
         self.lie: Callable[[Walk], float | None] = lambda env: None
         self.begin = 0
-        self.listed = slip if listed is None else listed
+        self.claimed = slip if claimed is None else claimed
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
@@ -54,7 +51,7 @@ class Walk(gymnasium.Env):
         return self.shown(), self.unit * ends if paid is None else paid, ends, False, {}
 
 
-class Listed(Walk):
+class Table(Walk):
     """With a table."""
 
     observation_space = spaces.Discrete(S)
@@ -69,7 +66,7 @@ class Listed(Walk):
             self.P[s] = {
                 a: [
                     (p, t, float(r), t == S - 1)
-                    for p, (t, r) in zip((1 - self.listed, self.listed), pair, strict=True)
+                    for p, (t, r) in zip((1 - self.claimed, self.claimed), pair, strict=True)
                     if p > 0
                 ]
                 for a, pair in rows.items()
@@ -115,7 +112,7 @@ def teleports_after(steps: int) -> Callable[[Walk], None]:
     return lie
 
 
-KINDS = {"table": (Listed, "softmax"), "simulator": (Restored, {"type": "mlp", "hidden": [8]})}
+KINDS = {"table": (Table, "softmax"), "simulator": (Restored, {"type": "mlp", "hidden": [8]})}
 LIES = {
     "another reward": (pays_after(35, 0.5), r"gave reward 0\.5, (discount 0\.99|an end)"),
     "a reward off by 1e-9": (pays_after(35, 1e-9), r"gave reward 1e-09, (discount 0\.99|an end)"),
@@ -156,21 +153,6 @@ def test_a_step_that_dynamics_rule_out_stops_the_training():
         ModelMismatch, match=r"CartPole-v1 contradicts its dynamics: state \[.*\] under action [01] gave"
     ):
         model.iterate()
-
-
-def test_a_step_may_differ_from_dynamics_in_the_last_bits_only():
-    env = gymnasium.make("CartPole-v1").unwrapped
-    env.reset(seed=0)
-    model = CartPole(env, gamma=0.9)
-    start = model.number(model.vectors([env]))
-    *_, ahead = model.step(model.states(start), torch.tensor([1]))
-    for off, held in ((0.0, 0), (1e-15, 0), (1e-10, CONTRADICTED)):
-        there = model.number(ahead + off)
-        step = Happened(*map(np.array, ([int(start)], [1], [1.0], [0.9], [int(there)], [True])))
-        assert model.outcome_of(step).tolist() == [held]
-    for reward, discount in ((1.0 + 1e-9, 0.9), (1.0, 0.0)):
-        step = Happened(*map(np.array, ([int(start)], [1], [reward], [discount], [int(model.number(ahead))], [True])))
-        assert model.outcome_of(step).tolist() == [CONTRADICTED]
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e6, -1e6, 1 / 3])
@@ -215,7 +197,7 @@ def test_observations_of_dynamics_are_compared_with_those_of_the_environment(mon
 
 
 def test_a_reward_that_is_paid_in_float32_agrees_with_the_one_that_it_was_rounded_from():
-    model = PGTS(lambda: Listed(unit=1 / 3), depth=1, **SMALL)
+    model = PGTS(lambda: Table(unit=1 / 3), depth=1, **SMALL)
     for env in real(model):
         env.lie = lambda env: float(np.float32(1 / 3)) if env.position == S - 1 else None
     model.learn(300)
@@ -223,12 +205,12 @@ def test_a_reward_that_is_paid_in_float32_agrees_with_the_one_that_it_was_rounde
 
 
 def test_an_end_that_the_table_does_not_know_and_a_start_that_it_rules_out_are_contradictions():
-    model = PGTS(Listed, depth=1, **SMALL)
+    model = PGTS(Table, depth=1, **SMALL)
     for env in real(model):
         env.begin = 2
     with pytest.raises(ModelMismatch, match=r"an episode began in state 2; the start distribution of its table has 1"):
         model.iterate()
-    model = PGTS(Listed, depth=1, **SMALL)
+    model = PGTS(Table, depth=1, **SMALL)
     for env in real(model):
         step = env.step
         env.step = lambda action, step=step: (*step(action)[:2], True, False, {})
@@ -258,9 +240,9 @@ def test_a_step_beyond_a_truncation_that_the_simulator_makes_is_a_contradiction(
 
 
 @pytest.mark.fault("probabilities that are not the environment's")
-@pytest.mark.parametrize(("slip", "listed"), [(0.2, 2 / 3), (0.5, 0.4), (0.05, 0.2)])
-def test_probabilities_that_are_wrong_stop_the_training(slip, listed):
-    model = PGTS(lambda: Listed(slip=listed), depth=1, **{**SMALL, "num_envs": 16})
+@pytest.mark.parametrize(("slip", "claimed"), [(0.2, 2 / 3), (0.5, 0.4), (0.05, 0.2)])
+def test_probabilities_that_are_wrong_stop_the_training(slip, claimed):
+    model = PGTS(lambda: Table(slip=claimed), depth=1, **{**SMALL, "num_envs": 16})
     for env in real(model):
         env.slip = slip
     with pytest.raises(
@@ -270,8 +252,8 @@ def test_probabilities_that_are_wrong_stop_the_training(slip, listed):
 
 
 def test_a_rounded_table_is_never_stopped_and_a_true_one_not_even_doubted():
-    for listed in (0.33, 1 / 3):
-        model = PGTS(lambda listed=listed: Listed(slip=listed), depth=1, **{**SMALL, "num_envs": 16})
+    for claimed in (0.33, 1 / 3):
+        model = PGTS(lambda claimed=claimed: Table(slip=claimed), depth=1, **{**SMALL, "num_envs": 16})
         for env in real(model):
             env.slip = 1 / 3
         model.learn(3_000)
@@ -279,7 +261,7 @@ def test_a_rounded_table_is_never_stopped_and_a_true_one_not_even_doubted():
 
 
 def test_a_start_that_is_too_frequent_stops_the_training():
-    class Scattered(Listed):
+    class Scattered(Table):
         def __init__(self) -> None:
             super().__init__()
             self.initial_state_distrib, self.shares = np.full(S, 1 / (S - 1)) * (np.arange(S) < S - 1), [0.2] * 5
@@ -302,7 +284,7 @@ def test_a_start_that_is_too_frequent_stops_the_training():
 
 def test_warn_counts_contradictions_and_warns_once_a_kind_and_off_checks_nothing():
     for mode, said in (("warn", 1), ("off", 0)):
-        model = PGTS(Listed, depth=1, model_check=mode, **SMALL)
+        model = PGTS(Table, depth=1, model_check=mode, **SMALL)
         for env in real(model):
             env.lie = pays_after(0, 0.25)
         with warnings.catch_warnings(record=True) as caught:
@@ -315,7 +297,7 @@ def test_warn_counts_contradictions_and_warns_once_a_kind_and_off_checks_nothing
         else:
             assert "model/contradictions" not in tags
     with pytest.raises(PgtsError, match="model_check is 'loud'; it must be error, warn or off"):
-        PGTS(Listed, model_check="loud")
+        PGTS(Table, model_check="loud")
 
 
 def test_with_sampled_advantages_nothing_is_checked():
@@ -365,24 +347,6 @@ def test_steps_that_a_simulator_only_samples_are_not_checked_which_is_one_warnin
     assert model.model_check.contradictions == 0
 
 
-def test_a_step_is_not_queried_or_an_outcome_or_random():
-    env = Restored()
-    env.reset(seed=0)
-    model = SimulatorModel(Restored, gamma=0.9)
-    start = model.root(env, env.shown())
-    env.step(1)
-    there = model.root(env, env.shown())
-    step = Happened(*map(np.array, ([start], [1], [0.0], [0.9], [there], [True])))
-    no, yes = np.array([False]), np.array([True])
-    assert model.outcome_of(step, query_N=no).tolist() == [NOT_QUERIED]
-    assert model.outcome_of(step, query_N=yes).tolist() == [0]
-    assert model.outcome_of(step, query_N=no).tolist() == [0]
-    random = SimulatorModel(lambda: Restored(slip=0.3), gamma=0.9)
-    start = random.number(random.adapter.get_state(Restored()))
-    step = Happened(*map(np.array, ([start], [1], [0.0], [0.9], [start], [True])))
-    assert random.outcome_of(step).tolist() == [RANDOM]
-
-
 @pytest.mark.parametrize("pack", [lambda x: (x, [x]), lambda x: pickle.dumps({"x": x})])
 def test_a_state_is_the_same_whether_its_numbers_are_of_python_or_of_numpy(pack):
     class Mixed(Restored):
@@ -403,23 +367,6 @@ def test_a_state_is_the_same_whether_its_numbers_are_of_python_or_of_numpy(pack)
         model.learn(800)
 
 
-def test_outcomes_that_look_alike_are_one():
-    rows = [(0.25, 1, 2.0, False), (0.125, 1, 3.0, False), (0.25, 0, 2.0, True), (0.375, 1, 2.0, True)]
-    mdp = TabularMDP.from_transitions([[rows], [[(1.0, 0, 0.0, False)]]], 0.9, start=0)
-    model = TabularModel(mdp)
-    assert model.frequencies()[0].tolist() == [0.25, 0.125, 0.625, 0.0]
-    steps = [(2.0, 0.9, 1), (3.0, 0.9, 1), (2.0, 0.0, 7), (2.0, 0.9, 0), (-0.0, 0.9, 1)]
-    reward_N, discount_N, next_N = map(np.array, zip(*steps, strict=True))
-    zeros = np.zeros(len(steps), dtype=np.int64)
-    assert model.outcome_of(Happened(zeros, zeros, reward_N, discount_N, next_N, zeros > 0)).tolist() == [
-        0,
-        1,
-        2,
-        -1,
-        -1,
-    ]
-
-
 def test_a_saved_check_goes_on_with_the_same_bits(tmp_path):
     def make() -> PGTS:
         return PGTS("FrozenLake-v1", depth=1, **SMALL)
@@ -436,10 +383,10 @@ def test_a_saved_check_goes_on_with_the_same_bits(tmp_path):
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
-@pytest.mark.parametrize("make", [Listed, Restored])
+@pytest.mark.parametrize("make", [Table, Restored])
 def test_ranks_stop_together_whichever_of_them_was_contradicted(make):
     def stopped() -> tuple[int, int, str]:
-        policy = "softmax" if make is Listed else {"type": "mlp", "hidden": [8]}
+        policy = "softmax" if make is Table else {"type": "mlp", "hidden": [8]}
         model = PGTS(make, depth=1, policy=policy, **SMALL)
         if model.ranks.rank == 1:
             for env in real(model):
