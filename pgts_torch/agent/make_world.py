@@ -225,7 +225,7 @@ def _simulator(request: _Request) -> SimulatedWorld:
     numbers, alike = itertools.count(), not request.own_to_each
     make: Callable[[], gymnasium.Env] = lambda: request.fresh(next(numbers)).unwrapped  # noqa: E731
     try:
-        check_snapshots(Setup(request.name, make, adapter, base_actions(env), request.random, alike=alike))
+        check_snapshots(Setup(make, adapter, base_actions(env), request.random, alike=alike))
     except MissingModel as missing:
         raise MissingModel(f"{request.name} cannot serve as a model: {missing}") from missing
     except PgtsError:

@@ -150,7 +150,7 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
     outer = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if is_box else all_actions(space)
     actions = [*map(transforms_of(first).action, outer)]
     random, alike = numpy_stream(seed, "check_model"), not own_to_each(make)
-    setup = Setup(name, lambda: make().unwrapped, adapter, actions, random, alike=alike)
+    setup = Setup(lambda: make().unwrapped, adapter, actions, random, alike=alike)
     try:
         walks = walks_of(setup, continuations, length)
     except PgtsError as error:

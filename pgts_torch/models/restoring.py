@@ -42,7 +42,6 @@ class Setup:
     alike: whether new instances are alike; else each state is restored in an instance of its own.
     """
 
-    name: str
     make: Callable[[], Any]
     adapter: SnapshotAdapter
     actions: Sequence[Any]

@@ -77,7 +77,7 @@ def transforms_of(env: gymnasium.Env) -> Transforms:
     for wrapper in wrappers_of(env):
         kind = _kind(wrapper)
         if kind is None:
-            raise refusal(env, wrapper, "which may change what a step gives")
+            raise _refusal(env, wrapper, "which may change what a step gives")
         if kind:
             hooks[kind].append(getattr(wrapper, kind))
     return Transforms(tuple(hooks["action"]), tuple(hooks["reward"][::-1]), tuple(hooks["observation"][::-1]))
@@ -107,7 +107,7 @@ def check_transforms(env: gymnasium.Env, actions: Sequence[Any], generator: np.r
     changed = different(before, attributes(env))
     for wrapper in hooked:
         if any(name.startswith(f"{type(wrapper).__name__}.") for name in changed):
-            raise refusal(env, wrapper, "which remembers something from step to step")
+            raise _refusal(env, wrapper, "which remembers something from step to step")
     # The environment is in another state by now, and the wrappers have been used in between.
     for (taken, observation, reward), (action, seen, paid) in zip(recorder.inside, outside, strict=True):
         with environment_code():
@@ -117,7 +117,7 @@ def check_transforms(env: gymnasium.Env, actions: Sequence[Any], generator: np.r
         for kind, (now, then) in pairs.items():
             if fingerprint(now) != fingerprint(then):
                 outermost = next((wrapper for wrapper in hooked if _kind(wrapper) == kind), hooked[0])
-                raise refusal(env, outermost, f"which makes different things of the same {kind}")
+                raise _refusal(env, outermost, f"which makes different things of the same {kind}")
 
 
 def _copied(action: Any, observation: Any, reward: Any) -> tuple[Any, Any, Any]:
@@ -166,7 +166,7 @@ def _through(functions: Sequence[Callable[[Any], Any]], value: Any) -> Any:
     return value
 
 
-def refusal(env: gymnasium.Env, wrapper: gymnasium.Wrapper, why: str) -> MissingModel:
+def _refusal(env: gymnasium.Env, wrapper: gymnasium.Wrapper, why: str) -> MissingModel:
     """The error that names a wrapper and the ways out."""
     return MissingModel(
         f"{env_name(env)} is wrapped in {type(wrapper).__name__}, {why}, and a model only knows the environment "
