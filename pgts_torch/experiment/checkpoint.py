@@ -21,7 +21,7 @@ from pgts_torch.experiment.ownership import (
     remove_partial,
     write_mark,
 )
-from pgts_torch.experiment.summary import EndedBy
+from pgts_torch.experiment.summary import EndedBy, first_mistake
 
 
 class Progress(BaseModel, strict=True, extra="forbid"):
@@ -91,11 +91,8 @@ def read(path: Path) -> tuple[Notes, dict[str, Any]]:
     try:
         notes = Notes.model_validate(content.pop("notes", None))
     except ValidationError as error:
-        wrong = error.errors()[0]
-        where = ".".join(map(str, ("notes", *wrong["loc"])))
-        raise PgtsError(
-            f"the checkpoint {path} is not of the form that this version writes: {where}: {wrong['msg']}"
-        ) from error
+        reason = first_mistake(error, "notes")
+        raise PgtsError(f"the checkpoint {path} is not of the form that this version writes: {reason}") from error
     if path.name != checkpoint_name(notes.env_steps):
         raise Damaged(f"{path} is damaged: it is the checkpoint of step {notes.env_steps}")
     return notes, content

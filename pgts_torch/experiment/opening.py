@@ -1,5 +1,6 @@
 """Choose, create and clear the folder of a run, without touching files that no run has written."""
 
+import itertools
 import os
 import sys
 import time
@@ -54,8 +55,7 @@ def claimed(config: Config) -> Iterator[RunLock]:
 def new_folder(config: Config) -> Path:
     """Create a new folder in runs/. Two processes that do this at the same time get different ones."""
     stem = RUNS / f"{config.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-    number = 1
-    while True:
+    for number in itertools.count(1):
         path = stem if number == 1 else stem.with_name(f"{stem.name}-{number}")
         with files.named(f"run.dir {path} cannot be written to"):
             try:
@@ -64,7 +64,7 @@ def new_folder(config: Config) -> Path:
             except FileExistsError:
                 if not path.parent.is_dir():
                     raise
-        number += 1
+    raise AssertionError
 
 
 def _is_edited(config: Config, run: Path, mark: Mark) -> bool:

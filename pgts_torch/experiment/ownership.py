@@ -29,17 +29,10 @@ REPORT_FILE = "report.html"
 CHECKPOINTS = "checkpoints"
 EVENTS_SUFFIX = ".pgts"
 
-_OWN_FILES = (  # in the order in which they are removed: a half cleared run is an unfinished one
-    SUMMARY_FILE,
-    METRICS_FILE,
-    FAILURE_FILE,
-    VERSIONS_FILE,
-    BEST_FILE,
-    PICTURE_FILE,
-    REPORT_FILE,
-    MARK_FILE,
-    CONFIG_FILE,
-)
+_RESULTS = (SUMMARY_FILE, METRICS_FILE, FAILURE_FILE, VERSIONS_FILE, BEST_FILE, PICTURE_FILE, REPORT_FILE)
+"""In the order in which they are removed: a half cleared run is an unfinished one."""
+
+_OWN_FILES = (*_RESULTS, MARK_FILE, CONFIG_FILE)
 _CHECKPOINT = re.compile(r"\d{12,}\.pt")
 _EVENTS = re.compile(rf"events\.out\.tfevents\.\d+\..+{re.escape(EVENTS_SUFFIX)}")
 _PARTIAL = re.compile(rf"\.(.+)\.\d+{re.escape(files.PARTIAL)}")
@@ -159,7 +152,7 @@ def is_events(name: str) -> bool:
 def clear(run: Path, mark: Mark) -> list[str]:
     """Remove the files of a run except its lock and its mark; returns the names of the files that stay."""
     remove_partial(run)
-    for path in [run / name for name in _OWN_FILES if name not in (MARK_FILE, CONFIG_FILE)] + checkpoints(run):
+    for path in [run / name for name in _RESULTS] + checkpoints(run):
         _remove(path)
     clear_events(run)
     with suppress(OSError):  # missing, or files of the user are in it

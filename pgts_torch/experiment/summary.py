@@ -67,8 +67,13 @@ def from_json(raw: bytes) -> Summary:
     try:
         return _SUMMARY.validate_json(raw, strict=True)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise PgtsError(f"{'.'.join(map(str, first['loc'])) or 'its JSON'}: {first['msg']}") from error
+        raise PgtsError(first_mistake(error, "summary")) from error
+
+
+def first_mistake(error: ValidationError, what: str) -> str:
+    """The first of the mistakes that pydantic has found in `what`, with the name of the value."""
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, (what, *first['loc'])))}: {first['msg']}"
 
 
 def describe(summary: Summary) -> str:

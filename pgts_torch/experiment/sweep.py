@@ -3,12 +3,13 @@
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import TypeAdapter, ValidationError
 
 from pgts_torch import files
 from pgts_torch.config import Config, load
@@ -191,10 +192,9 @@ def _targets(out: Path) -> tuple[Path, Path]:
 
 def _is_table(raw: bytes) -> bool:
     try:
-        content = json.loads(raw)
-    except (ValueError, RecursionError):
+        return bool(TypeAdapter(Sweep).validate_json(raw))
+    except ValidationError:
         return False
-    return isinstance(content, dict) and {each.name for each in fields(Sweep)} <= content.keys()
 
 
 def _summary(run: Run) -> "Summary | None":

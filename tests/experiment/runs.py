@@ -69,3 +69,22 @@ def left(folder: Path) -> dict[str, Any]:
         line.pop("charts/SPS", None)
     files |= {"summary": {name: summary[name] for name in summary if name not in ("seconds", "run")}, "metrics": lines}
     return files | {"names": sorted(path.name for path in folder.iterdir())}
+
+
+def tree(folder: Path) -> dict[str, bytes | str | None]:
+    """Every entry of a folder, with its bytes, or where a symbolic link leads; None: a folder."""
+    return {
+        str(path.relative_to(folder)): os.readlink(path)
+        if path.is_symlink()
+        else path.read_bytes()
+        if path.is_file()
+        else None
+        for path in folder.rglob("*")
+    }
+
+
+def put(folder: Path, **files: str) -> None:
+    for name, content in files.items():
+        path = folder / name.replace("__", "/").replace("_", ".")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content)

@@ -50,6 +50,7 @@ def test_a_run_that_meets_what_is_not_finite_keeps_its_checkpoints_writes_what_i
     assert not (folder / "summary.json").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.fault("environment raises an error")
 def test_a_run_whose_environment_raises_writes_down_where_and_what(tmp_path, monkeypatch, capsys):
     step, calls = TabularVectorEnv.step, iter(range(10**6))

@@ -1,14 +1,12 @@
 """Only files that a run has made are ever replaced or removed, whatever else lies in its folder."""
 
 import os
-import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from pgts_torch import PGTS, EvalCallback
 from pgts_torch.cli.main import main
 from pgts_torch.config import Config, dump, load
 from pgts_torch.errors import PgtsError
@@ -16,31 +14,12 @@ from pgts_torch.experiment import checkpoint, opening, ownership, run
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.ownership import MARK_FILE
 from pgts_torch.experiment.tracking import RunFolder, read_metrics
-from tests.forks import ForkedCommand
+from tests.experiment.runs import put, tree
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
 TINY = ["--rollout.num_envs=1", "--rollout.horizon.length=5", "--search.depth=0", "--eval.episodes=1"]
 SHORT = [*TINY, "--total_steps=15", "--log.checkpoint_every=1", "--run.tensorboard=false"]
-
-
-def tree(folder: Path) -> dict[str, bytes | str | None]:
-    """Every entry of a folder, with its bytes, or where a symbolic link leads; None: a folder."""
-    return {
-        str(path.relative_to(folder)): os.readlink(path)
-        if path.is_symlink()
-        else path.read_bytes()
-        if path.is_file()
-        else None
-        for path in folder.rglob("*")
-    }
-
-
-def put(folder: Path, **files: str) -> None:
-    for name, content in files.items():
-        path = folder / name.replace("__", "/").replace("_", ".")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content)
 
 
 @pytest.fixture
@@ -112,6 +91,7 @@ def test_a_run_that_starts_over_keeps_and_names_the_files_of_the_user(unfinished
     assert all(checkpoint.read(path) for path in ownership.checkpoints(folder))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_that_is_overwritten_leaves_nothing_of_the_one_before(here, capsys):
     run.train(load(None, [*SHORT, "--run.dir=run", "--run.tensorboard=true", "--eval.every=5", "--eval.keep_best"]))
     (here / "run" / ".metrics.jsonl.77.partial").write_text("{")
@@ -307,62 +287,3 @@ def test_a_lock_works_where_there_is_no_fcntl(here, monkeypatch):
         lock.check()
         with pytest.raises(PgtsError, match=f"^run.dir run is in use by the process {os.getpid()}$"):
             RunLock(Path("run"))
-
-
-# Outputs with names of the user's choice
-
-
-@pytest.fixture(scope="module")
-def model() -> PGTS:
-    return PGTS("pgts/Ladder-v0", depth=0, num_envs=1)
-
-
-@pytest.mark.fault("file of the user under the name of an output")
-def test_a_model_replaces_a_model_and_nothing_else(model, here):
-    put(here, thesis_tex="mine")
-    (here / "link.pt").symlink_to("thesis.tex")
-    for name in ("thesis.tex", "link.pt"):
-        with pytest.raises(PgtsError, match=f"^{name} exists and is not a model that pgts_torch has saved: move it"):
-            model.save(name)
-        with pytest.raises(PgtsError, match=f"^{name} exists and is not a model"):
-            EvalCallback(every=1, best_path=name)
-    assert (here / "thesis.tex").read_text() == "mine"
-    os.mkfifo(here / "pipe.pt")
-    for name, kind in {"pipe.pt": "pipe", ".": "folder", "/dev/null": "device"}.items():
-        with pytest.raises(PgtsError, match=rf"^{name} is a {kind}; it must be a file, or not exist$"):
-            model.save(name)
-    (here / "empty.pt").touch()
-    (here / "to-new.pt").symlink_to("new.pt")
-    for name in ("empty.pt", "empty.pt", "to-new.pt"):
-        model.save(name)
-    assert (here / "to-new.pt").is_symlink()
-    assert PGTS.load("new.pt").num_env_steps == 0
-
-
-@pytest.mark.fault("file of the user under the name of an output")
-def test_a_page_replaces_a_page_and_nothing_else(here, capsys):
-    run.train(load(None, [*SHORT, "--run.dir=run"]))
-    put(here, thesis_html="<!DOCTYPE html>mine", run__report_html="mine")
-    for arguments, name in ((["--out=thesis.html"], "thesis.html"), ([], "run/report.html")):
-        assert main(["report", "run", *arguments]) == 2
-        assert f"error: {name} exists and is not a page of pgts report: move it away" in capsys.readouterr().err
-    assert (here / "run" / "report.html").read_text() == "mine"
-    for _ in range(2):
-        assert main(["report", "run", "--out=new.html"]) == 0
-
-
-@pytest.mark.fault("file of the user under the name of an output")
-@pytest.mark.parametrize("name", ["table.json", "curves.png"])
-def test_a_sweep_replaces_its_own_table_and_picture_and_nothing_else(name, here, capsys, monkeypatch):
-    monkeypatch.setattr(subprocess, "Popen", ForkedCommand)
-    put(here, out__x="mine")
-    (here / "out" / name).write_text('{"rows": []}')
-    before = tree(here)
-    small = ["--depths=0", *(each for each in TINY if "depth" not in each), "--total_steps=5"]
-    sweep = ["sweep", "--out=out", "--seeds=1", *small, "--run.tensorboard=false"]
-    assert main(sweep) == 2
-    assert f"error: out/{name} exists and is not the " in capsys.readouterr().err
-    assert tree(here) == before
-    (here / "out" / name).unlink()
-    for _ in range(2):
-        assert main(sweep) == 0

@@ -14,7 +14,6 @@ from pgts_torch.cli.main import main
 from pgts_torch.envs import vector
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.report import facts
-from pgts_torch.experiment.report import page as page_module
 from pgts_torch.experiment.report.curves import draw, panels
 from pgts_torch.experiment.report.page import image, tiles, typeset, write
 
@@ -70,12 +69,6 @@ def train(folder: Path, *arguments: str) -> int:
 def run(finished: Path, tmp_path: Path, undrawn: None) -> Path:
     """A finished run that a test may damage."""
     return shutil.copytree(finished, tmp_path / "run", ignore=lambda *_: ["report.html"])
-
-
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Curves stay empty, which takes no time."""
-    monkeypatch.setattr(page_module, "image", lambda figure, **options: DRAWN)
 
 
 @pytest.fixture(scope="module")
@@ -308,16 +301,17 @@ def test_the_command_prints_the_path_or_the_data(run, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "mistake"),
     [
-        (["none"], "argument RUN_DIR: 'none' is not a folder"),
-        (["."], "argument RUN_DIR: '.' is not the folder of a run: it has no config.yaml"),
-        (["run", "--out", "config.yaml"], "argument --out: 'config.yaml' is not a file that ends in .html"),
-        (["run", "--out", "none/x.html"], "argument --out: 'none/x.html': 'none' is not a folder"),
+        (["none"], "'none' is not a folder"),
+        (["."], "'.' is not the folder of a run"),
+        (["run", "--out", "config.yaml"], "--out: 'config.yaml'"),
+        (["run", "--out", "none/x.html"], "--out: 'none/x.html'"),
     ],
 )
 def test_a_mistake_is_one_line_with_exit_code_2(run, monkeypatch, capsys, arguments, mistake):
     monkeypatch.chdir(run.parent)
     assert main(["report", *arguments]) == 2
-    assert capsys.readouterr() == ("", f"error: {mistake} (see pgts report --help)\n")
+    [line] = capsys.readouterr().err.splitlines()
+    assert mistake in line
     assert not list(run.parent.rglob("*.html"))
 
 

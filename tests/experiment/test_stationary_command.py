@@ -45,14 +45,6 @@ def answer(capsys: pytest.CaptureFixture[str], *arguments: str) -> Any:
     return json.loads(out)
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert main(["stationary", *arguments]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert len(err.splitlines()) == 1
-    return err.removeprefix("error: ").rstrip("\n")
-
-
 @pytest.fixture
 def npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The ladder of four states in a file of the working directory."""
@@ -142,36 +134,28 @@ def test_a_long_table_shows_the_depths_at_which_something_changes(tmp_path, monk
     assert [line.split()[0] for line in out.splitlines()[5:8]] == ["0", "65", "Depths"]
 
 
-HELP = "(see pgts stationary --help)"
-MOST = "at most 1048576 are enumerated: take at most"
 MISTAKES = {
-    "": f"the following arguments are required: WHAT {HELP}",
-    "laddr": f"argument WHAT: 'laddr' is not an MDP; did you mean ladder? {HELP}",
-    "xyz": f"argument WHAT: 'xyz' is not an MDP; choose from {', '.join(STATIONARY_OPTIONS)} {HELP}",
-    "none.npz": f"argument WHAT: 'none.npz' is not a file {HELP}",
-    "tightrope --n 3": f"--n does not apply to tightrope, which takes --gamma, --start {HELP}",
-    "ladder --mdp-seed 3": f"--mdp-seed does not apply to ladder, which takes --n, --gamma, --start {HELP}",
-    "four.npz --gamma 0.5": f"--gamma does not apply to four.npz, which takes --start {HELP}",
-    "ladder --n 0": f"argument --n: '0' is not a whole number >= 1 and below 2**63 {HELP}",
-    "ladder --gamma nan": f"argument --gamma: 'nan' is not a number in [0, 1] {HELP}",
-    "ladder --gamma 1.5": f"argument --gamma: '1.5' is not a number in [0, 1] {HELP}",
-    "ladder --start first": "argument --start: 'first' is neither a whole number >= 0 and below 2**63 nor uniform "
-    f"{HELP}",
-    "grid --traps 1,x": f"argument --traps: 'x' is not a whole number >= 0 and below 2**63 {HELP}",
-    "ladder --start 5": "start state 5 does not exist; states are 0 to 4",
-    "ladder --gamma 1": "gamma is 1 and from state 0 some policy never ends: it has no finite value; "
-    "take a gamma below 1",
-    "random --branching 11": "branching is 11; it must be between 1 and num_states = 10",
-    "grid --traps 8": "state 8 is both goal and trap",
-    "grid --n 4": f"--n 4 gives 4,294,967,296 = 4^16 deterministic policies; {MOST} 10 states with 4 actions, "
-    "as --n 3 does",
-    "deep_sea --n 5": f"--n 5 gives 33,554,432 = 2^25 deterministic policies; {MOST} 20 states with 2 actions, "
-    "as --n 4 does",
-    "ladder --n 1000000000000": "--n 1000000000000 gives about 10^301029995664 = 2^1000000000000 deterministic "
-    f"policies; {MOST} 20 states with 2 actions, as --n 20 does",
-    "random --states 13 --actions 3": f"1,594,323 = 3^13 deterministic policies; {MOST} 12 states with 3 actions",
-    "broken.npz": "broken.npz: array 'gamma' is missing; it holds P, R",
-    "large.npz": f"2,097,152 = 2^21 deterministic policies; {MOST} 20 states with 2 actions",
+    "": "WHAT",
+    "laddr": "'laddr' is not an MDP; did you mean ladder?",
+    "xyz": ", ".join(STATIONARY_OPTIONS),
+    "none.npz": "'none.npz' is not a file",
+    "tightrope --n 3": "--n does not apply to tightrope, which takes --gamma, --start",
+    "ladder --mdp-seed 3": "--mdp-seed does not apply to ladder",
+    "four.npz --gamma 0.5": "--gamma does not apply to four.npz",
+    "ladder --n 0": "--n: '0'",
+    "ladder --gamma 1.5": "--gamma: '1.5'",
+    "ladder --start first": "--start: 'first'",
+    "grid --traps 1,x": "--traps: 'x'",
+    "ladder --start 5": "start state 5",
+    "ladder --gamma 1": "gamma is 1",
+    "random --branching 11": "branching is 11",
+    "grid --traps 8": "state 8",
+    "grid --n 4": "--n 4 gives 4,294,967,296 = 4^16 deterministic policies; at most 1048576 are enumerated: take at "
+    "most 10 states with 4 actions, as --n 3 does",
+    "ladder --n 1000000000000": "as --n 20 does",
+    "random --states 13 --actions 3": "take at most 12 states with 3 actions",
+    "broken.npz": "broken.npz: array 'gamma' is missing",
+    "large.npz": "take at most 20 states with 2 actions",
 }
 
 
@@ -179,7 +163,11 @@ MISTAKES = {
 def test_a_mistake_is_one_line_with_exit_code_2(arguments, npz, capsys):
     np.savez("broken.npz", P=np.eye(2)[:, None], R=np.zeros((2, 1)))
     np.savez("large.npz", P=np.full((21, 2, 21), 1 / 21), R=np.zeros((21, 2)), gamma=0.9)
-    assert refusal(capsys, *arguments.split()) == MISTAKES[arguments]
+    assert main(["stationary", *arguments.split()]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    [mistake] = err.splitlines()
+    assert MISTAKES[arguments] in mistake
 
 
 def test_the_help_tells_the_names_and_the_arrays_of_a_file(capsys):

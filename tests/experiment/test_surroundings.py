@@ -89,5 +89,5 @@ def test_without_tensorboard_a_run_says_what_to_do_before_it_writes_or_goes_on_w
 
 
 def test_a_package_that_is_not_installed_has_no_version(monkeypatch):
-    monkeypatch.setattr("pgts_torch.experiment.tracking._PACKAGES", ("torch", "no-such-package"))
+    monkeypatch.setattr("pgts_torch.experiment.tracking.PACKAGES", ("torch", "no-such-package"))
     assert versions()["no-such-package"] is None

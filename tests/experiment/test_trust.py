@@ -54,6 +54,7 @@ def test_a_saved_model_imports_the_module_of_its_environment_only_where_it_is_tr
     assert trace.exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.fault("saved file that names a module")
 def test_the_folder_of_a_run_imports_a_module_only_where_it_is_trusted(here, capsys):
     assert main(["train", f"--env.id={ENV}", *SHORT]) == 0  # typed by the user, who so consents
