@@ -33,7 +33,7 @@ class Cart(gymnasium.envs.classic_control.CartPoleEnv):
 
 
 class Parts(gymnasium.Env):
-    """Shows a dictionary; it can be restored."""
+    """Its observations are dictionaries; it can be restored."""
 
     action_space = spaces.Discrete(2)
     observation_space = spaces.Dict({"place": spaces.Discrete(9), "map": spaces.Box(0, 1, (2, 2))})
@@ -41,13 +41,13 @@ class Parts(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.place = 0
-        return self.shown(), {}
+        return self.observation(), {}
 
     def step(self, action):
         self.place = min(self.place + action, 8)
-        return self.shown(), 1.0, self.place == 8, False, {}
+        return self.observation(), 1.0, self.place == 8, False, {}
 
-    def shown(self) -> dict[str, object]:
+    def observation(self) -> dict[str, object]:
         return {"place": self.place, "map": np.full((2, 2), self.place / 8, np.float32)}
 
     def get_state(self):
@@ -64,13 +64,13 @@ class Unknown(gymnasium.Env):
 
 
 class Together(VectorEnv):
-    """Copies that cannot be told apart."""
+    """Environments of which single ones cannot be reached."""
 
     num_envs, metadata = 3, {"autoreset_mode": AutoresetMode.DISABLED}
     single_observation_space, single_action_space = Unknown.observation_space, Unknown.action_space
 
 
-def copies_of(make: Callable[[], gymnasium.Env], num_envs: int = 3) -> SyncVectorEnv:
+def vector_of(make: Callable[[], gymnasium.Env], num_envs: int = 3) -> SyncVectorEnv:
     return SyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
 
 
@@ -83,19 +83,19 @@ def world_of(env: object, **options) -> ModelWorld:
 WORLDS = {
     "tabular": lambda: world_of("pgts/Ladder-v0"),
     "tabular, from P": lambda: world_of("FrozenLake-v1"),
-    "simulated": lambda: world_of(copies_of(Cart)),
-    "simulated, by parts": lambda: world_of(copies_of(Parts), observation_key="map"),
+    "simulated": lambda: world_of(vector_of(Cart)),
+    "simulated, by parts": lambda: world_of(vector_of(Parts), observation_key="map"),
     **{name: lambda name=name: world_of(name) for name in DYNAMICS},
 }
 
 
 def numbered(world: World, observation: np.ndarray) -> Tensor:
-    """The numbers of the states that the copies are in now."""
+    """The numbers of the states that the environments are in now."""
     return world.numbers(world.read(observation, world.encode(observation)))
 
 
 def walked(world: World, steps: int) -> tuple[list[Tensor], list[Tensor]]:
-    """What the copies show, encoded, and the numbers of their states, in each step of a random walk."""
+    """The observations of the environments, encoded, and the numbers of their states, in each step of a random walk."""
     observation, _ = world.env.reset(seed=1)
     seen, numbers = [world.encode(observation)], [numbered(world, observation)]
     for action_B in torch.randint(world.num_actions, (steps, 3), generator=stream(0, "walk")):
@@ -117,12 +117,12 @@ def walked(world: World, steps: int) -> tuple[list[Tensor], list[Tensor]]:
         (lambda: world_of("Taxi-v4"), TabularWorld),
         (lambda: world_of("pgts/Grid-v0", plain=True), TabularWorld),
         *((lambda name=name: world_of(name), DynamicsWorld) for name in DYNAMICS),
-        (lambda: world_of(copies_of(Cart)), SimulatedWorld),
+        (lambda: world_of(vector_of(Cart)), SimulatedWorld),
         (lambda: world_of("CartPole-v1", plain=True), World),
-        (lambda: world_of(copies_of(Unknown), plain=True), World),
+        (lambda: world_of(vector_of(Unknown), plain=True), World),
     ],
 )
-def test_what_can_be_asked_about_an_environment_decides_its_world(make, kind):
+def test_what_is_known_of_an_environment_decides_its_world(make, kind):
     world = make()
     assert type(world) is kind
     assert (world.model is None) == (kind is World)
@@ -131,13 +131,13 @@ def test_what_can_be_asked_about_an_environment_decides_its_world(make, kind):
 
 @pytest.mark.parametrize("id", ["CartPole-v1", "CliffWalking-v1"])
 def test_the_states_of_a_rollout_are_numbered_at_once_as_one_after_the_other(id, monkeypatch):
-    world, other, asked = world_of(id), world_of(id), []
+    world, other, counts = world_of(id), world_of(id), []
     policy = make_policy(MLP(), world, seed=0)
     monkeypatch.setattr(
-        world, "numbers", lambda read_N: asked.append(len(read_N)) or type(world).numbers(world, read_N)
+        world, "numbers", lambda read_N: counts.append(len(read_N)) or type(world).numbers(world, read_N)
     )
     made = rollout(world, policy, FixedHorizon(length=6), seed=0, names=("test",), generator=stream(0, "test"))
-    assert asked == [7 * 3]
+    assert counts == [7 * 3]
     observation, _ = other.env.reset(seed=seed_sequence(0, "test", "env").generate_state(3).tolist())
     for state_B, action_B in zip(made.state_TB, made.action_TB, strict=True):
         assert torch.equal(numbered(other, observation), state_B)
@@ -163,25 +163,25 @@ def test_an_update_sees_what_was_acted_on_and_not_what_the_model_makes_of_the_st
     assert not torch.equal(remade, acted[0])
 
 
-def test_changed_constants_are_honoured_and_must_be_the_same_in_all_copies():
+def test_changed_constants_are_used_and_must_be_the_same_in_all_environments():
     world = world_of("CartPole-v1", sutton_barto_reward=True)
     observation, _ = world.env.reset(seed=0)
     assert float(world.model.outcomes(numbered(world, observation)).reward_NA.max()) == 0.0
-    copies = world_of("CartPole-v1").env
-    copies.envs[1].unwrapped.gravity = 1.6
-    observation, _ = copies.reset(seed=0)
+    envs = world_of("CartPole-v1").env
+    envs.envs[1].unwrapped.gravity = 1.6
+    observation, _ = envs.reset(seed=0)
     with pytest.raises(
         PgtsError, match=r"environment 1 of CartPole-v1 has gravity = 1\.6, where another instance has 9\.8"
     ):
-        numbered(world_of(copies), observation)
+        numbered(world_of(envs), observation)
 
 
-def test_actions_are_those_of_the_copies_also_in_a_simulator():
+def test_actions_are_those_of_the_environments_also_in_a_simulator():
     def mirrored() -> gymnasium.Env:
         return gymnasium.wrappers.TransformAction(Cart(), lambda a: 1 - a, spaces.Discrete(2))
 
     following = []
-    for world in (world_of(copies_of(Cart)), world_of(copies_of(mirrored))):
+    for world in (world_of(vector_of(Cart)), world_of(vector_of(mirrored))):
         observation, _ = world.env.reset(seed=3)
         answer = world.model.outcomes(numbered(world, observation)[:1])
         following.append(world.observe(answer.child_NAK[0, :, 0]))
@@ -194,18 +194,13 @@ def test_actions_are_those_of_the_copies_also_in_a_simulator():
     [
         (lambda: world_of("FrozenLake-v1", action_repeat=2), "action_repeat is 2; in a table it must be 1"),
         (lambda: world_of("CartPole-v1", plain=True, action_repeat=2), "action_repeat is 2; without a model it must"),
-        (lambda: world_of("CartPole-v1", action_repeat=0), "action_repeat is 0"),
         (lambda: world_of("CartPole-v1", observation_key="x"), "they have no part 'x'"),
         (lambda: world_of("CartPole-v1", plain=True, observation_key="x"), "they have no part 'x'"),
-        (lambda: world_of(copies_of(Parts)), "the observations of Parts are dictionaries of .*: set observation_key"),
-        (lambda: world_of(copies_of(Parts), observation_key="x"), "no part 'x'; they have"),
+        (lambda: world_of(vector_of(Parts)), "the observations of Parts are dictionaries of .*: set observation_key"),
+        (lambda: world_of(vector_of(Parts), observation_key="x"), "no part 'x'; they have"),
         (lambda: world_of("pgts/Ladder-v0", observation_key="x"), "they have no part 'x'"),
-        (lambda: world_of(3), "the environment is 3; it must be a Gymnasium id, an environment, a function"),
-        (lambda: world_of(Cart()), "has no spec to make another instance from: give a function that makes one"),
         (lambda: world_of(SyncVectorEnv([Cart])), "the environment resets by"),
-        (lambda: cells.world_of("Pendulum-v1"), "the actions of Pendulum-v1 are continuous, Box"),
         (lambda: world_of("CartPole-v1", num_envs=0), "num_envs is 0"),
-        (lambda: world_of("NoSuch-v0"), "NoSuch-v0 cannot be made"),
     ],
 )
 def test_what_does_not_make_a_world_is_refused_by_name(make, message):
@@ -215,7 +210,7 @@ def test_what_does_not_make_a_world_is_refused_by_name(make, message):
 
 def test_an_environment_that_cannot_be_restored_needs_a_model():
     with pytest.raises(MissingModel, match="give Unknown the methods get_state"):
-        world_of(copies_of(Unknown))
+        world_of(vector_of(Unknown))
     with pytest.raises(MissingModel, match="a simulator needs a SyncVectorEnv"):
         world_of(Together())
 
@@ -224,7 +219,7 @@ def test_an_environment_that_cannot_be_restored_needs_a_model():
 
 
 @pytest.mark.parametrize("kind", WORLDS)
-def test_a_numbered_state_is_observed_as_the_copies_showed_it(kind):
+def test_a_numbered_state_is_observed_as_in_the_environment(kind):
     world = WORLDS[kind]()
     seen, numbers = walked(world, 6)
     for k, (seen_B, number_B) in enumerate(zip(seen, numbers, strict=True)):
@@ -271,7 +266,7 @@ def test_observations_that_the_environment_cannot_make_are_refused(kind):
 
 
 def by_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worlds, "_dynamics", lambda sought: None)
+    monkeypatch.setattr(worlds, "CLASSIC", ())
 
 
 @pytest.mark.parametrize("repeat", [1, 3])
@@ -311,7 +306,7 @@ def test_a_simulator_repeats_random_actions_as_the_key_says():
 
 
 @pytest.mark.parametrize("depth", [0, 2])
-def test_an_iteration_is_the_same_bit_for_bit_whether_dynamics_or_a_simulator_is_asked(depth, monkeypatch):
+def test_an_iteration_is_the_same_bit_for_bit_with_dynamics_and_with_a_simulator(depth, monkeypatch):
     fast = cartpole(depth=depth)
     by_simulator(monkeypatch)
     slow = cartpole(depth=depth)
@@ -368,7 +363,7 @@ def test_training_with_a_lookahead_is_reproducible_and_a_loaded_model_goes_on_bi
     assert not same_weights(whole, twin)
 
 
-def test_each_iteration_numbers_anew():
+def test_each_iteration_numbers_its_states_from_0():
     model = cartpole()
     for k in range(3):
         seen = model.iterate()
@@ -382,7 +377,6 @@ def test_repeated_actions_prove_nothing_and_single_ones_do():
         assert cartpole(action_repeat=repeated).world.model.highest_value == pytest.approx(highest)
 
 
-@pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_cartpole_is_learned_with_a_lookahead_of_two_steps_and_not_without_training():
     model = PGTS("CartPole-v1", depth=2, num_envs=8, seed=0, horizon={"type": "fixed", "length": 200})

@@ -90,9 +90,9 @@ def test_every_step_is_gymnasiums(variant, device):
     torch.testing.assert_close(next_ND, following, **tolerance)
     torch.testing.assert_close(reward_N, reward, **tolerance)
     assert torch.equal(discount_N, torch.full_like(reward, GAMMA).masked_fill(terminated, 0.0))
-    shown = model.observe(next_ND)
-    assert shown.dtype == torch.float32
-    torch.testing.assert_close(shown, observation, rtol=0 if exact else 2e-7, atol=0 if exact else 1e-12)
+    observed = model.observe(next_ND)
+    assert observed.dtype == torch.float32
+    torch.testing.assert_close(observed, observation, rtol=0 if exact else 2e-7, atol=0 if exact else 1e-12)
     if not isinstance(model, Pendulum):
         assert 0 < int(terminated.sum()) < 2_000
     # Other physics would be noticed.
@@ -114,7 +114,7 @@ OTHER = {
 
 @pytest.mark.parametrize("name", KINDS)
 def test_every_constant_that_a_step_reads_is_read_from_the_instance(name):
-    """Gymnasium itself is asked which attributes a step reads."""
+    """Gymnasium itself says which attributes a step reads."""
     base, read = make(name).unwrapped, set()
 
     class Spied(type(base)):
@@ -124,7 +124,7 @@ def test_every_constant_that_a_step_reads_is_read_from_the_instance(name):
 
     base.reset(seed=0)
     if name == "MountainCar-v0":
-        base.state = (0.499, 0.07)  # only beyond the goal is its velocity asked for
+        base.state = (0.499, 0.07)  # only beyond the goal is its velocity read
     base.__class__ = Spied
     for action in (0, 1) if name != "Pendulum-v1" else (np.ones(1, np.float32),):
         base.step(action)

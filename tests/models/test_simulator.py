@@ -1,4 +1,4 @@
-"""A simulator as a model: the truth of tables where there are some, each question asked once, chance in the keys."""
+"""A simulator as a model: the truth of tables where there are some, each pair queried once, chance in the keys."""
 
 import copy
 import math
@@ -12,7 +12,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.errors import PgtsError
 from pgts_torch.models import SimulatorModel, TabularModel
 from pgts_torch.models.actions import all_actions, grid_actions, sampled_actions
 from pgts_torch.models.environments import EnvSource
@@ -20,7 +20,7 @@ from pgts_torch.models.snapshots import generator_state
 from pgts_torch.search import Topology, expectimax, sampled
 from pgts_torch.seeding import sample_keys, stream
 from pgts_torch.tabular import TabularMDP, exact
-from tests.models.corridors import Bare, Broken, Corridor
+from tests.models.corridors import Broken, Corridor
 from tests.support import outcomes_of
 
 DRAWS = 400
@@ -80,14 +80,14 @@ def test_a_search_without_end_meets_each_state_of_the_cliff_once():
     assert sorted(states) == [*range(37), 47]
 
 
-def test_drawn_outcomes_have_the_frequencies_of_the_table():
+def test_sampled_outcomes_have_the_frequencies_of_the_table():
     id = "FrozenLake-v1"
     mdp, model = table_of(gymnasium.make(id), 0.9), SimulatorModel(id, gamma=0.9)
     number_S = every_state(id, model, 16)
     statistic, freedom = 0.0, 0
     for s, a in [(0, 0), (6, 2), (14, 2), (14, 1), (10, 3)]:
-        drawn = model.sample(number_S[s].expand(DRAWS), torch.full((DRAWS,), a), key_N=keys(DRAWS, 16 * a + s))
-        seen = list(zip(model.observations(drawn.next_state_N).tolist(), drawn.discount_N.tolist(), strict=True))
+        sample = model.sample(number_S[s].expand(DRAWS), torch.full((DRAWS,), a), key_N=keys(DRAWS, 16 * a + s))
+        seen = list(zip(model.observations(sample.next_state_N).tolist(), sample.discount_N.tolist(), strict=True))
         expected = outcomes_of(mdp, s, a)
         assert set(seen) <= set(expected)
         statistic += sum((seen.count(what) - DRAWS * p) ** 2 / (DRAWS * p) for what, p in expected.items())
@@ -136,7 +136,7 @@ def test_truncation_keeps_the_discount_and_termination_ends_it():
 # Calls
 
 
-def test_a_search_asks_the_simulator_once_for_each_state_and_action():
+def test_a_search_queries_the_simulator_once_for_each_state_and_action():
     model = SimulatorModel("CliffWalking-v1", gamma=0.9)
     root_B = model.roots([standing_in("CliffWalking-v1", 36), standing_in("CliffWalking-v1", 36)])
     topology = Topology(model)
@@ -151,8 +151,8 @@ def test_a_search_asks_the_simulator_once_for_each_state_and_action():
     assert model.simulator_steps == first.model_calls
 
 
-@pytest.mark.parametrize(("most_bytes", "asked_again"), [(10**9, False), (0, True)])
-def test_answers_outlive_the_numbers_of_states_unless_they_take_much_memory(most_bytes, asked_again, monkeypatch):
+@pytest.mark.parametrize(("most_bytes", "is_queried_again"), [(10**9, False), (0, True)])
+def test_answers_outlive_the_numbers_of_states_unless_they_take_much_memory(most_bytes, is_queried_again, monkeypatch):
     monkeypatch.setattr("pgts_torch.models.answers._MOST_BYTES", most_bytes)
     model, answers, steps = SimulatorModel("CliffWalking-v1", gamma=0.9), [], []
     for state in (0, 36, 36):  # the second search leads to states that the first one has numbered otherwise
@@ -165,11 +165,11 @@ def test_answers_outlive_the_numbers_of_states_unless_they_take_much_memory(most
     assert torch.equal(answers[1], alone)
     assert torch.equal(answers[2], alone)
     assert not torch.equal(answers[0], alone)
-    assert (steps[2] > steps[1]) == asked_again
+    assert (steps[2] > steps[1]) == is_queried_again
 
 
 class Panorama(Corridor):
-    """Its state takes two bytes, and what it shows a million."""
+    """Its state takes two bytes, and its observation a million."""
 
     def __init__(self):
         super().__init__(slip=0.0)
@@ -179,14 +179,14 @@ class Panorama(Corridor):
         return np.full((1000, 1000), self.position, np.uint8)
 
 
-def test_what_states_show_counts_as_memory(monkeypatch):
+def test_remembered_observations_count_as_memory(monkeypatch):
     monkeypatch.setattr("pgts_torch.models.answers._MOST_BYTES", 2**20)
-    for make, asked_again in ((lambda: Corridor(slip=0.0), False), (Panorama, True)):
+    for make, is_queried_again in ((lambda: Corridor(slip=0.0), False), (Panorama, True)):
         model = SimulatorModel(make, gamma=0.9)
         for _ in range(2):
             model.clear()
             model.outcomes(model.roots([reset(make(), 0)]))
-        assert model.simulator_steps == (4 if asked_again else 2)
+        assert model.simulator_steps == (4 if is_queried_again else 2)
 
 
 def test_numbers_do_not_depend_on_what_is_remembered():
@@ -214,23 +214,23 @@ def test_observations_that_are_made_late_are_those_that_steps_give(id):
     base: Any = env.unwrapped
     state = model.root(env, observation)
     for action in (0, 2, 1, 2, 3, 2, 2, 5, 2, 0, 2):
-        drawn = model.sample(torch.tensor([state]), torch.tensor([action]), key_N=torch.tensor([5]))
+        sample = model.sample(torch.tensor([state]), torch.tensor([action]), key_N=torch.tensor([5]))
         model.adapter.seed(base, 5)
         observation, reward, terminated, *_ = base.step(action)
-        state = int(drawn.next_state_N)
+        state = int(sample.next_state_N)
         assert model.snapshot(state).key == model.adapter.get_state(base).key
-        assert (float(drawn.reward_N), float(drawn.discount_N)) == (reward, 0.0 if terminated else 0.9)
-        (shown,) = model.observations(torch.tensor([state]))
-        assert np.array_equal(shown, np.append(observation["image"], observation["direction"]))
+        assert (float(sample.reward_N), float(sample.discount_N)) == (reward, 0.0 if terminated else 0.9)
+        (observed,) = model.observations(torch.tensor([state]))
+        assert np.array_equal(observed, np.append(observation["image"], observation["direction"]))
         if terminated:
             break
 
 
-def test_only_distinct_states_are_looked_at_and_what_others_make_of_a_step_is_kept(monkeypatch):
+def test_only_distinct_states_are_observed_and_an_observation_that_a_subclass_makes_is_kept(monkeypatch):
     doorkey = pytest.importorskip("minigrid.envs", exc_type=ImportError).DoorKeyEnv
-    looks = []
+    observed = []
     real = doorkey.gen_obs
-    monkeypatch.setattr(doorkey, "gen_obs", lambda env: looks.append(env) or real(env))
+    monkeypatch.setattr(doorkey, "gen_obs", lambda env: observed.append(env) or real(env))
 
     class Dimmed(doorkey):
         def step(self, action):
@@ -242,9 +242,9 @@ def test_only_distinct_states_are_looked_at_and_what_others_make_of_a_step_is_ke
         env = make(size=5)
         observation, _ = env.reset(seed=0)
         model = SimulatorModel(lambda make=make: make(size=5), gamma=0.9, observe=lambda seen: seen["image"])
-        looks.clear()
+        observed.clear()
         look = expectimax(model, torch.tensor([model.root(env, observation)]), depth=2, v_leaf=zeros)
-        assert len(looks) == (model.num_states - 1 if make is doorkey else look.model_calls)
+        assert len(observed) == (model.num_states - 1 if make is doorkey else look.model_calls)
         images.append(model.observations(torch.tensor([1]))[0])
     assert look.model_calls > 2 * model.num_states
     assert np.array_equal(images[0] // 2, images[1])
@@ -274,7 +274,7 @@ def test_an_outcome_has_the_discount_that_the_step_names():
     ]  # the end is two to the right
 
 
-def test_what_chance_decides_is_asked_for_every_key():
+def test_what_chance_decides_is_queried_for_every_key():
     model = SimulatorModel(Corridor, gamma=0.9)
     root = model.root(reset(Corridor(), 0))
     model.sample(torch.full((50,), root), torch.ones(50, dtype=torch.int64), key_N=keys(50))
@@ -293,15 +293,15 @@ def test_an_outcome_is_a_function_of_state_action_and_key_alone(id):
     global_before = np.random.get_state()[1].copy(), torch.get_rng_state()  # noqa: NPY002
     envs = [reset(gymnasium.make(id), seed) for seed in range(6)]
     state_N, action_N, key_N = model.roots(envs).repeat(4), torch.arange(24) % model.num_actions, keys(24)
-    drawn = model.sample(state_N, action_N, key_N=key_N)
+    sample = model.sample(state_N, action_N, key_N=key_N)
     order_N = torch.randperm(24, generator=stream(0, "order"))
     reordered = other.sample(other.roots(envs).repeat(4)[order_N], action_N[order_N], key_N=key_N[order_N])
-    assert torch.equal(reordered.reward_N, drawn.reward_N[order_N])
+    assert torch.equal(reordered.reward_N, sample.reward_N[order_N])
     assert np.array_equal(
-        other.observations(reordered.next_state_N), model.observations(drawn.next_state_N)[order_N.numpy()]
+        other.observations(reordered.next_state_N), model.observations(sample.next_state_N)[order_N.numpy()]
     )
     if id != "CartPole-v1":
-        assert not torch.equal(model.sample(state_N, action_N, key_N=keys(24, 1)).next_state_N, drawn.next_state_N)
+        assert not torch.equal(model.sample(state_N, action_N, key_N=keys(24, 1)).next_state_N, sample.next_state_N)
     assert np.array_equal(np.random.get_state()[1], global_before[0])  # noqa: NPY002
     assert torch.equal(torch.get_rng_state(), global_before[1])
 
@@ -321,7 +321,7 @@ def test_a_search_leaves_the_environment_it_starts_from_bit_identical(id, monkey
         assert rest[:3] == other[:3]
 
 
-# Observations, forgetting, devices
+# Observations, clearing, devices
 
 
 def test_observations_are_those_of_the_environment_and_wait_for_those_of_roots():
@@ -341,7 +341,7 @@ def test_observations_are_those_of_the_environment_and_wait_for_those_of_roots()
 
 
 class Canvas(Corridor):
-    """Shows one array again and again, and writes into it."""
+    """Its observation is one array again and again, which it writes into."""
 
     def __init__(self):
         super().__init__(slip=0.0)
@@ -353,7 +353,7 @@ class Canvas(Corridor):
 
 
 class Diptych(Canvas):
-    """Shows it as a part of others."""
+    """With that array as a part of others."""
 
     def __init__(self):
         super().__init__()
@@ -366,7 +366,7 @@ class Diptych(Canvas):
 
 
 @pytest.mark.parametrize("make", [Canvas, Diptych])
-def test_what_a_state_showed_stays_when_the_environment_writes_into_it(make):
+def test_a_remembered_observation_stays_when_the_environment_writes_into_it(make):
     model, env = SimulatorModel(make, gamma=0.9), make()
     root_B = torch.tensor([model.root(env, env.reset(seed=0)[0])])
     model.outcomes(model.outcomes(root_B).child_NAK.flatten())
@@ -390,7 +390,7 @@ def test_observe_decides_what_is_remembered():
     assert cards.observations(cards.roots([reset(gymnasium.make("Blackjack-v1"), 0)], [(12, 3, 0)])).shape == (1, 45)
 
 
-def test_a_model_forgets_on_request_and_says_so():
+def test_after_clear_numbers_start_again_and_an_old_topology_refuses_to_go_on():
     model = SimulatorModel("CliffWalking-v1", gamma=0.9)
     root_B = model.roots([standing_in("CliffWalking-v1", 36)])
     topology = Topology(model)
@@ -404,11 +404,11 @@ def test_a_model_forgets_on_request_and_says_so():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_model_speaks_its_dtype_and_keeps_the_bound_it_is_given(dtype):
+def test_answers_are_in_the_dtype_of_the_model_and_a_given_bound_is_kept(dtype):
     model = SimulatorModel("CliffWalking-v1", gamma=0.9, dtype=dtype, highest_value=0.0)
     root_B = model.roots([standing_in("CliffWalking-v1", 36)])
-    answer, drawn = model.outcomes(root_B), model.sample(root_B, root_B, key_N=keys(1))
-    for tensor in (answer.reward_NA, answer.prob_NAK, answer.discount_NAK, drawn.reward_N, drawn.discount_N):
+    answer, sample = model.outcomes(root_B), model.sample(root_B, root_B, key_N=keys(1))
+    for tensor in (answer.reward_NA, answer.prob_NAK, answer.discount_NAK, sample.reward_N, sample.discount_N):
         assert tensor.dtype == model.dtype == dtype
     assert (model.highest_value, SimulatorModel(Corridor, gamma=1.0).highest_value) == (0.0, math.inf)
 
@@ -428,11 +428,11 @@ def test_continuous_actions_are_a_grid_or_a_sample():
     assert [action.tolist() for action in grid[:4]] == [[-1, 0], [-1, 2], [-1, 4], [0, 0]]
     assert len(grid) == 9
     assert all(action in space for action in grid)
-    drawn = sampled_actions(space, 7, seed=1)
-    assert len(drawn) == 7
-    assert all(action in space for action in drawn)
-    assert np.array_equal(sampled_actions(space, 7, seed=1), drawn)
-    assert not np.array_equal(sampled_actions(space, 7, seed=2), drawn)
+    sample = sampled_actions(space, 7, seed=1)
+    assert len(sample) == 7
+    assert all(action in space for action in sample)
+    assert np.array_equal(sampled_actions(space, 7, seed=1), sample)
+    assert not np.array_equal(sampled_actions(space, 7, seed=2), sample)
     model = SimulatorModel("Pendulum-v1", gamma=0.9, actions=grid_actions(spaces.Box(-2, 2, (1,)), 5))
     env = reset(gymnasium.make("Pendulum-v1"), 0)
     reward_A = model.outcomes(model.roots([env])).reward_NA[0]
@@ -493,11 +493,6 @@ def test_other_constants_are_another_environment():
     heavy.unwrapped.gravity = 20.0
     with pytest.raises(PgtsError, match="constants differ"):
         model.root(heavy)
-
-
-def test_an_environment_without_an_adapter_is_refused():
-    with pytest.raises(MissingModel, match="Bare cannot be restored: give Bare the methods get_state"):
-        SimulatorModel(Bare, gamma=0.9)
 
 
 @pytest.mark.parametrize(

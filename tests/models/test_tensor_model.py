@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models import StateIndex, TensorModel, state_index
+from pgts_torch.models import StateIndex, TensorModel
 from pgts_torch.models.state_index import hash_rows
 from pgts_torch.search import Topology, expectimax
 from pgts_torch.seeding import sample_keys, stream
@@ -233,7 +233,7 @@ def test_a_search_over_vectors_sees_what_the_tree_sees_however_they_are_merged(d
         assert (len(roots.unique()) == 5) == (merge is False)
 
 
-def test_each_pair_is_asked_once_and_states_that_are_reached_on_several_paths_are_one():
+def test_each_pair_is_queried_once_and_states_that_are_reached_on_several_paths_are_one():
     model = Lattice()
     topology, roots = Topology(model), model.number(torch.tensor([[9.0, 9.0]], dtype=torch.float64))
     for depth in (3, 5, 5):
@@ -258,20 +258,20 @@ def test_what_follows_where_nothing_counts_needs_no_number():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_drawn_outcome_is_the_listed_one_in_the_dtype_of_the_model_whatever_the_key(dtype):
+def test_a_sampled_outcome_is_the_enumerated_one_in_the_dtype_of_the_model_whatever_the_key(dtype):
     model = Lattice(dtype=dtype)
     state_N = model.number(torch.tensor(STARTS, dtype=torch.float64)).repeat_interleave(3)
     action_N = torch.arange(3).repeat(len(STARTS))
     answer = model.outcomes(state_N[::3])
     for seed in (0, 1):
-        drawn = model.sample(state_N, action_N, key_N=sample_keys(len(state_N), generator=stream(seed, "keys")))
-        assert torch.equal(drawn.reward_N, answer.reward_NA.reshape(-1))
-        assert torch.equal(drawn.discount_N, answer.discount_NAK.reshape(-1))
-        assert torch.equal(drawn.next_state_N, answer.child_NAK.reshape(-1))
-        assert drawn.reward_N.dtype == drawn.discount_N.dtype == answer.prob_NAK.dtype == dtype
+        sampled = model.sample(state_N, action_N, key_N=sample_keys(len(state_N), generator=stream(seed, "keys")))
+        assert torch.equal(sampled.reward_N, answer.reward_NA.reshape(-1))
+        assert torch.equal(sampled.discount_N, answer.discount_NAK.reshape(-1))
+        assert torch.equal(sampled.next_state_N, answer.child_NAK.reshape(-1))
+        assert sampled.reward_N.dtype == sampled.discount_N.dtype == answer.prob_NAK.dtype == dtype
 
 
-def test_after_clear_numbers_begin_anew_and_an_old_topology_refuses_to_go_on():
+def test_after_clear_numbers_start_again_and_an_old_topology_refuses_to_go_on():
     model = Lattice()
     topology = Topology(model)
     starts = torch.tensor(STARTS[:3], dtype=torch.float64)
@@ -327,8 +327,8 @@ def test_a_search_in_inference_mode_leaves_a_model_that_serves_outside():
     assert not model.states(torch.arange(2)).is_inference()
 
 
-def test_the_sample_of_rows_is_drawn_by_the_hash_so_that_equal_rows_are_both_in_it_or_neither():
+def test_the_sample_of_rows_is_chosen_by_the_hash_so_that_equal_rows_are_both_in_it_or_neither():
     bits = torch.arange(20_000).view(-1, 2)
-    top = hash_rows(bits) >> (64 - state_index._SAMPLE_BITS)
+    top = hash_rows(bits) >> 60
     share = float((top == 0).double().mean())
     assert abs(share - 1 / 16) < 5 * math.sqrt(1 / 16 * 15 / 16 / 10_000)  # 5 sigma: one seed in 1.7 million would fail
