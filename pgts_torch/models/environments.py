@@ -148,12 +148,8 @@ class EnvSource:
         return numbered(self.make_one(k, max_episode_steps=-1), per_dimension=self.actions_per_dimension)
 
     def make_one(self, k: int = 0, **options: Any) -> gymnasium.Env:
-        """A new environment as it is registered or given, with its own actions and time limit; PgtsError as `make`.
-
-        Args:
-            k: which of several makers makes it.
-            options: for gymnasium.make, of an id or a spec.
-        """
+        """A new environment as it is registered or given, with its own actions and time limit; PgtsError as `make`. Of
+        several makers number k makes it, by an id with these options of gymnasium.make."""
         if not self.makers:
             raise PgtsError(
                 f"{self.name} was given as a VectorEnv of which no others can be made; give a SyncVectorEnv or an id"
@@ -166,8 +162,7 @@ class EnvSource:
         return made
 
     def own_actions(self, envs: VectorEnv) -> np.ndarray | None:
-        """What the numbers of the actions stand for in environments that `make` gave, a row each; None: the numbers
-        themselves."""
+        """What the numbers of actions stand for in environments of `make`, a row each; None: the numbers themselves."""
         outermost = each_of(envs)[0]
         return np.stack(outermost.actions) if isinstance(outermost, Numbered) and envs is not self.given else None
 

@@ -1,6 +1,5 @@
 """Numbers for states that are vectors: equal rows get the same number, also where hashes collide."""
 
-from collections.abc import Callable
 from typing import Literal, final
 
 import torch
@@ -12,9 +11,6 @@ from pgts_torch.seeding import mix
 
 Merge = Literal["auto"] | bool
 """Whether equal rows get one number: True, False, or as long as it pays."""
-
-Hash = Callable[[Tensor], Tensor]
-"""Rows of bits, int64 [N, D], to int64 [N]. A bad one costs time and no more."""
 
 _EMPTY = torch.iinfo(torch.int64).max
 _LEAST_SLOTS = 1024
@@ -64,7 +60,6 @@ class StateIndex:
         dtype: of the rows: floating, where -0.0 equals 0.0, or an integer type.
         device: where rows and table lie.
         merge: whether equal rows get one number. False: never; every row is a new one.
-        hash: which slot a row visits first.
     """
 
     def __init__(
@@ -74,11 +69,10 @@ class StateIndex:
         dtype: torch.dtype,
         device: torch.device | str = "cpu",
         merge: Merge = "auto",
-        hash: Hash = hash_rows,
     ) -> None:
         if merge not in ("auto", True, False):
             raise PgtsError(f"merge is {merge!r}; it must be 'auto', True or False")
-        self._merge, self._hash = merge, hash
+        self._merge = merge
         with torch.inference_mode(False):
             # _rows: the row of each number, with room for more. _slots: the table, numbers or _EMPTY.
             self._rows = torch.empty(0, num_columns, dtype=dtype, device=device)
@@ -184,7 +178,7 @@ class StateIndex:
         return row_ND + 0.0  # -0.0 becomes 0.0, so that equal rows have equal bits
 
     def _hashed(self, row_ND: Tensor) -> Int[Tensor, "N"]:
-        return self._hash((row_ND.view(_BITS[row_ND.dtype]) if row_ND.dtype in _BITS else row_ND).long())
+        return hash_rows((row_ND.view(_BITS[row_ND.dtype]) if row_ND.dtype in _BITS else row_ND).long())
 
     def _empty_slots(self, count: int) -> Tensor:
         return torch.full((count,), _EMPTY, dtype=torch.int64, device=self.device)
