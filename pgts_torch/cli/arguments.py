@@ -51,12 +51,11 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 def describe_options(options: Sequence[Option]) -> Iterator[str]:
     """Yield the lines of --help about the keys of a configuration, by section."""
     yield "keys, each --KEY VALUE or --KEY=VALUE, with the value in YAML:"
-    yield from textwrap.wrap(
-        "A mapping replaces its whole section, as in --critic '{type: exact}'; a single key changes only itself. "
-        "true may be left out.",
-        WIDTH,
-        initial_indent="  ",
-        subsequent_indent="  ",
+    yield from _wrap(
+        "A mapping replaces its whole section, as in --critic '{type: exact}', and so does a word, as in --critic "
+        "exact; a single key changes only itself. true may be left out.",
+        "  ",
+        "  ",
     )
     sections = itertools.groupby(
         options, lambda option: option.key.partition(".")[0] if "." in option.key else "general"
@@ -72,13 +71,15 @@ def describe_options(options: Sequence[Option]) -> Iterator[str]:
 
 def _describe_option(option: Option, indent: str) -> Iterator[str]:
     deeper = indent + "    "
-    head = f"--{option.key}  {option.requirement} (default: {_value(option.default)})"
-    yield from textwrap.wrap(head, WIDTH, initial_indent=indent, subsequent_indent=deeper, break_on_hyphens=False)
-    yield from textwrap.wrap(option.meaning, WIDTH, initial_indent=deeper, subsequent_indent=deeper)
+    yield from _wrap(f"--{option.key}  {option.requirement} (default: {_value(option.default)})", indent, deeper)
+    yield from _wrap(option.meaning, deeper, deeper)
     for value, meaning in option.choices:
-        yield from textwrap.wrap(
-            f"{value}: {meaning}", WIDTH, initial_indent=deeper + "  ", subsequent_indent=deeper + "    "
-        )
+        yield from _wrap(f"{value}: {meaning}", deeper + "  ", deeper + "    ")
+
+
+def _wrap(text: str, indent: str, further: str) -> list[str]:
+    """Break a text into lines, the first of which has an indentation of its own."""
+    return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=further, break_on_hyphens=False)
 
 
 def _value(value: Any) -> str:

@@ -13,7 +13,7 @@ from pgts_torch.config.config import Config
 from pgts_torch.config.strict_yaml import Document, Place, YamlMistake
 from pgts_torch.errors import PgtsError
 from pgts_torch.options.mistakes import escape, explain, quote, show, what
-from pgts_torch.options.schema import KeyPath, Node, is_nullable, is_text, schema_of
+from pgts_torch.options.schema import KeyPath, Node, is_nullable, is_text, schema_of, tag_of
 
 MAX_BYTES = 2**15
 """A larger configuration file is refused."""
@@ -123,10 +123,14 @@ class _Given:
     def _set(self, path: KeyPath, document: Document) -> None:
         """Replace the value of one key, and where it and what is below it come from."""
         section: Any = self.data
-        for part in path[:-1]:
-            section = section.setdefault(part, {})
-            if not isinstance(section, dict):
+        for end, part in enumerate(path[:-1], start=1):
+            value = section.get(part, {})
+            tags = [tag for node in schema_of(Config).find(path[:end]) if (tag := tag_of(node))]
+            if isinstance(value, str) and tags:
+                value = {tags[0]: value}  # the word stands for a mapping with this type
+            if not isinstance(value, dict):
                 return  # the file has something else than a section here, which is reported by itself
+            section[part] = section = value
         section[path[-1]] = document.value
         self.sources = {key: source for key, source in self.sources.items() if key[: len(path)] != path}
         flag = f"--{'.'.join(path)}"
@@ -137,13 +141,14 @@ class _Given:
         """Return the configuration; None after mistakes.
 
         Args:
-            is_whole: whether all that the user gave is known; otherwise only single values can be refused.
+            is_whole: whether all that the user gave is known; if not, only values are refused that are wrong by
+                themselves.
         """
         try:
             return Config.model_validate(self.data)
         except ValidationError as error:
             for mistake in explain(Config, error, lambda key: self._source(key).text):
-                if not is_whole and mistake.kind in ("conflict", "extra_forbidden"):
+                if not is_whole and not mistake.is_value:
                     continue
                 exact = [self.sources[key] for key in mistake.keys if key in self.sources]
                 source = exact[0] if exact else self._source(mistake.keys[0])

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from pgts_torch.options.fields import INT64_MAX
-from pgts_torch.options.schema import KeyPath, Node, Schema, is_text, requirement, schema_of
+from pgts_torch.options.schema import KeyPath, Node, Schema, is_text, requirement, schema_of, tag_of
 
 
 @dataclass(frozen=True)
@@ -18,13 +18,11 @@ class Mistake:
 
     Args:
         message: a whole sentence.
-        kind: pydantic's error type; "conflict" where options do not go together.
         keys: the options that can be changed to solve it, the likeliest first.
-        is_value: whether a value was refused; the message then begins with its key.
+        is_value: whether a value was refused for itself, whatever the others are; the message then begins with its key.
     """
 
     message: str
-    kind: str
     keys: tuple[KeyPath, ...]
     is_value: bool = False
 
@@ -45,20 +43,19 @@ def explain(
 
 def _mistake(schema: Schema, error: ErrorDetails, written: Callable[[KeyPath], str | None]) -> Mistake:
     path, node, section = schema.locate(error["loc"])
-    kind = error["type"]
-    if kind == "conflict":
+    if error["type"] == "conflict":
         keys = tuple(tuple(key.split(".")) for key in error["ctx"]["keys"])
-        return Mistake(error["ctx"]["reason"], kind, keys or (path,))
+        return Mistake(error["ctx"]["reason"], keys or (path,))
     if node is None:
-        return Mistake(_unknown(schema, path, section), kind, (path,))
+        return Mistake(_unknown(schema, path, section), (path,))
     value, must = error["input"], what(node)
-    if kind == "union_tag_invalid":
-        tag = schema.tag(node)
+    if error["type"] == "union_tag_invalid":
+        tag = tag_of(node)
         path, must = (*path, tag), requirement(node)
         value = value[tag] if isinstance(value, dict) else getattr(value, tag)
     is_or_holds = "holds" if isinstance(error["loc"][-1], int) else "is"
     sentence = f"{'.'.join(path)} {is_or_holds} {show(value, written(path))}; it must be {must}{_advice(node, value)}"
-    return Mistake(sentence, kind, (path,), is_value=True)
+    return Mistake(sentence, (path,), is_value=True)
 
 
 def _unknown(schema: Schema, path: KeyPath, section: Node) -> str:
@@ -73,9 +70,7 @@ def _unknown(schema: Schema, path: KeyPath, section: Node) -> str:
 
 def what(node: Node) -> str:
     """Return what a value, or a section, must be, in words."""
-    if "oneOf" in node:
-        return f"{requirement(node)}, or a mapping with such a {node['discriminator']['propertyName']}"
-    return requirement(node)
+    return requirement(node) + (f", or a mapping with such a {tag}" if (tag := tag_of(node)) else "")
 
 
 def _advice(node: Node, value: Any) -> str:

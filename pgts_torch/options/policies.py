@@ -41,13 +41,17 @@ class AutoPolicy(Part):
     type: Literal["auto"] = "auto"
 
 
-class Softmax(Part):
-    """A table of logits, for environments whose observations are numbered states."""
-
-    type: Literal["softmax"] = "softmax"
+class TabularPolicy(Part):
+    """A table, for environments whose observations are numbered states."""
 
     init: Init = Field(default=Uniform(), discriminator="type")
     """The policy before the first update."""
+
+
+class Softmax(TabularPolicy):
+    """A table of logits, for environments whose observations are numbered states."""
+
+    type: Literal["softmax"] = "softmax"
 
     @field_validator("init")
     @classmethod
@@ -60,13 +64,10 @@ class Softmax(Part):
         return init
 
 
-class Simplex(Part):
+class Simplex(TabularPolicy):
     """A table of probabilities, for environments whose observations are numbered states."""
 
     type: Literal["simplex"] = "simplex"
-
-    init: Init = Field(default=Uniform(), discriminator="type")
-    """The policy before the first update."""
 
 
 class MLP(Part):

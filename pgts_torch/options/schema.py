@@ -61,11 +61,7 @@ class Schema:
     def variants(self, node: Node) -> dict[str, Node]:
         """Return the sections between which a tag (`type` or `kind`) chooses, in order; {} for other nodes."""
         nodes = [self._follow(variant) for variant in node.get("oneOf", ())]
-        return {variant["properties"][self.tag(node)]["const"]: variant for variant in nodes}
-
-    def tag(self, node: Node) -> str:
-        """Return the key by which a node with variants chooses."""
-        return node["discriminator"]["propertyName"]
+        return {variant["properties"][tag_of(node)]["const"]: variant for variant in nodes}
 
     def find(self, path: Sequence[str]) -> list[Node]:
         """Return the nodes of a path, one for each variant that has it. Below kwargs any path is valid, as node {}."""
@@ -120,7 +116,7 @@ class Schema:
             child = (*path, name)
             key, meaning = ".".join(child), _sentence(node)
             if variants := self.variants(node):
-                tag = self.tag(node)
+                tag = tag_of(node)
                 choices = tuple((value, _sentence(variant)) for value, variant in variants.items())
                 yield Option(f"{key}.{tag}", requirement(node), node["default"][tag], meaning, choices)
                 yield from self._options_of_variants(f"{key}.{tag}", variants, child)
@@ -157,6 +153,11 @@ class Schema:
 @functools.cache
 def schema_of(model: type[BaseModel]) -> Schema:
     return Schema(model)
+
+
+def tag_of(node: Node) -> str:
+    """Return the key by which a node chooses between variants; empty where it has none."""
+    return node["discriminator"]["propertyName"] if "oneOf" in node else ""
 
 
 def requirement(node: Node) -> str:

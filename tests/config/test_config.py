@@ -34,6 +34,7 @@ from pgts_torch.options import (
     NetworkValues,
     SharedNetwork,
     TabularValues,
+    TDLambda,
 )
 from pgts_torch.options.arguments import read
 from pgts_torch.options.schema import Option, schema_of
@@ -91,6 +92,14 @@ def test_a_word_stands_for_the_part_of_this_type(tmp_path: Path) -> None:
     critic = NetworkValues(network=SharedNetwork(), method=MonteCarlo())
     assert (config.policy, config.critic, config.update, config.search.kind) == (MLP(), critic, PPO(), "mcts")
     assert config.rollout.horizon == GeometricHorizon()
+
+
+def test_an_override_goes_below_a_word(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("{policy: mlp, search: mcts}")
+    flags = ["--policy.hidden", "[8]", "--search.depth=2", "--critic=network", "--critic.method.lambda=0.5"]
+    config = load(tmp_path / "c.yaml", flags)
+    assert (config.policy, config.search.kind, config.search.depth) == (MLP(hidden=[8]), "mcts", 2)
+    assert config.critic == NetworkValues(method=TDLambda(lambda_=0.5))
 
 
 def test_a_section_without_type_has_the_default_one() -> None:
