@@ -1,17 +1,87 @@
 """The configuration of a run: all options of its training, and those of the run itself."""
 
-from collections.abc import Sequence
-from typing import Any
+import json
+from typing import Annotated, Any
 
-from pydantic import model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from pgts_torch.config import strict_yaml
-from pgts_torch.config.sections import EvalConfig, General, LogConfig, RunConfig
-from pgts_torch.options import CMPO, CNN, MLP, PPO, Mirror, NetworkValues, Projected, Softmax, TabularValues
 from pgts_torch.options.arguments import described
+from pgts_torch.options.fields import Count, Device, Folder, Name, Natural, conflict
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import NETWORKS, TABLES
 from pgts_torch.options.training import Training
+
+
+class General(Part):
+    """Options of the whole run."""
+
+    name: Name = "run"
+    """The beginning of the name of the run's folder."""
+
+    seed: Natural = 0
+    """The seed of all random numbers."""
+
+    total_steps: Count = 50_000
+    """Environment steps to train for."""
+
+    device: Device = "cpu"
+    """The device of policy, critic and model."""
+
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1
+    """The number of threads of torch."""
+
+
+class LogConfig(Part):
+    """Metrics and checkpoints."""
+
+    every: Count = 1
+    """Iterations from one line of metrics to the next."""
+
+    checkpoint_every: Natural = 20
+    """Iterations from one checkpoint to the next, fewer where they take more than a minute; 0: only after the last, and
+    where a signal ends the training."""
+
+    keep: Count = 3
+    """The number of checkpoints that are kept, the newest ones; for the best model see eval.keep_best."""
+
+
+class EvalConfig(Part):
+    """Evaluations of the current policy in separate episodes, with greedy and with sampled actions."""
+
+    every: Count | None = None
+    """Environment steps from one evaluation to the next; null: only after the last iteration."""
+
+    episodes: Count = 10
+    """Episodes of one evaluation."""
+
+    stop_at_return: float | None = None
+    """Training ends once greedy episodes have this mean return; null: it does not. Only with eval.every."""
+
+    keep_best: bool = False
+    """Save the model as best.pt whenever the mean return of greedy episodes is the highest so far. Only with
+    eval.every."""
+
+    @field_validator("stop_at_return", "keep_best")
+    @classmethod
+    def _only_during_training(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None and value is not False and info.data.get("every", 1) is None:
+            key = f"eval.{info.field_name}"
+            raise conflict(f"{key} is {json.dumps(value)}, which needs evaluations during training; eval.every is null")
+        return value
+
+
+class RunConfig(Part):
+    """The run folder."""
+
+    dir: Folder | None = None
+    """Its path; null: a new one in runs/, named after the run, its seed and the time."""
+
+    overwrite: bool = False
+    """Replace an earlier run in run.dir. Otherwise a run of the same configuration resumes from its last checkpoint,
+    and any other is an error."""
+
+    tensorboard: bool = True
+    """Write TensorBoard events beside metrics.jsonl."""
 
 
 class Config(Training, General):
@@ -23,8 +93,12 @@ class Config(Training, General):
 
     @model_validator(mode="before")
     @classmethod
-    def _infer_types(cls, data: Any) -> Any:
-        return _with_types(data) if isinstance(data, dict) else data
+    def _without_nulls(cls, data: Any) -> Any:
+        """Leave out what version 0.1 wrote as null for other kinds of search, and for the defaults of this one."""
+        if not isinstance(data, dict) or not isinstance(search := data.get("search"), dict):
+            return data
+        kept = {name: value for name, value in search.items() if value is not None or name not in NULL_ONCE}
+        return data | {"search": kept}
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of `PGTS`."""
@@ -34,46 +108,6 @@ class Config(Training, General):
 
 
 NULL_ONCE = ("max_width", "samples", "share", "simulations", "merge")
-"""Options of a kind of search that version 0.1 wrote as null for the other kinds, and for their default."""
-
-
-def _with_types(data: dict[str, Any]) -> dict[str, Any]:
-    """Return the values with a type for policy, critic and update where these have other keys but no type.
-
-    It is the first type that goes with the other values and has all these keys; if none has, the first that goes.
-    """
-    if isinstance(search := data.get("search"), dict):
-        kept = {name: value for name, value in search.items() if value is not None or name not in NULL_ONCE}
-        data = data | {"search": kept}
-    data = _with_type(data, "policy", [Softmax, MLP, CNN])
-    policy, sampled = _type(data, "policy"), _type(data, "estimator") == "sampled"
-    tables, networks = policy not in NETWORKS, policy not in TABLES
-    for_tables: list[type[Part]] = [Projected if policy == "simplex" else Mirror]
-    for_networks: list[type[Part]] = [PPO] if sampled else [CMPO, PPO]
-    critic = data.get("critic") or {}
-    if policy in NETWORKS and isinstance(critic, dict):  # also where states are numbered
-        data = data | {"critic": {"type": "network"} | critic}
-    data = _with_type(data, "critic", [TabularValues] * tables + [NetworkValues] * networks)
-    return _with_type(data, "update", for_tables * tables + for_networks * networks)
-
-
-def _with_type(data: dict[str, Any], name: str, kinds: Sequence[type[Part]]) -> dict[str, Any]:
-    section = data.get(name)
-    if not section or not isinstance(section, dict) or "type" in section:
-        return data
-    kind = next((kind for kind in kinds if section.keys() <= _keys(kind)), kinds[0])
-    return data | {name: {"type": kind.model_fields["type"].default} | section}
-
-
-def _keys(kind: type[Part]) -> set[str]:
-    """Return the keys of a part; of the mirror update only those of tables, because cmpo has the others."""
-    names = {"type", *Mirror.standing("tables")} if kind is Mirror else kind.model_fields
-    return {str(kind.model_fields[name].validation_alias or name) for name in names}
-
-
-def _type(data: dict[str, Any], name: str) -> Any:
-    section = data.get(name)
-    return section.get("type") if isinstance(section, dict) else section
 
 
 def dump(config: Config) -> str:

@@ -15,7 +15,7 @@ from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.states import load_checked
 from pgts_torch.config import Config
-from pgts_torch.config.sections import EvalConfig
+from pgts_torch.config.config import EvalConfig
 from pgts_torch.experiment import checkpoint, diagnostics
 from pgts_torch.experiment.advice import Movement, greedy_is_worse, learned_little, span_of
 from pgts_torch.experiment.checkpoint import Notes, Progress

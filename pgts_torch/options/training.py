@@ -1,13 +1,14 @@
 """All options of a training, and the rules between them."""
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues
+from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues, TabularValues
 from pgts_torch.options.fields import Ascending, EnvId, Key, Kwargs, UnitInterval, conflict
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, Network, Simplex, Softmax, Table
+from pgts_torch.options.policies import CNN, MLP, NETWORKS, TABLES, AutoPolicy, Biased, Network, Simplex, Softmax, Table
 from pgts_torch.options.rollouts import Estimator, LookaheadAdvantages, Rollouts, SampledAdvantages
 from pgts_torch.options.search import AutoSearch, Search
 from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient, Update
@@ -56,6 +57,11 @@ class Training(Part):
 
     update: AutoUpdate | Update = Field(default=AutoUpdate(), discriminator="type")
     """How the policy is changed by the advantages."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _infer_types(cls, data: Any) -> Any:
+        return _with_types(data) if isinstance(data, dict) else data
 
     @field_validator("policy")
     @classmethod
@@ -166,3 +172,39 @@ def _check_mirror(update: Mirror, policy: Any) -> None:
                 f"update.{name} is {value}, which the mirror update of a {kind} does not use; policy.type is "
                 f"{policy.type}"
             )
+
+
+def _with_types(data: dict[str, Any]) -> dict[str, Any]:
+    """Return the values with a type for policy, critic and update where these have other keys but no type.
+
+    It is the first type that goes with the other values and has all these keys; if none has, the first that goes.
+    """
+    data = _with_type(data, "policy", [Softmax, MLP, CNN])
+    policy, sampled = _type(data, "policy"), _type(data, "estimator") == "sampled"
+    tables, networks = policy not in NETWORKS, policy not in TABLES
+    for_tables: list[type[Part]] = [Projected if policy == "simplex" else Mirror]
+    for_networks: list[type[Part]] = [PPO] if sampled else [CMPO, PPO]
+    critic = data.get("critic") or {}
+    if policy in NETWORKS and isinstance(critic, dict):  # also where states are numbered
+        data = data | {"critic": {"type": "network"} | critic}
+    data = _with_type(data, "critic", [TabularValues] * tables + [NetworkValues] * networks)
+    return _with_type(data, "update", for_tables * tables + for_networks * networks)
+
+
+def _with_type(data: dict[str, Any], name: str, kinds: Sequence[type[Part]]) -> dict[str, Any]:
+    section = data.get(name)
+    if not section or not isinstance(section, dict) or "type" in section:
+        return data
+    kind = next((kind for kind in kinds if section.keys() <= _keys(kind)), kinds[0])
+    return data | {name: {"type": kind.model_fields["type"].default} | section}
+
+
+def _keys(kind: type[Part]) -> set[str]:
+    """Return the keys of a part; of the mirror update only those of tables, because cmpo has the others."""
+    names = {"type", *Mirror.standing("tables")} if kind is Mirror else kind.model_fields
+    return {str(kind.model_fields[name].validation_alias or name) for name in names}
+
+
+def _type(data: dict[str, Any], name: str) -> Any:
+    section = data.get(name)
+    return section.get("type") if isinstance(section, dict) else section

@@ -79,6 +79,13 @@ def test_arguments_reach_the_options():
     assert given(policy={"type": "mlp", "hidden": (7,)}).policy == MLP(hidden=[7])
 
 
+def test_a_mapping_without_type_is_of_the_first_type_that_has_its_keys():
+    options = given(policy={"hidden": [7]}, critic={"polyak": 0.5}, update={"clip_range": 0.1})
+    assert (options.policy, options.critic) == (MLP(hidden=[7]), NetworkValues(polyak=0.5))
+    assert options.update == PPO(clip_range=0.1)
+    assert given(update={"step_size": 0.5}).update == Mirror(step_size=0.5)
+
+
 def test_the_method_of_a_network_has_the_default_of_networks():
     assert NetworkValues(method=TDLambda()) == NetworkValues()
     assert NetworkValues().method.lambda_ == 0.95 != TabularValues().method.lambda_
