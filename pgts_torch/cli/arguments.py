@@ -96,9 +96,9 @@ def whole(least: int, word: str | None = None) -> Callable[[str], Any]:
         if text == word:
             return text
         if not (text.isascii() and text.isdecimal() and len(text) < 20 and least <= int(text) <= INT64_MAX):
-            kind = f"a whole number >= {least} and below 2**63"
-            must = f"not {kind}" if word is None else f"neither {kind} nor {word}"
-            raise argparse.ArgumentTypeError(f"{text!r} is {must}")
+            whole_number = f"a whole number >= {least}"
+            is_not = f"not {whole_number} and below 2**63" if word is None else f"neither {whole_number} nor {word}"
+            raise argparse.ArgumentTypeError(f"{text!r} is {is_not}")
         return int(text)
 
     return convert
