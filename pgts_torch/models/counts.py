@@ -157,15 +157,18 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
         return {"new_outcomes": len(memory.counts.pair_C) - known, "unknown_worth": self.unknown_worth}
 
     def is_news(self, state_B: Int[Tensor, "B"], action_B: Int[Tensor, "B"]) -> bool:
-        """Note steps that are to be learned later. Return whether learning them now would change much: whether one of
-        these pairs has been visited as often since the last `learn` as before it or, with rmax, becomes known."""
+        """Note steps that are to be learned later. Return whether learning them now would change much.
+
+        It would where a pair is new (with rmax: becomes known), and where a pair has been visited as often since the
+        last `learn` as before it, unless no pair has had two outcomes so far.
+        """
         memory, news = self._memory, False
         least = 1 + self._extra(memory.counts) if self.options.optimism == "rmax" else 1
         for pair in (state_B * self.num_actions + action_B).tolist():
             memory.since[pair] += 1
             before = memory.counts.visits(pair)
             now = before + memory.since[pair]
-            news |= now >= least and (before < least or now >= 2 * before)
+            news |= now >= least and (before < least or (memory.counts.most > 1 and now >= 2 * before))
         return news
 
     def state_dict(self) -> dict[str, Any]:

@@ -229,31 +229,34 @@ def test_rewards_in_another_unit_give_values_in_that_unit(optimism):
 # Learning beside a search
 
 
-def test_steps_are_news_when_a_pair_becomes_known_or_has_been_seen_twice_as_often():
-    def news(model: CountsModel) -> list[int]:
-        """At which visit to state 0 learning was worth it."""
-        found = []
-        for n in range(1, 41):
-            then = 1 + n % 2
-            if model.is_news(torch.tensor([2, 0]), torch.tensor([0, 0])):
-                found.append(n)
-                model.learn(step(0, 0, 0.0, then), generator=stream(0, "learn"))
-                while sum(model.state_dict()["count_C"][:2].tolist()) < n:
-                    model.learn(step(0, 0, 0.0, then), generator=stream(0, "learn"))
-        return found
-
-    model = CountsModel(3, 1, gamma=0.9, options=Counts(optimism="bonus"))
-    model.learn(Experience(*(column.repeat(1000) for column in step(2, 0, 0.0, 2))), generator=stream(0, "learn"))
-    assert news(model) == [1, 2, 4, 8, 16, 32]
-    assert not model.is_news(torch.tensor([2]), torch.tensor([0]))
+def news(model: CountsModel, visits: int) -> list[int]:
+    """At which visit to state 0 learning was worth it, if all visits are learned then."""
+    found, pending = [], []
+    for n in range(1, visits + 1):
+        pending.append(step(0, 0, 0.0, 1))
+        if model.is_news(torch.tensor([2, 0]), torch.tensor([0, 0])):
+            found.append(n)
+            for each in pending:
+                model.learn(each, generator=stream(0, "learn"))
+            pending = []
+    return found
 
 
-def test_a_pair_below_the_visits_of_rmax_is_no_news():
-    model = CountsModel(3, 1, gamma=0.9, options=Counts(strength=4.0))
-    for then in (0, 1):
-        model.learn(step(2, 0, 0.0, then), generator=stream(0, "learn"))
-    answers = [model.is_news(torch.tensor([0]), torch.tensor([0])) for _ in range(6)]
-    assert answers == [False, False, False, False, True, True]
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (Counts(optimism="bonus"), [1, 2, 4, 8, 16, 32]),
+        (Counts(strength=4.0), [5, 10, 20, 40]),
+        (NONE, [1]),
+    ],
+)
+def test_steps_are_news_when_a_pair_becomes_known_or_has_been_seen_twice_as_often(options, expected):
+    model = CountsModel(3, 1, gamma=0.9, options=options)
+    often = Experience(*(column.repeat(1000) for column in step(2, 0, 0.0, 2)))
+    model.learn(often, generator=stream(0, "learn"))
+    if options != NONE:  # one outcome more; without it everything is certain
+        model.learn(step(2, 0, 0.0, 1), generator=stream(0, "learn"))
+    assert news(model, 50) == expected
 
 
 def test_a_plain_table_learns_with_the_optimistic_one_and_a_search_notices():
