@@ -5,6 +5,7 @@ from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.classic import Acrobot, CartPole, MountainCar, Pendulum
 from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.fidelity import check_model
+from pgts_torch.models.posterior import posterior_certificate
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.state_index import StateIndex
 from pgts_torch.models.tabular import TabularModel
@@ -24,5 +25,6 @@ __all__ = [
     "TensorModel",
     "Transitions",
     "check_model",
+    "posterior_certificate",
     "with_torques",
 ]

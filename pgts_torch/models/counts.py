@@ -96,16 +96,21 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
         return self._memory.generation
 
     @property
+    def counts(self) -> OutcomeCounts:
+        """What was seen so far."""
+        return self._memory.counts
+
+    @property
     def num_outcomes(self) -> int:  # type: ignore[override]
         """The largest number of outcomes that a pair has had, and the unknown one."""
-        return self._memory.counts.most + 1
+        return self.counts.most + 1
 
     @property
     def value_range(self) -> tuple[float, float]:
         """The lowest and the highest value of a state: as given, or what the rewards seen so far allow."""
         if self.options.value_range is not None:
             return self.options.value_range[0], self.options.value_range[1]
-        reward_C, ends_C = self._memory.counts.reward_C, self._memory.counts.discount_C == 0
+        reward_C, ends_C = self.counts.reward_C, self.counts.discount_C == 0
         last_C, other_C = reward_C[ends_C], reward_C[~ends_C]
         low, high = value_range((other_C.min(initial=0), other_C.max(initial=0)), self.gamma)
         low, high = min(low, last_C.min(initial=0)), max(high, last_C.max(initial=0))
@@ -150,7 +155,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
                 learned then.
         """
         pair_N, next_N, discount_N, reward_N = self._checked(experience)
-        memory, known = self._memory, len(self._memory.counts.pair_C)
+        memory, known = self._memory, len(self.counts.pair_C)
         if len(pair_N):
             counts = memory.counts.with_steps(pair_N, next_N, discount_N, reward_N)
             memory.replace(counts, None if memory.sampled is None else self._sampled(counts, generator))
@@ -174,7 +179,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
     def state_dict(self) -> dict[str, Any]:
         """Return counts and rewards of the outcomes seen, and probabilities that were sampled."""
         sampled = dict(zip(("share_C", "unknown_C"), self._memory.sampled or (), strict=False))
-        return self._memory.counts.state_dict() | {name: torch.from_numpy(x_C.copy()) for name, x_C in sampled.items()}
+        return self.counts.state_dict() | {name: torch.from_numpy(x_C.copy()) for name, x_C in sampled.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load what `state_dict` returned.
@@ -212,7 +217,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
     def _made_columns(self) -> tuple[Tensor, ...]:
         """Pair, probability, probability of the unknown, mean reward, discount and next state of each outcome, and last
         of a pair that was never visited."""
-        counts = self._memory.counts
+        counts = self.counts
         last = (self.num_states * self.num_actions, 0.0, 1.0, 0.0, 0.0, 0)
         columns = counts.pair_C, *self._probabilities(counts), counts.reward_C, counts.discount_C, counts.next_C
         padded = (np.append(x_C, np.asarray(x, dtype=x_C.dtype)) for x_C, x in zip(columns, last, strict=True))

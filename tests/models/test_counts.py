@@ -246,7 +246,7 @@ def news(model: CountsModel, visits: int) -> list[int]:
     ("options", "expected"),
     [
         (Counts(optimism="bonus"), [1, 2, 4, 8, 16, 32]),
-        (Counts(strength=4.0), [5, 10, 20, 40]),
+        (Counts(optimism="rmax", strength=4.0), [5, 10, 20, 40]),
         (NONE, [1]),
     ],
 )
