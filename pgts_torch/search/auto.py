@@ -12,10 +12,9 @@ from pgts_torch.errors import MemoryBudgetExceeded, NodeBudgetExceeded, PgtsErro
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.options.search import Auto, Sampled
 from pgts_torch.search.engine import SampledSearch, Search
-from pgts_torch.search.expectimax import full_width
+from pgts_torch.search.expectimax import search_levels
 from pgts_torch.search.lookahead import Leaves, Lookahead
 from pgts_torch.search.memory import tree_nodes
-from pgts_torch.search.pruned import pruned
 from pgts_torch.search.topology import Topology
 
 MOST_SAMPLES = 32
@@ -60,7 +59,7 @@ class AutoSearch(Search):
             try:
                 if self._too_much is None or roots < self._too_much[0] or expansions < self._too_much[1]:
                     try:
-                        full = full_width(leaves, self.topology, root_B, max_nodes=self.options.max_nodes)
+                        full = search_levels(leaves, self.topology, root_B, max_nodes=self.options.max_nodes)
                         self._picked = _all_paths(full)
                         return full
                     except NodeBudgetExceeded:
@@ -79,11 +78,11 @@ class AutoSearch(Search):
             calls_before: `topology.table.model_calls` before the search; what it tried in vain counts too.
         """
         assert self.topology is not None
-        topology: Topology = self.topology
+        topology, max_nodes = self.topology, self.options.max_nodes
         calls_left_behind, is_emptied = 0, False
         while True:
             try:
-                narrow = pruned(leaves, topology, root_B, max_width=self._width, max_nodes=self.options.max_nodes)
+                narrow = search_levels(leaves, topology, root_B, max_nodes=max_nodes, max_width=self._width)
                 break
             except NodeBudgetExceeded as error:
                 if isinstance(error, MemoryBudgetExceeded):
@@ -102,10 +101,10 @@ class AutoSearch(Search):
             self._picked = _all_paths(narrow)
         else:
             self._picked = (
-                f"expectimax, {self._width} states a level: all paths need more than {self.options.max_nodes} nodes, "
+                f"expectimax, {self._width} states a level: all paths need more than {max_nodes} nodes, "
                 "or too much memory"
             )
-        if 2 * max(self._width, narrow.nodes) <= self.options.max_nodes:
+        if 2 * max(self._width, narrow.nodes) <= max_nodes:
             self._width *= 2
         return replace(narrow, model_calls=calls_left_behind + topology.table.model_calls - calls_before)
 

@@ -13,7 +13,7 @@ from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.options.search import MCTS, Expectimax, Sampled
 from pgts_torch.search.empirical import FixedSamples
-from pgts_torch.search.expectimax import by_width
+from pgts_torch.search.expectimax import search_levels
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_finite
 from pgts_torch.search.mcts import grow
 from pgts_torch.search.sampled import plan_levels, sparse
@@ -135,7 +135,8 @@ class ExpectimaxSearch(Search):
         self.topology: Topology = Topology(enumerating(model, "expectimax"), max_bytes=options.max_bytes)
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
-        return by_width(leaves, self.topology, root_B, self.options)
+        max_nodes, max_width = self.options.max_nodes, self.options.max_width
+        return search_levels(leaves, self.topology, root_B, max_nodes=max_nodes, max_width=max_width)
 
     def __str__(self) -> str:
         width = self.options.max_width

@@ -48,19 +48,17 @@ def expectimax(
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
     options = Expectimax(max_width=max_width, max_nodes=max_nodes)
-    return by_width(Leaves(model, depth, q_leaf, v_leaf), topology_of(model, topology), root_B, options)
-
-
-def by_width(leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], options: Expectimax) -> Lookahead:
-    """`expectimax`, with leaves and topology at hand."""
-    if options.max_width is None:
-        return full_width(leaves, topology, root_B, max_nodes=options.max_nodes)
-    return pruned(leaves, topology, root_B, max_width=options.max_width, max_nodes=options.max_nodes)
+    leaves, topology = Leaves(model, depth, q_leaf, v_leaf), topology_of(model, topology)
+    return search_levels(leaves, topology, root_B, max_nodes=options.max_nodes, max_width=options.max_width)
 
 
 @torch.no_grad()
-def full_width(leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_nodes: int) -> Lookahead:
-    """Expand all states of all levels, value the leaves, back up."""
+def search_levels(
+    leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_nodes: int, max_width: int | None = None
+) -> Lookahead:
+    """`expectimax`, with leaves and topology at hand: expand the levels, value the leaves, back up."""
+    if max_width is not None:
+        return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
     calls_before, expansions = topology.table.model_calls, leaves.expansions
     levels = topology.levels(root_B, expansions, max_nodes=max_nodes)
     bottom = levels.leaves(expansions)

@@ -14,7 +14,6 @@ from pgts_torch.search.outcome_table import has_weight
 from pgts_torch.search.topology import Topology
 
 
-@torch.no_grad()
 def pruned(
     leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_width: int, max_nodes: int
 ) -> Lookahead:

@@ -11,7 +11,7 @@ from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
 from pgts_torch.options.search import MAX_BYTES, MAX_NODES, Sampled
 from pgts_torch.search.bootstrap import Step, bootstrap, spread
 from pgts_torch.search.empirical import Empirical, Share
-from pgts_torch.search.expectimax import full_width
+from pgts_torch.search.expectimax import search_levels
 from pgts_torch.search.levels import back_up
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_roots, unexpanded
 from pgts_torch.search.memory import RESAMPLED
@@ -96,7 +96,7 @@ def sparse(
     if all(C is None for C in plan):
         assert isinstance(model, EnumeratingModel)
         topology = Topology(model, max_bytes=options.max_bytes)
-        return full_width(leaves, topology, root_B, max_nodes=options.max_nodes)
+        return search_levels(leaves, topology, root_B, max_nodes=options.max_nodes)
     empirical = Empirical(model, root_B, samples=plan, share=options.share, key=key)
     topology = Topology(empirical, max_bytes=options.max_bytes)
     # The empirical model's states are nodes: expand them, value the lowest, back up as in `expectimax`.

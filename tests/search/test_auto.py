@@ -43,8 +43,7 @@ def widths(monkeypatch) -> Callable[[Callable[[int], int]], list[int | None]]:
                 raise NodeBudgetExceeded(f"it has {nodes} nodes")
             return found(nodes, root_B)
 
-        monkeypatch.setattr(auto, "full_width", search)
-        monkeypatch.setattr(auto, "pruned", search)
+        monkeypatch.setattr(auto, "search_levels", search)
         return tried
 
     return replace

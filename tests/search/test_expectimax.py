@@ -53,14 +53,14 @@ def walkable_depth(mdp: TabularMDP, most_paths: int = 4_000) -> int:
 def test_all_states_at_once_and_each_alone_have_T_to_the_m_of_any_q_and_v(name):
     mdp, model = zoo(name), TabularModel(zoo(name))
     topology, q_SA, v_S = Topology(model), some_q(mdp), some_v(mdp)
-    q_of_v = q_of(mdp, v_S)
-    for depth in DEPTHS:
-        of_q, of_v = exact.lookahead(mdp, q_SA, depth), exact.lookahead(mdp, q_of_v, depth)
-        for roots in [all_states(mdp), *(torch.tensor([s]) for s in few_states(mdp))]:
+    of_q = [exact.lookahead(mdp, q_SA, depth) for depth in DEPTHS]
+    of_v = [exact.lookahead(mdp, q_of(mdp, v_S), depth) for depth in DEPTHS]
+    for roots in [all_states(mdp), *(torch.tensor([s]) for s in few_states(mdp))]:
+        for depth in DEPTHS:
             by_q = expectimax(model, roots, depth=depth, q_leaf=Critic(q_SA), topology=topology)
             by_v = expectimax(model, roots, depth=depth, v_leaf=Critic(v_S), topology=topology)
-            assert_close(by_q.q_BA, of_q[roots])
-            assert_close(by_v.q_BA, of_v[roots])
+            assert_close(by_q.q_BA, of_q[depth][roots])
+            assert_close(by_v.q_BA, of_v[depth][roots])
 
 
 @pytest.mark.parametrize("name", [name for name in ZOO if name != "Taxi"])
