@@ -49,7 +49,7 @@ def pendulum(**kwargs) -> PGTS:
     return PGTS("Pendulum-v1", **SHORT | {"actions_per_dimension": 5} | kwargs)
 
 
-def test_pendulum_is_trained_evaluated_saved_and_used_by_one_knob(tmp_path):
+def test_pendulum_is_trained_evaluated_saved_and_used_with_one_option(tmp_path):
     model = pendulum()
     assert isinstance(model.world, DynamicsWorld)
     assert model.iterate().look.q_BA.shape[-1] == 5
@@ -147,7 +147,7 @@ def test_continuous_actions_need_no_model_where_advantages_are_sampled():
         (3, {}, "the environment is 3; it must be a Gymnasium id, an environment, a function that makes one"),
     ],
 )
-def test_what_cannot_be_acted_in_is_refused_by_name(env, options, message):
+def test_environments_that_no_agent_can_act_in_are_refused_by_name(env, options, message):
     with pytest.raises(PgtsError, match=message):
         PGTS(env, **SHORT, **options)
 
@@ -176,7 +176,7 @@ def test_actions_that_are_counted_from_elsewhere_are_numbered(tmp_path):
     assert set(loaded.predict(np.zeros((50, 2)), deterministic=False).tolist()) == {5, 6}
 
 
-def test_more_combinations_than_a_policy_can_list_are_refused():
+def test_more_combinations_of_actions_than_10_000_are_refused():
     class Panel(Field):
         action_space = spaces.MultiDiscrete([10] * 5)
 

@@ -22,6 +22,7 @@ from pgts_torch.options import MLP, FixedHorizon
 from pgts_torch.seeding import sample_keys, seed_sequence, stream
 from tests.agent import cells
 from tests.agent.helpers import same_bits
+from tests.support import same_values
 
 KEYWORDS = {"num_envs": 3, "gamma": None, "observation_key": None, "plain": False, "device": "cpu"}
 
@@ -329,18 +330,7 @@ def cartpole(**kwargs) -> PGTS:
 
 
 def same_weights(first: PGTS, second: PGTS) -> bool:
-    pairs = [(first.state_dict()[part], second.state_dict()[part]) for part in ("policy", "critic")]
-    return all(same_values(*pair) for pair in pairs)
-
-
-def same_values(first: object, second: object) -> bool:
-    if isinstance(first, Tensor):
-        return torch.equal(first, second)
-    if isinstance(first, dict):
-        return first.keys() == second.keys() and all(same_values(first[name], second[name]) for name in first)
-    if isinstance(first, list | tuple):
-        return len(first) == len(second) and all(map(same_values, first, second))
-    return first == second
+    return all(same_values(first.state_dict()[part], second.state_dict()[part]) for part in ("policy", "critic"))
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
