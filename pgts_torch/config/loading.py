@@ -81,11 +81,14 @@ class _Given:
         """Add the values in a file. Whether it could be read as YAML."""
         try:
             document = strict_yaml.parse(_read(path))
-            self.data = _mapping(document.value)
+            if not isinstance(document.value, dict):
+                given = "empty" if document.value is None else show(document.value)
+                raise YamlMistake(f"the configuration is {given}; it must be a mapping of keys to values", None)
         except YamlMistake as mistake:
             where = f"{path}:{mistake.line}" if mistake.line else path
             self.mistakes.append((mistake.line or 0, f"{where}: {mistake.reason}"))
             return False
+        self.data = document.value
         self.mistakes += [(line, f"{path}:{line}: {reason}") for line, reason in document.mistakes]
         self.sources = {key: _Source(f"{path}:{at.line}", at.line, at.text) for key, at in document.places.items()}
         return True
@@ -134,8 +137,8 @@ class _Given:
         section[path[-1]] = document.value
         self.sources = {key: source for key, source in self.sources.items() if key[: len(path)] != path}
         flag = f"--{'.'.join(path)}"
-        self.sources |= {path: _Source(flag)}
-        self.sources |= {(*path, *key): _Source(flag, text=at.text) for key, at in document.places.items()}
+        places = {(): None} | {key: at.text for key, at in document.places.items()}
+        self.sources |= {(*path, *key): _Source(flag, text=text) for key, text in places.items()}
 
     def validated(self, *, is_whole: bool) -> Config | None:
         """Return the configuration; None after mistakes.
@@ -189,13 +192,6 @@ def _read(path: Path) -> str:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise YamlMistake(f"the configuration is not UTF-8 (at byte {error.start})", None) from None
-
-
-def _mapping(value: Any) -> dict[str, Any]:
-    if isinstance(value, dict):
-        return value
-    given = "empty" if value is None else show(value)
-    raise YamlMistake(f"the configuration is {given}; it must be a mapping of keys to values", None)
 
 
 def _value(text: str, nodes: Sequence[Node]) -> Document:

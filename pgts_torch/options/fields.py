@@ -56,11 +56,11 @@ RESERVED_KWARGS = {
 
 def _check_kwargs(kwargs: dict[str, Any]) -> dict[str, Any]:
     for name in kwargs:
+        key = f"env.kwargs.{name}"
         if not name.isidentifier():
-            reason = f"env.kwargs has the key {name!r}, which cannot be the name of an argument"
-            raise conflict(reason, f"env.kwargs.{name}")
+            raise conflict(f"env.kwargs has the key {name!r}, which cannot be the name of an argument", key)
         if name in RESERVED_KWARGS:
-            raise conflict(f"env.kwargs must not have the key {name}: {RESERVED_KWARGS[name]}", f"env.kwargs.{name}")
+            raise conflict(f"env.kwargs must not have the key {name}: {RESERVED_KWARGS[name]}", key)
     for value in _plain_values(kwargs):
         if isinstance(value, float) and not math.isfinite(value):
             raise conflict(f"env.kwargs holds {value}; numbers must be finite")
