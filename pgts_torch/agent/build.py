@@ -14,6 +14,7 @@ from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate, Update
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models.base import SamplingModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.arguments import checked, described
 from pgts_torch.options.critics import (
@@ -26,7 +27,8 @@ from pgts_torch.options.critics import (
     TabularValues,
 )
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import AutoPolicy, Network, Simplex, Softmax
+from pgts_torch.options.policies import MLP, AutoPolicy, Network, Simplex, Softmax
+from pgts_torch.options.replay import UniformReplay
 from pgts_torch.options.rollouts import Estimator, LookaheadAdvantages, SampledAdvantages
 from pgts_torch.options.search import MCTS, Auto, Expectimax, Kind, Sampled
 from pgts_torch.options.training import Training
@@ -50,6 +52,11 @@ _UPDATES: _Choices = {
     CMPO: CMPOUpdate,
 }
 
+_ONE_STEP: dict[str, Any] = {"num_epochs": 1, "minibatch_size": 4096, "max_grad_norm": 1.0}
+_SMALL_FITS = {**_ONE_STEP, "polyak": 0.05}
+_SMALL_STEPS = {**_ONE_STEP, "temperature": 1.0, "clip": 1.0}
+"""Options of network critics and updates that suit the many small updates of replay."""
+
 
 def make_device(device: torch.device | str) -> torch.device:
     """Return the torch device; PgtsError unless torch can compute there."""
@@ -68,15 +75,20 @@ def chosen(options: Training, world: World) -> Training:
         PgtsError: options that do not go together.
     """
     policy, critic, update = options.policy, options.critic, options.update
-    numbered = isinstance(world, TabularWorld)
+    numbered, replayed = isinstance(world, TabularWorld), isinstance(options.replay, UniformReplay)
     if isinstance(policy, AutoPolicy):
-        policy = Softmax() if numbered else default_network(world.observation_space)
+        network = default_network(world.observation_space)
+        if isinstance(network, MLP) and replayed:
+            network = MLP(normalize=True)
+        policy = Softmax() if numbered else network
     if isinstance(critic, AutoCritic):
-        critic = NetworkValues() if isinstance(policy, Network) else TabularValues()
+        fits = NetworkValues(**_SMALL_FITS) if replayed else NetworkValues()
+        critic = fits if isinstance(policy, Network) else TabularValues()
     if isinstance(critic, NetworkValues) and isinstance(critic.network, OwnNetwork) and isinstance(policy, Network):
         critic = critic.model_copy(update={"network": policy})
     if isinstance(update, AutoUpdate):
-        neural = PPO() if isinstance(options.estimator, SampledAdvantages) else CMPO()
+        lookahead = CMPO(**_SMALL_STEPS) if replayed else CMPO()
+        neural = PPO() if isinstance(options.estimator, SampledAdvantages) else lookahead
         update = neural if isinstance(policy, Network) else Projected() if isinstance(policy, Simplex) else Mirror()
     return checked(dict(options) | {"policy": policy, "critic": critic, "update": update})
 
@@ -130,9 +142,14 @@ def make_critic(
     if isinstance(options, TabularValues):
         return TabularCritic(*tabular.mdp_shape, options, device=world.device)
     if isinstance(options, RolloutValues):
+        if not isinstance(tabular.model, SamplingModel):
+            raise MissingModel(
+                f"{type(tabular.model).__name__} cannot sample outcomes, which the critic 'rollout' needs"
+            )
         return RolloutCritic(tabular.model, options)
     assert isinstance(options, ExactValues)
-    assert tabular.mdp is not None
+    if tabular.mdp is None:
+        raise PgtsError("the critic 'exact' needs the table of the environment, which is not known: take tabular")
     return ExactCritic(tabular.mdp, options)
 
 
@@ -149,7 +166,7 @@ def check_parts(arguments: Mapping[str, Any], world: World, policy: Policy, upda
 
 def plain(arguments: Mapping[str, Any], options: Training) -> dict[str, Any]:
     """Return the arguments of `PGTS` as plain values; PgtsError where a part was given as an object."""
-    for name in ("policy", "critic", "update"):
+    for name in ("policy", "critic", "update", "model"):
         if not isinstance(arguments[name], str | Mapping | Part | None):
             raise PgtsError(f"{name} was given as {arguments[name]!r}; only models made from descriptions can be saved")
     return {**arguments, **described(options), "env_kwargs": dict(arguments["env_kwargs"] or {})}

@@ -82,10 +82,20 @@ class Certificates:
         critic: gives v.
         num_depths: D.
         ranks: all of them get the same bounds.
+        samples_starts: whether the episodes begin in start states; if not, and mu is not known, there is no bound.
     """
 
-    def __init__(self, world: ModelWorld, search: Search, critic: Critic, *, num_depths: int, ranks: Ranks) -> None:
-        self._world, self._search, self._critic = world, search, critic
+    def __init__(
+        self,
+        world: ModelWorld,
+        search: Search,
+        critic: Critic,
+        *,
+        num_depths: int,
+        ranks: Ranks,
+        samples_starts: bool = True,
+    ) -> None:
+        self._world, self._search, self._critic, self._samples_starts = world, search, critic, samples_starts
         self._num_depths, self._ranks = num_depths, ranks
         self._upper: UpperBound | None = None
 
@@ -103,6 +113,11 @@ class Certificates:
             wanted: the option that needs a finite one, as the beginning of the message.
         """
         model = self._search.model
+        if self._world.start_S is None and not self._samples_starts:
+            raise PgtsError(
+                f"{wanted}; with replay no upper bound on the optimality gap is known, because start states are known "
+                "from episodes only, and imagined ones begin elsewhere: take a fixed depth without stop_at"
+            )
         if self._search.topology is None:
             raise PgtsError(
                 f"{wanted}; a search that samples outcomes gives no upper bound on the optimality gap: take a search "
@@ -186,7 +201,8 @@ class Certificates:
         span = self._search.model.highest_value - self._search.model.lowest_value
         width = self.width(num_episodes, number)
         is_complete = float(look.pruned_BA.max()) == 0
-        if not (is_complete and estimate + width < span):  # T^n w is no smaller than v_hat
+        # T^n w is no smaller than v_hat
+        if not (self._samples_starts and is_complete and estimate + width < span):
             return Bound(math.inf, gap)
         swept_N = self._smallest(lambda upper: upper.swept(state_N, expansions))
         certificate = float(prob_N @ (swept_N - v_N).abs()) + width

@@ -53,6 +53,24 @@ class Episodes:
         if self._one_by_one:
             self._each = list(iterate(self._env.observation_space, self.observation))
 
+    def restart(self, over_B: np.ndarray, seeds: list[int]) -> None:
+        """Begin new episodes in some environments.
+
+        Args:
+            over_B: in which.
+            seeds: one for each environment; only those of `over_B` are used.
+        """
+        self._seeds, self._over_B = seeds, self._over_B & ~over_B
+        if not self._one_by_one:
+            self.observation = self._env.reset(seed=seeds, options={"reset_mask": over_B})[0]  # type: ignore[arg-type]
+            return
+        assert isinstance(self._env, SyncVectorEnv)
+        for b in over_B.nonzero()[0]:
+            self._stepping = int(b)
+            self._each[b], _ = self._env.envs[b].reset(seed=seeds[b])
+        self._stepping = None
+        self._join()
+
     def step(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Take one step. Return rewards, discounts and truncations; they have no meaning outside `alive_B`.
 
@@ -81,7 +99,7 @@ class Episodes:
 
     def _step_alive(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert isinstance(self._env, SyncVectorEnv)
-        envs, space = self._env.envs, self._env.single_observation_space
+        envs = self._env.envs
         reward_B, discount_B = np.zeros((2, len(envs)))
         self._reward_B = reward_B
         truncated_B = np.zeros(len(envs), dtype=bool)
@@ -91,9 +109,14 @@ class Episodes:
             reward_B[b] = number_of("reward", reward)
             discount_B[b] = 0.0 if terminated else discount_of(info, self._gamma, named=self._names_discounts[b])
         self._stepping = None
-        rows: Any = create_empty_array(space, n=len(envs))
-        self.observation = concatenate(space, self._each, rows)
+        self._join()
         return reward_B, discount_B, truncated_B
+
+    def _join(self) -> None:
+        """Make one observation of those of all environments."""
+        space = self._env.single_observation_space
+        rows: Any = create_empty_array(space, n=len(self._each))
+        self.observation = concatenate(space, self._each, rows)
 
     @contextmanager
     def named(self, when: str) -> Iterator[None]:

@@ -67,6 +67,7 @@ class LookaheadEstimator(Estimator):
             centred(q_NA, pi_NA, rounding=rounding),
             weight_N,
             chosen.look.noise,
+            self._look.policy,
             state_N=state_N,
             pi_NA=pi_NA,
             **chosen._asdict(),

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
+from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.search.lookahead import Lookahead
 
@@ -19,12 +20,14 @@ class Batch:
     weight_N: w(s), the weight of each row in the update.
     noise: the standard error of the advantages of a sampled lookahead (root mean square), in reward units, by which
         normalised steps divide at least; 0 where nothing was sampled or no standard errors are computed.
+    policy: the policy pi that the batch is of, from which updates of networks start; None: the one that is updated.
     """
 
     observation_N: Shaped[Tensor, "N ..."]
     advantage_NA: Float[Tensor, "N A"]
     weight_N: Float[Tensor, "N"]
     noise: float = 0.0
+    policy: Policy | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

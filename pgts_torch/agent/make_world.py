@@ -38,7 +38,10 @@ from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_
 from pgts_torch.seeding import SharedGenerators, numpy_stream
 from pgts_torch.tabular.mdp import check_gamma
 
-_NO_MODEL_NEEDED = "; or take depth 0 and the estimator 'sampled', which need no model"
+_WAYS_OUT = (
+    "; a model can be learned from its steps: model 'ensemble' where observations are vectors, 'counts' where they are "
+    "numbers; or take depth 0 and the estimator 'sampled', which need no model"
+)
 
 DEFAULT_GAMMA = 0.99
 """Discount where neither the caller nor the environment names one."""
@@ -53,6 +56,7 @@ def make_world(
     plain: bool,
     action_repeat: int = 1,
     device: torch.device | str,
+    other: Callable[[VectorEnv, float], ModelWorld] | None = None,
 ) -> World:
     """Make the world of an environment, with the first model of table, dynamics and simulator that applies to it.
 
@@ -62,6 +66,7 @@ def make_world(
         observation_key: the entry of dictionary observations that is used.
         plain: whether no model is needed: then only a table is looked for, and without one the world has no model.
         action_repeat: how often an action is taken in one outcome of the model (`TensorModel`).
+        other: makes the world of environments and their discount, with a model that is learned or the caller's own.
 
     Raises:
         PgtsError: the environment does not exist, or no agent can act in it; or actions are to be repeated in a table,
@@ -71,13 +76,15 @@ def make_world(
     env = source.make(num_envs) if source.given is None else source.given
     discount = DEFAULT_GAMMA if gamma is None else gamma
     check_gamma(discount)
+    if other is not None:
+        return other(env, discount)
     request = _Request(source, env, discount, observation_key, action_repeat, torch.device(device))
     with SharedGenerators(0, "models"):
         world, reasons = _first_model(request, (_table,) if plain else (_table, _dynamics, _simulator))
     if world is not None:
         return world
     if not plain:
-        raise MissingModel("; ".join(reversed(reasons)) + _NO_MODEL_NEEDED)
+        raise MissingModel("; ".join(reversed(reasons)) + _WAYS_OUT)
     for wrapper in wrappers_of(each_of(env)[0]):
         if isinstance(wrapper, NormalizeObservation | NormalizeReward):
             raise PgtsError(

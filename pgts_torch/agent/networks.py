@@ -234,6 +234,15 @@ class Network(nn.Module):
         return torch.cat([self.forward(self.encode(piece)) for piece in observation_N.split(self._most_rows)])
 
     @torch.no_grad()
+    def follow(self, other: "Network", rate: float) -> None:
+        """Move the weights toward those of a network of the same shape by this share of the difference, and take over
+        its running statistics."""
+        for moved, aim in zip(self.weights, other.weights, strict=True):
+            moved.lerp_(aim, rate)
+        for statistic, present in zip(self.buffers(), other.buffers(), strict=True):
+            statistic.copy_(present)
+
+    @torch.no_grad()
     def plain_state(self) -> dict[str, Tensor]:
         """Return weights and running statistics, copied to the CPU."""
         return {name: value.to("cpu", copy=True) for name, value in self._named.items()}

@@ -260,10 +260,7 @@ class NetworkCritic(Critic):
     def _move_target_network(self) -> None:
         if not self._lags or self._num_fits % self.options.target_period:
             return
-        for moved, aim in zip(self._target_network.weights, self.network.weights, strict=True):
-            moved.lerp_(aim, self.options.polyak)
-        for statistic, present in zip(self._target_network.buffers(), self.network.buffers(), strict=True):
-            statistic.copy_(present)
+        self._target_network.follow(self.network, self.options.polyak)
 
 
 def _shares_trunk(policy: Policy, network: Network) -> bool:

@@ -164,7 +164,7 @@ class PPOUpdate(NetworkUpdate):
     def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
         """Losses: policy, minus the objective without entropy, mean over the steps; grad_norm, mean, before clipping;
         clip_fraction, the probability of actions whose rho is out of range after the steps; num_steps."""
-        old_NA, advantage_NA = log_probs(network, input_N), batch.advantage_NA.float()
+        old_NA, advantage_NA = log_probs_before(network, input_N, batch), batch.advantage_NA.float()
         weight_N = batch.weight_N / batch.weight_N.mean()
         if self.options.normalize_advantage:
             advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N)
@@ -219,6 +219,11 @@ def entropy(log_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
 def divergence(log_p_NA: Float[Tensor, "N A"], log_q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
     """KL(p(.|s) || q(.|s)) in nats, from log p and log q."""
     return (log_p_NA.exp() * (log_p_NA - log_q_NA)).sum(-1)
+
+
+def log_probs_before(network: Network, input_N: Float[Tensor, "N ..."], batch: Batch) -> Float[Tensor, "N A"]:
+    """log pi of the policy that the batch is of, from which the update starts."""
+    return log_probs(batch.policy.network if isinstance(batch.policy, NetworkPolicy) else network, input_N)
 
 
 @torch.no_grad()

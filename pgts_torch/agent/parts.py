@@ -1,25 +1,35 @@
 """Make the parts of a training from the arguments of `PGTS`."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
+
+import torch
+from gymnasium.vector import VectorEnv
 
 from pgts_torch.agent.build import check_parts, chosen, make_critic, make_policy, make_search, make_update
 from pgts_torch.agent.certificate import Certificates
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.depth import DepthChoice
+from pgts_torch.agent.dyna import Dyna
 from pgts_torch.agent.estimators import Estimator, LookaheadEstimator, SampledEstimator
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.model_check import ModelCheck
+from pgts_torch.agent.ongoing import OngoingEpisodes
+from pgts_torch.agent.own_models import learned_world, world_of
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.base import Model
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.options.arguments import read
-from pgts_torch.options.rollouts import SampledAdvantages
+from pgts_torch.options.models import LEARNED
+from pgts_torch.options.replay import UniformReplay
+from pgts_torch.options.rollouts import SampledAdvantages, StepsHorizon
 from pgts_torch.options.training import Training
 from pgts_torch.search.engine import Search
 from pgts_torch.seeding import SharedGenerators
@@ -39,11 +49,14 @@ class Parts(NamedTuple):
     depth_choice: DepthChoice | None
     estimator: Estimator
     model_check: ModelCheck
+    episodes: OngoingEpisodes | None
+    dyna: Dyna | None
 
     @property
     def model_calls(self) -> int:
-        """For how many (state, action) lookahead and critic have queried the model so far, in this process."""
-        return self.critic.model_calls + (self.search.model_calls if self.search is not None else 0)
+        """For how many (state, action) the model has been queried so far in this process, but for its check."""
+        searched = 0 if self.search is None else self.search.model_calls
+        return self.critic.model_calls + searched + (0 if self.dyna is None else self.dyna.model_calls)
 
 
 def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
@@ -56,7 +69,7 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
     Raises:
         PgtsError, MissingModel, ModelMismatch: as `PGTS`.
     """
-    options, seed = read(arguments), arguments["seed"]
+    options, seed = read(arguments).resolved(), arguments["seed"]
     source, world = _environments(arguments, options, ranks)
     options = chosen(options, world)
     policy, critic, update = (arguments[name] for name in ("policy", "critic", "update"))
@@ -66,34 +79,68 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
         critic = make_critic(options.critic, world, policy, options.estimator, seed=seed)
     if not isinstance(update, Update):
         update = make_update(options.update, policy)
-    search, certificates, depth_choice = None, None, None
+    model_check = ModelCheck(
+        world,
+        mode=options.search.model_check,
+        is_queried=not isinstance(options.estimator, SampledAdvantages),
+        seed=seed,
+        ranks=ranks,
+    )
+    search, certificates, depth_choice, dyna = None, None, None, None
+    if isinstance(options.replay, UniformReplay):
+        assert isinstance(world, ModelWorld)
+        dyna = Dyna(world, policy, options.replay, model_check)
     if isinstance(options.estimator, SampledAdvantages):
         estimator: Estimator = SampledEstimator(policy, critic, options.estimator.lambda_, update.state_weight)
     else:
         search = make_search(options.search, world)
         assert isinstance(world, ModelWorld)
         depths, stop_at = options.search.depths, options.search.stop_at
-        certificates = Certificates(world, search, critic, num_depths=len(depths), ranks=ranks)
+        certificates = Certificates(
+            world, search, critic, num_depths=len(depths), ranks=ranks, samples_starts=dyna is None
+        )
         if stop_at is not None:
             certificates.check(f"stop_at is {stop_at}")
         if options.search.depth == "adaptive":
             certificates.check("depth is adaptive")
-        look = PolicyLookahead(world, policy, critic, search, ranks)
+        followed = policy if dyna is None else dyna.policy
+        look = PolicyLookahead(world, followed, critic, search, ranks)
         tolerance = options.search.filled("adaptive").tolerance
         depth_choice = DepthChoice(look, certificates, depths=depths, tolerance=tolerance, stop_at=stop_at)
         estimator = LookaheadEstimator(depth_choice, update.state_weight)
-    model_check = ModelCheck(
-        world, mode=options.search.model_check, is_queried=search is not None, seed=seed, ranks=ranks
-    )
     check_parts(arguments, world, policy, update)
+    horizon, episodes = options.rollout.horizon, None
+    if isinstance(horizon, StepsHorizon):
+        max_length = source.time_limit if horizon.max_length is None else horizon.max_length
+        episodes = OngoingEpisodes(world, max_length=max_length, seed=seed, names=ranks.names)
     return Parts(
-        options, source, world, policy, critic, update, search, certificates, depth_choice, estimator, model_check
+        options,
+        source,
+        world,
+        policy,
+        critic,
+        update,
+        search,
+        certificates,
+        depth_choice,
+        estimator,
+        model_check,
+        episodes,
+        dyna,
     )
 
 
 def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks) -> tuple[EnvSource, World]:
     """Return the source of environments, and the world of this rank's part of them."""
+    assert options.rollout.num_envs is not None
     num_envs, given = options.rollout.num_envs, ("gamma", "actions_per_dimension")
+    model, device = arguments["model"], torch.device(arguments["device"])
+    shared = {"observation_key": arguments["observation_key"], "device": device}
+    other = None
+    if isinstance(model, Model):
+        other = partial(_with_model, model, shared)
+    elif isinstance(options.model, LEARNED):
+        other = partial(_with_learned, options, shared, arguments["seed"])
     with SharedGenerators(arguments["seed"], "construction"):
         source = EnvSource.of(
             arguments["env"], kwargs=arguments["env_kwargs"], **{name: arguments[name] for name in given}
@@ -110,8 +157,20 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
             observation_key=arguments["observation_key"],
             plain=isinstance(options.estimator, SampledAdvantages),
             action_repeat=options.search.action_repeat,
-            device=arguments["device"],
+            device=device,
+            other=other,
         )
     if arguments["reward_range"] is not None:
         world.promise(RewardRange.of(arguments["reward_range"]))
     return source, world
+
+
+def _with_model(model: Model, shared: Mapping[str, Any], env: VectorEnv, gamma: float) -> ModelWorld:
+    return world_of(env, model, gamma=gamma, **shared)
+
+
+def _with_learned(options: Training, shared: Mapping[str, Any], seed: int, env: VectorEnv, gamma: float) -> ModelWorld:
+    assert isinstance(options.model, LEARNED)
+    capacity = options.replay.capacity if isinstance(options.replay, UniformReplay) else UniformReplay().capacity
+    repeat = options.search.action_repeat
+    return learned_world(env, options.model, gamma=gamma, action_repeat=repeat, capacity=capacity, seed=seed, **shared)

@@ -14,14 +14,16 @@ from tqdm import tqdm
 from pgts_torch.agent import saved, saving
 from pgts_torch.agent.build import Description, make_device, plain
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.iteration import Iteration
+from pgts_torch.agent.iteration import Iteration, PolicyBatch
 from pgts_torch.agent.model_check import Mode
 from pgts_torch.agent.parts import make_parts
 from pgts_torch.agent.policies import Policy, exact_probs
-from pgts_torch.agent.ranks import present_ranks
+from pgts_torch.agent.ranks import Draws, present_ranks
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.base import Model
 from pgts_torch.models.environments import Given
 from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.seeding import stream
@@ -84,7 +86,9 @@ class PGTS:
         policy: Description | Policy | None = None,
         critic: Description | Critic | None = None,
         update: Description | Update | None = None,
-        horizon: Description = "fixed",
+        model: Description | Model = "auto",
+        replay: Description = "auto",
+        horizon: Description = "auto",
         num_envs: int | None = None,
         actions_per_dimension: int | None = None,
         action_repeat: int = 1,
@@ -101,7 +105,8 @@ class PGTS:
         self.seed, self.device, self.ranks = seed, make_device(device), present_ranks()
         parts = self._parts = make_parts(arguments, self.ranks)
         self.options, self.source, self.world, self.policy, self.critic, self.update = parts[:6]
-        self.search, self.certificates, self.depth_choice, self.estimator, self.model_check = parts[6:]
+        self.search, self.certificates, self.depth_choice, self.estimator, self.model_check = parts[6:11]
+        self.episodes, self.dyna = parts[11:]
         self.gamma, self.horizon = self.world.gamma, self.options.rollout.horizon
         self.num_iterations = self.num_env_steps = self.num_model_calls = 0
         self._arguments = arguments | {"env": self.source.description, "device": str(self.device)}
@@ -116,26 +121,38 @@ class PGTS:
         calls_before = self._parts.model_calls
 
         # Visit states with pi_k: those where the estimate d(s) of d^{pi_k}(s) is positive.
-        experience = visit(self.world, self.policy, self.horizon, draws, self.ranks)
-
-        # Line 2: estimate Q^{pi_k}.
-        losses = self.estimator.evaluate(experience, draws)
-
-        # Look m steps ahead from the visited states: (T^m Q^{pi_k})(s, .).
-        batch = self.estimator(experience, draws)
-
-        # Check the episodes against the model, before pi is updated.
-        self.model_check(experience, self.num_iterations)
-
-        # Line 3: pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta_k d(s) (T^m Q^{pi_k})(s, .) ], unless pi_k is good enough.
-        if not batch.is_enough:
-            losses |= self.update(self.policy, batch, generator=draws.common)
+        experience = visit(self.world, self.policy, self.episodes, self.horizon, draws, self.ranks)
+        if self.dyna is None:
+            batch, losses = self._improve(experience, draws)
+        else:
+            # Learn from many imagined rollouts, which start in states visited so far.
+            losses = self.dyna.learn(experience, draws)
+            for imagined, own_draws in self.dyna.rollouts(draws):
+                batch, latest = self._improve(imagined, own_draws)
+            losses |= latest
 
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
         model_calls = self.ranks.total(self._parts.model_calls - calls_before, self.policy.state_dict)
         self.num_model_calls += model_calls
         return Iteration(**vars(batch), experience=experience, losses=losses, model_calls=model_calls)
+
+    def _improve(self, rollout: Rollout, draws: Draws) -> tuple[PolicyBatch, dict[str, float]]:
+        """Estimate Q^pi from a rollout, look m steps ahead, update pi. Return the batch, and the losses by name."""
+        # Line 2: estimate Q^{pi_k}.
+        losses = self.estimator.evaluate(rollout, draws)
+
+        # Look m steps ahead from the visited states: (T^m Q^{pi_k})(s, .).
+        batch = self.estimator(rollout, draws)
+
+        # Check steps of the environment against the model, before pi is updated.
+        if self.dyna is None:
+            self.model_check(rollout, self.num_iterations)
+
+        # Line 3: pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta_k d(s) (T^m Q^{pi_k})(s, .) ], unless pi_k is good enough.
+        if not batch.is_enough:
+            losses |= self.update(self.policy, batch, generator=draws.common)
+        return batch, losses
 
     @property
     def mdp(self) -> TabularMDP:

@@ -33,6 +33,7 @@ class PolicyLookahead:
 
     def __init__(self, world: ModelWorld, policy: Policy, critic: Critic, search: Search, ranks: Ranks) -> None:
         self.world, self.policy, self.critic, self.search, self._ranks = world, policy, critic, search, ranks
+        self._generation = world.model.generation
         self._leaves = {f"{critic.target}_leaf": self._leaf, "prior": self._prior}
 
     def __call__(self, state_N: Int[Tensor, "N"], depth: int, generator: torch.Generator) -> Lookahead:
@@ -54,9 +55,11 @@ class PolicyLookahead:
         return _moved(_joined([look for look in looks if look is not None]), state_N.device)
 
     def restart(self) -> None:
-        """Reset the search before an iteration in which states get new numbers."""
-        if not self.world.keeps_numbers:
+        """Reset the search before a lookahead for which states have got new numbers, or the model has learned."""
+        generation = self.world.model.generation
+        if not self.world.keeps_numbers or generation != self._generation:
             self.search.reset()
+            self._generation = generation
 
     def _leaf(self, state_N: Int[Tensor, "N"]) -> Tensor:
         observation_N = self.world.observe(state_N)

@@ -55,7 +55,7 @@ class Ranks:
         names = ("iteration", number)
         own = stream(seed, *names, *self.names, device=device)
         common = own if self.size == 1 else stream(seed, *names, "common", device=device)
-        return Draws(seed, number, (*names, *self.names), own, common)
+        return Draws(seed, number, (*names, *self.names), own, common, names)
 
     def gather(self, what: str, make: Callable[[], T]) -> list[T]:
         """Return the results of `make` in all processes, in the order of ranks. All processes must call it alike.
@@ -130,10 +130,17 @@ class Draws:
     names: tuple[str | int, ...]
     own: torch.Generator
     common: torch.Generator
+    _common_names: tuple[str | int, ...]
 
     def search(self) -> torch.Generator:
         """A new generator for a search; all searches of an iteration get the same random numbers."""
-        return stream(self.seed, "iteration", self.number, "search", device=self.own.device)
+        return stream(self.seed, *self._common_names, "search", device=self.own.device)
+
+    def update(self, number: int) -> "Draws":
+        """The random generators of one of several updates of the iteration, which all processes make alike."""
+        names = (*self._common_names, "update", number)
+        common = stream(self.seed, *names, device=self.own.device)
+        return Draws(self.seed, self.number, names, common, common, names)
 
 
 def present_ranks() -> Ranks:

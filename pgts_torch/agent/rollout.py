@@ -1,10 +1,11 @@
 """Rollouts: episodes of a policy in an environment, or in a model of it."""
 
 import warnings
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from pgts_torch.agent.episodes import Episodes
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import SamplingModel
+from pgts_torch.models.base import Experience, SamplingModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, Horizon
 from pgts_torch.options.updates import StateWeight
@@ -56,6 +57,8 @@ class Rollout:
         (geometric horizon); 0 where the episode is over.
     survival_TB: the factor from one weight to the next: weight_{t+1} = weight_t * survival_t.
     state_UB: the states of these observations, which a lookahead may start from; None where there is no model.
+    finished: the undiscounted return and the length of each episode that ended, where episodes go on from one rollout
+        to the next; None: all begin in this one.
     """
 
     observation_UB: Shaped[Tensor, "U B ..."]
@@ -66,6 +69,7 @@ class Rollout:
     weight_TB: Float[Tensor, "T B"]
     survival_TB: Float[Tensor, "T B"]
     state_UB: Int[Tensor, "U B"] | None = None
+    finished: tuple[tuple[float, int], ...] | None = None
 
     @property
     def observation_V(self) -> Shaped[Tensor, "V ..."]:
@@ -97,6 +101,17 @@ class Rollout:
     def follows_TB(self) -> Bool[Tensor, "T B"]:
         """Whether the next row is another step of the same episode."""
         return torch.cat([self.alive_TB[1:], torch.zeros_like(self.alive_TB[:1])])
+
+    def steps(self) -> Experience:
+        """All steps, those of the first episode first."""
+        alive_BT = self.alive_TB.T
+
+        def rows(column_TB: Tensor) -> Tensor:
+            return column_TB.transpose(0, 1)[alive_BT]
+
+        before_N, after_N = rows(self.observation_UB[:-1]), rows(self.observation_UB[1:])
+        action_N, reward_N, discount_N = rows(self.action_TB), rows(self.reward_TB), rows(self.discount_TB)
+        return Experience(before_N, action_N, reward_N, discount_N, after_N, rows(self.follows_TB))
 
     def values(self, v: Callable[[Tensor], Tensor]) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
         """Return v(s_t) and v(s_{t+1}); they have no meaning where the episode is over.
@@ -178,17 +193,25 @@ def rollout(
         UserWarning: an environment uses the generators of the whole process, once for each world.
     """
     seeds = seed_sequence(seed, *names, "env").generate_state(world.env.num_envs).tolist()
-    shared = SharedGenerators(seed, *names)
-    with nullcontext() if world.draws_its_own else shared:
-        made = _episodes(world, policy, horizon, seeds, generator)
+    with shared_generators(world, seed, names):
+        return _episodes(world, policy, horizon, seeds, generator)
+
+
+@contextmanager
+def shared_generators(world: World, seed: int, names: tuple[str | int, ...]) -> Iterator[None]:
+    """A context in which the generators of the whole process are seeded, in case the environments use these."""
+    if world.draws_its_own:
+        yield
+        return
+    with SharedGenerators(seed, *names) as shared:
+        yield
     if shared.used and not world.warned:
         world.warned = True
         warnings.warn(
             f"{env_name(world.env)} uses the generator of {shared.used[0]}, which the whole process shares: it is "
             "seeded for each iteration and restored afterwards; better use self.np_random",
-            stacklevel=3,
+            stacklevel=4,
         )
-    return made
 
 
 def _episodes(world: World, policy: Policy, horizon: Horizon, seeds: list[int], generator: torch.Generator) -> Rollout:
@@ -220,9 +243,10 @@ def _episodes(world: World, policy: Policy, horizon: Horizon, seeds: list[int], 
         weight_B = weight_B * survival_B
         alive_B = alive_B & (survival_B > 0) & ~truncated_B
     check_end(horizon, int(alive_B.sum()))
-    columns = (torch.from_numpy(np.array(column)).to(world.device) for column in zip(*rows, strict=True))
+    arrays = (torch.from_numpy(np.array(column)).to(world.device) for column in zip(*rows, strict=True))
+    columns: dict[str, Any] = dict(zip(COLUMNS, arrays, strict=True))
     state_UB = model_world.numbers(torch.cat(reads)).view(len(reads), -1) if model_world else None
-    return Rollout(torch.stack(observations), **dict(zip(COLUMNS, columns, strict=True)), state_UB=state_UB)
+    return Rollout(torch.stack(observations), **columns, state_UB=state_UB)
 
 
 def simulated_returns(

@@ -10,6 +10,7 @@ from gymnasium.vector import VectorEnv
 
 from pgts_torch.agent import saving
 from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.dyna import Dyna
 from pgts_torch.agent.parts import Parts
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.ranks import Ranks
@@ -36,7 +37,13 @@ def state_of(parts: Parts, ranks: Ranks) -> dict[str, Any]:
     """Return the states of the parts of a training: tensors on the CPU and plain values."""
     searches = ranks.gather("searches", lambda: _search_state(parts))
     learned = {name: part.state_dict() for name, part in _learned(parts).items()}
-    return {**learned, "searches": dict(enumerate(searches)), "model_check": parts.model_check.state_dict()}
+    episodes = ranks.gather("episodes", lambda: {} if parts.episodes is None else parts.episodes.state_dict())
+    return {
+        **learned,
+        "searches": dict(enumerate(searches)),
+        "episodes": dict(enumerate(episodes)),
+        "model_check": parts.model_check.state_dict(),
+    }
 
 
 @torch.inference_mode(False)
@@ -48,7 +55,7 @@ def restore(parts: Parts, ranks: Ranks, state: dict[str, Any]) -> tuple[int, int
         PgtsError: the part of it that does not fit is named.
     """
     learned, check = _learned(parts), parts.model_check
-    check_keys("the saved state", state, {*learned, "searches", "model_check", *COUNTERS})
+    check_keys("the saved state", state, {*learned, "searches", "episodes", "model_check", *COUNTERS})
     for name in COUNTERS:
         check_count(name, state[name], least=0)
     before = {name: part.state_dict() for name, part in learned.items()}
@@ -57,6 +64,7 @@ def restore(parts: Parts, ranks: Ranks, state: dict[str, Any]) -> tuple[int, int
             load_checked(name, state[name], part.load_state_dict, part.state_dict)
         parts.update.check(parts.policy)
         _restore_search(parts, ranks, state["searches"])
+        _restore_episodes(parts, ranks, state["episodes"])
         load_checked("model_check", state["model_check"], check.load_state_dict, check.state_dict, is_all=False)
     except PgtsError:
         for name, part in learned.items():
@@ -65,8 +73,14 @@ def restore(parts: Parts, ranks: Ranks, state: dict[str, Any]) -> tuple[int, int
     return state["num_iterations"], state["num_env_steps"], state["num_model_calls"]
 
 
-def _learned(parts: Parts) -> dict[str, Policy | Critic | Update]:
-    return {"policy": parts.policy, "critic": parts.critic, "update": parts.update}
+def _learned(parts: Parts) -> dict[str, Policy | Critic | Update | Dyna]:
+    """The parts that learn, of which all ranks have the same state."""
+    learned: dict[str, Policy | Critic | Update | Dyna] = {
+        "policy": parts.policy,
+        "critic": parts.critic,
+        "update": parts.update,
+    }
+    return learned if parts.dyna is None else {**learned, "dyna": parts.dyna}
 
 
 def _search_state(parts: Parts) -> dict[str, Any]:
@@ -91,6 +105,20 @@ def _restore_search(parts: Parts, ranks: Ranks, searches: Any) -> None:
         certificates.load_state_dict(state["upper"])
 
     load_checked(f"searches.{rank}", searches[rank], load, lambda: _search_state(parts), has_bounds=True)
+
+
+def _restore_episodes(parts: Parts, ranks: Ranks, states: Any) -> None:
+    """Restore the episodes of this rank that go on."""
+    if parts.episodes is None:
+        return
+    if not isinstance(states, Mapping) or set(states) != set(range(ranks.size)):
+        raise PgtsError(
+            f"the saved state has the episodes of {len(states)} processes, which go on in the environments of each; "
+            f"this training has {ranks.size}: take as many"
+        )
+    load_checked(
+        f"episodes.{ranks.rank}", states[ranks.rank], parts.episodes.load_state_dict, parts.episodes.state_dict
+    )
 
 
 def load_training(

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
-from pgts_torch.agent.neural_updates import Move, NetworkUpdate, divergence, log_probs, mean, passes
+from pgts_torch.agent.neural_updates import Move, NetworkUpdate, divergence, log_probs, log_probs_before, mean, passes
 from pgts_torch.options.updates import CMPO, Mirror
 
 
@@ -33,7 +33,7 @@ class TargetUpdate(NetworkUpdate):
 
         Where step(s, a) is 0 everywhere no gradient step is taken, because Adam would turn rounding errors into one.
         """
-        old_NA, exponent_NA = log_probs(network, input_N), self.exponent(batch)
+        old_NA, exponent_NA = log_probs_before(network, input_N, batch), self.exponent(batch)
         if not bool(exponent_NA.any()):
             return Move(old_NA, old_NA, {"policy": 0.0, "grad_norm": 0.0})
         target_NA = (old_NA + exponent_NA).log_softmax(-1)

@@ -6,16 +6,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pgts_torch.agent.ongoing import OngoingEpisodes
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.ranks import Draws, Ranks
-from pgts_torch.agent.rollout import COLUMNS, Horizon, Rollout, rollout
+from pgts_torch.agent.rollout import COLUMNS, Rollout, rollout
 from pgts_torch.agent.world import ModelWorld, World
 
 
-def visit(world: World, policy: Policy, horizon: Horizon, draws: Draws, ranks: Ranks) -> Rollout:
-    """Run one episode of the policy in each environment of all ranks. All ranks number the states of the batch alike.
+def visit(
+    world: World, policy: Policy, episodes: OngoingEpisodes | None, horizon: Any, draws: Draws, ranks: Ranks
+) -> Rollout:
+    """Run the policy in each environment of all ranks. All ranks number the states of the batch alike.
 
     Args:
+        episodes: the episodes that go on; None: each environment runs one episode, from a reset.
+        horizon: when they end; for episodes that go on, how many steps an iteration takes.
         world: of this rank. Its states are numbered from 0 again, unless they keep their numbers.
         draws: the random generators of the iteration.
 
@@ -24,7 +29,11 @@ def visit(world: World, policy: Policy, horizon: Horizon, draws: Draws, ranks: R
     """
     if isinstance(world, ModelWorld):
         world.reset_numbers()
-    make = partial(rollout, world, policy, horizon, seed=draws.seed, names=draws.names, generator=draws.own)
+    if episodes is None:
+        make = partial(rollout, world, policy, horizon, seed=draws.seed, names=draws.names, generator=draws.own)
+    else:
+        length = horizon.length if draws.number else horizon.first
+        make = partial(episodes.collect, policy, length, names=draws.names, generator=draws.own)
     if ranks.size == 1:
         return make()
     parts = ranks.gather("episodes", lambda: _sent(world, make()))
@@ -36,7 +45,8 @@ def visit(world: World, policy: Policy, horizon: Horizon, draws: Draws, ranks: R
         world.reset_numbers()  # this rank's own numbers are replaced by those that all ranks have in common
         numbered = (world.adopt(part["states"]).view(len(part["alive_TB"]) + 1, -1) for part in parts)
         state_UB = torch.cat([_extended(part_UB, length) for part_UB in numbered], 1)
-    return Rollout(observation_UB, **columns, state_UB=state_UB)
+    finished = None if episodes is None else tuple(each for part in parts for each in part["finished"])
+    return Rollout(observation_UB, **columns, state_UB=state_UB, finished=finished)
 
 
 def _sent(world: World, made: Rollout) -> dict[str, Any]:
@@ -44,7 +54,7 @@ def _sent(world: World, made: Rollout) -> dict[str, Any]:
     columns = {name: getattr(made, name).cpu() for name in COLUMNS}
     if isinstance(world, ModelWorld) and made.state_UB is not None:
         columns["states"] = world.export(made.state_UB.flatten())
-    return {"observations": made.observation_UB.cpu(), **columns}
+    return {"observations": made.observation_UB.cpu(), "finished": made.finished, **columns}
 
 
 def _extended(x_UB: Tensor, length: int) -> Tensor:

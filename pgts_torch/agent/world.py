@@ -144,10 +144,12 @@ class ModelWorld(World, ABC):
 
 @final
 class TabularWorld(ModelWorld):
-    """Environments with a transition table: the observation is the state.
+    """Environments with numbered states: the observation is the state.
 
     Args:
-        mdp: the table.
+        mdp: the table of the environment; None: it is not known.
+        model: what a lookahead queries; default: the table.
+        gamma: discount; default: that of the table.
         starts_known: whether the start distribution of the table is that of the environment; False: it was
             estimated from resets.
         env, observation_key, device: as in `World`.
@@ -155,11 +157,23 @@ class TabularWorld(ModelWorld):
 
     keeps_numbers = True
 
-    def __init__(self, env: VectorEnv, mdp: TabularMDP, *, starts_known: bool = True, **options: Any) -> None:
-        super().__init__(env, gamma=float(mdp.outcomes.discount_NAK.max()), **options)
+    def __init__(
+        self,
+        env: VectorEnv,
+        mdp: TabularMDP | None,
+        *,
+        model: Model | None = None,
+        gamma: float = 1.0,
+        starts_known: bool = True,
+        **options: Any,
+    ) -> None:
+        super().__init__(env, gamma=gamma if mdp is None else float(mdp.outcomes.discount_NAK.max()), **options)
         self.mdp, self.starts_known = mdp, starts_known
-        self.model: TabularModel = TabularModel(mdp, device=self.device)
-        self.start_S = mdp.start_S.to(self.device) if starts_known else None
+        if model is None:
+            assert mdp is not None
+            model = TabularModel(mdp, device=self.device)
+        self.model = model
+        self.start_S = mdp.start_S.to(self.device) if starts_known and mdp is not None else None
 
     @property
     def mdp_shape(self) -> tuple[int, int]:

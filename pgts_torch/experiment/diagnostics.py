@@ -1,11 +1,14 @@
 """The logged metrics of an iteration. Nothing here draws a random number or feeds back into training."""
 
+import statistics
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.updates import SoftmaxUpdate
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.ascent import softmax_direction
@@ -16,11 +19,9 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
     episodes = iteration.experience
     entropy_N = -torch.special.xlogy(iteration.pi_NA, iteration.pi_NA).sum(-1)
     tags = {
-        "charts/episodic_return": float((episodes.reward_TB * episodes.alive_TB).sum(0).mean()),
-        "charts/discounted_return": float(episodes.returns().mean()),
-        "charts/episodic_length": episodes.num_steps / episodes.num_episodes,
+        **_episodes(episodes),
         "losses/entropy": float(entropy_N.mean()),
-        **{f"losses/{name}": value for name, value in iteration.losses.items()},
+        **{_tag(name): value for name, value in iteration.losses.items()},
         "search/depth": float(iteration.depth),
         "search/model_calls": float(algorithm.num_model_calls),
     }
@@ -35,6 +36,24 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
             "search/proved": float(algorithm.certificates is not None and algorithm.certificates.trust == "proved"),
         }
     return tags
+
+
+def _tag(name: str) -> str:
+    return f"model/{name.removeprefix('model_')}" if name.startswith("model_") else f"losses/{name}"
+
+
+def _episodes(rollout: Rollout) -> dict[str, float]:
+    """The tags of episodes; of those that ended, where they go on from one iteration to the next."""
+    if rollout.finished is None:
+        return {
+            "charts/episodic_return": float((rollout.reward_TB * rollout.alive_TB).sum(0).mean()),
+            "charts/discounted_return": float(rollout.returns().mean()),
+            "charts/episodic_length": rollout.num_steps / rollout.num_episodes,
+        }
+    if not rollout.finished:
+        return {}
+    returns, lengths = zip(*rollout.finished, strict=True)
+    return {"charts/episodic_return": statistics.fmean(returns), "charts/episodic_length": statistics.fmean(lengths)}
 
 
 class Truth:

@@ -94,8 +94,8 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
 
 def _out_of_reach(config: Config, algorithm: PGTS) -> str:
     """Why search.stop_at cannot be reached by any certificate; empty where it can."""
-    target, certificates, episodes = config.search.stop_at, algorithm.certificates, config.rollout.num_envs
-    if target is None or certificates is None or certificates.trust != "sampled starts":
+    target, certificates, episodes = config.search.stop_at, algorithm.certificates, algorithm.options.rollout.num_envs
+    if target is None or certificates is None or episodes is None or certificates.trust != "sampled starts":
         return ""
     if (least := certificates.width(episodes)) <= target:
         return ""

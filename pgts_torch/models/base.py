@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
+from pgts_torch.models.replay import ReplayBuffer
 from pgts_torch.models.rewards import RewardRange
 
 
@@ -54,6 +55,7 @@ class Model(ABC):
     reward_range: between which numbers its rewards must be; None: any.
     action_repeat: how often an action is taken in one outcome.
     is_certain: whether it is known that no action has more than one outcome.
+    options: what it was made from; None for a model of the caller's own class.
     generation: how often the model has changed, so that what was remembered of it is no longer true: it has learned,
         or has been cleared, after which states have other numbers.
     """
@@ -66,13 +68,20 @@ class Model(ABC):
     reward_range: RewardRange | None = None
     action_repeat: int = 1
     is_certain: bool = False
+    options: Any = None
     generation: int = 0
     device: torch.device
     dtype: torch.dtype
 
 
 class LearningModel(Model):
-    """A model that learns from the steps of an environment. It is never called exact."""
+    """A model that learns from the steps of an environment. It is never called exact.
+
+    replay: the steps that it keeps, whose column "state" has states in the form that `ModelWorld.adopt` takes; None: it
+        keeps none.
+    """
+
+    replay: ReplayBuffer | None = None
 
     @abstractmethod
     def learn(self, experience: Experience, *, generator: torch.Generator) -> dict[str, float]:

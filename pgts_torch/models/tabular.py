@@ -51,7 +51,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
         self.highest_value, self.lowest_value = highest_value(mdp.outcomes), lowest_value(mdp.outcomes)
         self.is_certain = bool((mdp.outcomes.prob_NAK.amax(-1) == 1).all())
         self._cumulative_NAK = self.table.prob_NAK.cumsum(-1)
-        self._mdp = mdp
+        self.mdp = mdp
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
         """The rows of the table. [PGTS Sec. 2]"""
@@ -79,8 +79,8 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
     def _looks_RK(self) -> Int[np.ndarray, "R K"]:
         """64 bits of each outcome of each row s * A + a by which it is told apart, 0 where it has no probability."""
         # In float64, whatever the dtype of the model: the environment's numbers are compared with these.
-        outcomes, K = self._mdp.outcomes, self.table.num_outcomes
-        child_SAK, discount_SAK, paid_SAK = outcomes.child_NAK, outcomes.discount_NAK, self._mdp.outcome_reward_SAK
+        outcomes, K = self.mdp.outcomes, self.table.num_outcomes
+        child_SAK, discount_SAK, paid_SAK = outcomes.child_NAK, outcomes.discount_NAK, self.mdp.outcome_reward_SAK
         looks_SAK = _looks(child_SAK.numpy(), discount_SAK.numpy(), paid_SAK.numpy())
         return np.where(outcomes.prob_NAK.numpy() > 0, looks_SAK, 0).reshape(-1, K)
 
@@ -96,9 +96,9 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
         if not (self._looks_RK.take(row_N * self._looks_RK.shape[1] + first_N) == looks_N).all():
             # Some step looks like no outcome: compare number by number, with rewards rounded to float32.
             at = happened.state_N, happened.action_N
-            outcomes, discount_NK = self._mdp.outcomes, self._mdp.outcomes.discount_NAK.numpy()[at]
+            outcomes, discount_NK = self.mdp.outcomes, self.mdp.outcomes.discount_NAK.numpy()[at]
             with np.errstate(over="ignore"):
-                paid_NK = self._mdp.outcome_reward_SAK.numpy()[at].astype(np.float32)
+                paid_NK = self.mdp.outcome_reward_SAK.numpy()[at].astype(np.float32)
             rounded_NK = (outcomes.prob_NAK.numpy()[at] > 0) & (paid_NK == happened.reward_N[:, None])
             rounded_NK &= discount_NK == happened.discount_N[:, None]
             rounded_NK &= (discount_NK == 0) | (outcomes.child_NAK.numpy()[at] == happened.next_state_N[:, None])
@@ -112,15 +112,15 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
 
     def outcomes_text(self, state: int, action: int) -> str:
         """The outcomes of a row, the most probable first."""
-        prob_K = self._mdp.outcomes.prob_NAK[state, action].tolist()
+        prob_K = self.mdp.outcomes.prob_NAK[state, action].tolist()
         likely = sorted((k for k, p in enumerate(prob_K) if p > 0), key=lambda k: -prob_K[k])
         named = [f"{self.outcome_text(state, action, k)} (probability {prob_K[k]:.4g})" for k in likely[:_MOST_NAMED]]
         return ", or ".join(named) + (f", or {len(likely) - _MOST_NAMED} others" if len(likely) > _MOST_NAMED else "")
 
     def outcome_text(self, state: int, action: int, k: int) -> str:
         """One outcome of a row, in a message."""
-        outcomes, at = self._mdp.outcomes, (state, action, k)
-        reward, discount = float(self._mdp.outcome_reward_SAK[at]), float(outcomes.discount_NAK[at])
+        outcomes, at = self.mdp.outcomes, (state, action, k)
+        reward, discount = float(self.mdp.outcome_reward_SAK[at]), float(outcomes.discount_NAK[at])
         return step_text(reward, discount, self.state_text(int(outcomes.child_NAK[at])))
 
     def frequencies(self) -> Float[Tensor, "R K"]:
@@ -130,7 +130,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
         is_new_RK = torch.ones_like(looks_RK, dtype=torch.bool)
         is_new_RK[:, 1:] = looks_RK[:, 1:] != looks_RK[:, :-1]
         place_RK = torch.where(is_new_RK, torch.arange(looks_RK.shape[1]), 0).cummax(-1).values
-        prob_RK = self._mdp.outcomes.prob_NAK.reshape(looks_RK.shape)
+        prob_RK = self.mdp.outcomes.prob_NAK.reshape(looks_RK.shape)
         return torch.zeros_like(prob_RK).scatter_add_(-1, order_RK.gather(-1, place_RK), prob_RK.gather(-1, order_RK))
 
 

@@ -64,6 +64,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
     ) -> None:
         check_count("action_repeat", action_repeat)
         self._index = StateIndex(state_size, dtype=state_dtype, device=device, merge=merge)
+        self.state_size, self.state_dtype = state_size, state_dtype
         self.num_actions = num_actions
         self.device = self._index.device
         self.dtype = dtype

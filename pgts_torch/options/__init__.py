@@ -17,10 +17,18 @@ from pgts_torch.options.critics import (
     TabularValues,
     TDLambda,
 )
-from pgts_torch.options.models import Counts
+from pgts_torch.options.models import AutoModel, Counts, Ensemble, GivenModel
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, Random, Simplex, Softmax, Uniform
-from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, LookaheadAdvantages, SampledAdvantages
+from pgts_torch.options.replay import AutoReplay, NoReplay, UniformReplay
+from pgts_torch.options.rollouts import (
+    AutoHorizon,
+    FixedHorizon,
+    GeometricHorizon,
+    LookaheadAdvantages,
+    SampledAdvantages,
+    StepsHorizon,
+)
 from pgts_torch.options.search import MCTS, Auto, Expectimax, Sampled
 from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient
 
@@ -32,20 +40,26 @@ __all__ = [
     "PPO",
     "Auto",
     "AutoCritic",
+    "AutoHorizon",
+    "AutoModel",
     "AutoPolicy",
+    "AutoReplay",
     "AutoUpdate",
     "Biased",
     "Counts",
+    "Ensemble",
     "ExactValues",
     "Expectimax",
     "FixedHorizon",
     "GeometricHorizon",
+    "GivenModel",
     "Gradient",
     "LookaheadAdvantages",
     "Mirror",
     "MonteCarlo",
     "NetworkTDLambda",
     "NetworkValues",
+    "NoReplay",
     "OwnNetwork",
     "Part",
     "Projected",
@@ -57,7 +71,9 @@ __all__ = [
     "Simplex",
     "Softmax",
     "SoftmaxGradient",
+    "StepsHorizon",
     "TDLambda",
     "TabularValues",
     "Uniform",
+    "UniformReplay",
 ]

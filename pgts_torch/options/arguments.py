@@ -16,7 +16,7 @@ from pgts_torch.options.training import Training
 _FLAT = {"env": ("observation_key",), "rollout": tuple(Rollouts.model_fields), "search": tuple(Depth.model_fields)}
 """The sections whose options are arguments of `PGTS` of their own."""
 
-_PARTS = ("policy", "critic", "estimator", "update")
+_PARTS = ("policy", "critic", "estimator", "update", "model", "replay")
 
 _PREFIX = re.compile(rf"\b(?:env|rollout|search)\.({'|'.join(name for names in _FLAT.values() for name in names)})\b")
 
@@ -25,16 +25,15 @@ def read(arguments: Mapping[str, Any]) -> Training:
     """Return the options in the arguments of `PGTS`.
 
     Parts may be given as options, names, plain mappings or objects that were made from options. None, and objects of
-    the caller's own classes, count as auto; num_envs None is the default.
+    the caller's own classes, count as auto.
 
     Raises:
         PgtsError: one line for each mistake.
     """
-    flat = {name: value for name, value in arguments.items() if name != "num_envs" or value is not None}
     data: dict[str, Any] = {
-        section: {name: flat[name] for name in names if name in flat} for section, names in _FLAT.items()
+        section: {name: arguments[name] for name in names if name in arguments} for section, names in _FLAT.items()
     }
-    parts = {name: getattr(arguments[name], "options", arguments[name]) for name in _PARTS}
+    parts = {name: getattr(arguments.get(name), "options", arguments.get(name)) for name in _PARTS}
     data |= {name: _with_never(value) for name, value in parts.items() if value is not None}
     search = arguments["search"]
     search = search.plain() if isinstance(search, Part) else search if isinstance(search, Mapping) else {"kind": search}

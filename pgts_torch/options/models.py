@@ -1,11 +1,24 @@
-"""Options of models that are learned from the steps of the environment."""
+"""Options of the model that a lookahead queries."""
 
 from typing import Any, Literal
 
-from pydantic import ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
-from pgts_torch.options.fields import Ascending, Positive, conflict
+from pgts_torch.options.fields import Ascending, Count, NonNegative, Positive, Sizes, conflict
 from pgts_torch.options.part import Part, null
+
+
+class AutoModel(Part):
+    """The given model, if the environment has one."""
+
+    type: Literal["auto"] = "auto"
+
+
+class GivenModel(Part):
+    """What is known of the environment: its table, its dynamics in torch, or a simulator that is restored from
+    snapshots."""
+
+    type: Literal["given"] = "given"
 
 
 class Counts(Part):
@@ -31,3 +44,38 @@ class Counts(Part):
         if value is not None and info.data.get("optimism") == "none":
             raise conflict(f"model.strength is {value}, which model.optimism none does not use")
         return value
+
+
+class Ensemble(Part):
+    """Networks that learn from the steps of the environment alone what follows a vector of numbers and an action: the
+    next vector, the reward, and whether the episode ends (Chua et al. 2018)."""
+
+    type: Literal["ensemble"] = "ensemble"
+
+    members: Count = 3
+    """The number of networks. Each has its own initial weights and minibatches."""
+
+    hidden: Sizes = Field(default=[64, 64])
+    """Sizes of the hidden layers of each network."""
+
+    learning_rate: Positive = 1e-3
+    """Step size of Adam."""
+
+    weight_decay: NonNegative = 1e-5
+    """The weight of the squared weights in the loss."""
+
+    minibatch_size: Count = 256
+    """Steps of the environment in each gradient step, for each member."""
+
+    updates_per_step: Positive = 0.5
+    """Gradient steps for each environment step."""
+
+    first_updates: Count = 600
+    """Gradient steps after the first rollouts."""
+
+
+Model = AutoModel | GivenModel | Counts | Ensemble
+"""Options of the model."""
+
+LEARNED = (Counts, Ensemble)
+"""Those that learn from the steps of the environment."""

@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from pgts_torch.options.fields import Count, UnitInterval
-from pgts_torch.options.part import Part
+from pgts_torch.options.part import Part, null
 
 
 class FixedHorizon(Part):
@@ -36,16 +36,41 @@ class GeometricHorizon(Part):
         return self.max_length
 
 
+class StepsHorizon(Part):
+    """Every iteration takes the same number of steps in each environment. An episode that is not over goes on in the
+    next iteration. Needs replay."""
+
+    type: Literal["steps"] = "steps"
+
+    length: Count = 200
+    """Steps of an iteration in each environment."""
+
+    first: Count = 500
+    """Steps of the first iteration in each environment."""
+
+    max_length: Count | None = None
+    """The largest number of steps of an episode; null: the time limit of the environment, if it has one."""
+
+
 Horizon = FixedHorizon | GeometricHorizon
+"""When an episode from a reset ends that is not over."""
+
+
+class AutoHorizon(Part):
+    """By the replay: steps with it, else fixed."""
+
+    type: Literal["auto"] = "auto"
 
 
 class Rollouts(Part):
     """The rollouts of one iteration."""
 
-    num_envs: Count = 16
+    num_envs: Count | None = null(fixed=16, geometric=16, steps=1)
     """Rollouts of one iteration, each in an environment of its own."""
 
-    horizon: Horizon = Field(default=FixedHorizon(), discriminator="type")
+    horizon: AutoHorizon | FixedHorizon | GeometricHorizon | StepsHorizon = Field(
+        default=AutoHorizon(), discriminator="type"
+    )
     """When a rollout ends."""
 
 

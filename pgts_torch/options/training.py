@@ -7,9 +7,20 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues, TabularValues
 from pgts_torch.options.fields import Ascending, EnvId, Key, Kwargs, UnitInterval, conflict
+from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Model
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, NETWORKS, TABLES, AutoPolicy, Biased, Network, Simplex, Softmax, Table
-from pgts_torch.options.rollouts import Estimator, LookaheadAdvantages, Rollouts, SampledAdvantages
+from pgts_torch.options.replay import AutoReplay, NoReplay, Replay, UniformReplay
+from pgts_torch.options.rollouts import (
+    AutoHorizon,
+    Estimator,
+    FixedHorizon,
+    GeometricHorizon,
+    LookaheadAdvantages,
+    Rollouts,
+    SampledAdvantages,
+    StepsHorizon,
+)
 from pgts_torch.options.search import AutoSearch, Search
 from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient, Update
 
@@ -58,10 +69,26 @@ class Training(Part):
     update: AutoUpdate | Update = Field(default=AutoUpdate(), discriminator="type")
     """How the policy is changed by the advantages."""
 
+    model: Model = Field(default=AutoModel(), discriminator="type")
+    """What the lookahead queries: what is known of the environment, or what is learned of it."""
+
+    replay: Replay = Field(default=AutoReplay(), discriminator="type")
+    """Whether what was seen is learned from again."""
+
     @model_validator(mode="before")
     @classmethod
     def _infer_types(cls, data: Any) -> Any:
         return _with_types(data) if isinstance(data, dict) else data
+
+    def resolved(self) -> "Training":
+        """Return the options with replay, horizon and number of environments in place of auto and null."""
+        replay, rollout = self.replay, self.rollout
+        if isinstance(replay, AutoReplay):
+            replay = UniformReplay() if isinstance(self.model, LEARNED) else NoReplay()
+        if isinstance(rollout.horizon, AutoHorizon):
+            horizon = FixedHorizon() if isinstance(replay, NoReplay) else StepsHorizon()
+            rollout = rollout.model_copy(update={"horizon": horizon})
+        return self.model_copy(update={"replay": replay, "rollout": rollout.filled(rollout.horizon.type)})
 
     @field_validator("policy")
     @classmethod
@@ -142,6 +169,45 @@ class Training(Part):
             )
         return update
 
+    @field_validator("model", "replay")
+    @classmethod
+    def _needs_a_lookahead(cls, value: Any, info: ValidationInfo) -> Any:
+        if isinstance(info.data.get("estimator"), SampledAdvantages) and isinstance(value, (*LEARNED, UniformReplay)):
+            key = f"{info.field_name}.type"
+            raise conflict(
+                f"{key} is {value.type}; with estimator.type sampled there is no lookahead, it must be auto",
+                key,
+                "estimator.type",
+            )
+        return value
+
+    @field_validator("model")
+    @classmethod
+    def _proves_nothing(cls, model: Any, info: ValidationInfo) -> Any:
+        search = info.data.get("search")
+        if search is not None and search.stop_at is not None and isinstance(model, LEARNED):
+            raise conflict(
+                f"search.stop_at is {search.stop_at}, which needs an upper bound on the optimality gap; model.type "
+                f"{model.type} is learned and bounds nothing",
+                "search.stop_at",
+                "model.type",
+            )
+        return model
+
+    @field_validator("replay")
+    @classmethod
+    def _goes_on(cls, replay: Any, info: ValidationInfo) -> Any:
+        rollout, model = info.data.get("rollout"), info.data.get("model")
+        is_none = isinstance(replay, NoReplay) or (isinstance(replay, AutoReplay) and not isinstance(model, LEARNED))
+        if rollout is not None and isinstance(rollout.horizon, StepsHorizon) and is_none:
+            raise conflict(
+                "rollout.horizon.type is steps, so that rollouts do not begin where episodes begin; that needs "
+                "replay.type uniform",
+                "rollout.horizon.type",
+                "replay.type",
+            )
+        return replay
+
 
 MOVES: dict[type[Part], tuple[type[Table | Network], ...]] = {
     Projected: (Simplex,),
@@ -175,10 +241,15 @@ def _check_mirror(update: Mirror, policy: Any) -> None:
 
 
 def _with_types(data: dict[str, Any]) -> dict[str, Any]:
-    """Return the values with a type for policy, critic and update where these have other keys but no type.
+    """Return the values with a type for parts that have other keys but no type.
 
     It is the first type that goes with the other values and has all these keys; if none has, the first that goes.
     """
+    data = _with_type(_with_type(data, "model", [Ensemble, Counts]), "replay", [UniformReplay])
+    replayed = _type(data, "replay") == "uniform" or _type(data, "model") in ("ensemble", "counts")
+    horizons: list[type[Part]] = [FixedHorizon, GeometricHorizon]
+    if isinstance(rollout := data.get("rollout"), dict):
+        data = data | {"rollout": _with_type(rollout, "horizon", [StepsHorizon] * replayed + horizons)}
     data = _with_type(data, "policy", [Softmax, MLP, CNN])
     policy, sampled = _type(data, "policy"), _type(data, "estimator") == "sampled"
     tables, networks = policy not in NETWORKS, policy not in TABLES

@@ -232,7 +232,16 @@ def configurations(draw: st.DrawFn) -> Config:
     if given["search.kind"] == "mcts":
         given |= {"search.exploration": None} if given["search.rule"] == "gumbel" else {"search.prior": "uniform"}
         given |= {"search.merge": False} if given["search.backup"] == "mean" else {}
+    if types["model.type"] == "counts" and given["model.optimism"] == "none":
+        given["model.strength"] = None
+    is_learned = types["model.type"] in ("counts", "ensemble")
+    if is_learned:
+        given["search.stop_at"] = None
+    if types["rollout.horizon.type"] == "steps" and (types["replay.type"], is_learned) != ("auto", True):
+        given = {key: value for key, value in given.items() if not key.startswith("replay.")}
+        given["replay.type"] = "uniform"
     if types["estimator.type"] == "sampled":
+        given = {key: value for key, value in given.items() if not key.startswith(("model.", "replay.", "rollout."))}
         given |= {"critic.target": "v"} if types["critic.type"] != "auto" else {}
         given = {key: value for key, value in given.items() if not key.startswith("search.")} | {"search.depth": 0}
     return Config.model_validate(_nested(given))
@@ -316,6 +325,9 @@ PARTS = [
     ["--policy.type", "cnn", "--policy.scale", "10", "--update.target_kl", "0.1", "--critic.target", "q"],
     ["--policy.type", "cnn", "--critic.network", "{type: cnn, channels: [4]}", "--critic.polyak", "0.1"],
     ["--policy.type", "mlp", "--search.depth", "0", "--estimator.type", "sampled", "--estimator.lambda", "0.9"],
+    ["--rollout.horizon.type", "fixed", "--model.type", "given", "--replay.type", "none"],
+    ["--model.type", "counts", "--rollout.horizon.first", "7"],
+    ["--model.members", "2", "--replay.length", "3"],
 ]
 """Command lines that together name every type there is."""
 

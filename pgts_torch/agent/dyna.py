@@ -1,0 +1,98 @@
+"""Many updates from episodes that are imagined in the model and start in states seen before."""
+
+import copy
+from collections.abc import Iterator
+from typing import Any, final
+
+from pgts_torch.agent.imagine import imagine
+from pgts_torch.agent.model_check import ModelCheck
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.ranks import Draws
+from pgts_torch.agent.rollout import Rollout
+from pgts_torch.agent.world import ModelWorld
+from pgts_torch.errors import check_count
+from pgts_torch.models.base import LearningModel
+from pgts_torch.models.replay import ReplayBuffer
+from pgts_torch.options.replay import UniformReplay
+
+
+@final
+class Dyna:
+    """Learns the model, where it learns, from each rollout of the environment, and makes the rollouts that the policy
+    learns from: imagined ones, which start in states sampled from all that were visited (Sutton 1990).
+
+    All ranks imagine the same rollouts, from the same states.
+
+    policy: the policy that imagined episodes follow: a slow copy of the one that is trained, which moves toward it by
+        `polyak` after each update; the policy itself where that is a table.
+    replay: the visited states, in column "state".
+    model_calls: the number of steps in the model so far.
+
+    Args:
+        world: the environments and their model.
+        trained: the policy that is trained.
+        model_check: holds the steps of the environment to the model before it is queried.
+    """
+
+    def __init__(self, world: ModelWorld, trained: Policy, options: UniformReplay, model_check: ModelCheck) -> None:
+        self._world, self._trained, self.options, self._model_check = world, trained, options, model_check
+        self.policy = trained
+        if isinstance(trained, NetworkPolicy) and options.polyak < 1:
+            self.policy = copy.deepcopy(trained)
+        model = world.model
+        own = model.replay if isinstance(model, LearningModel) else None
+        self._owns_replay = own is None
+        self.replay = ReplayBuffer(options.capacity) if own is None else own
+        self.num_updates = self.model_calls = 0
+
+    def learn(self, experience: Rollout, draws: Draws) -> dict[str, float]:
+        """Keep the visited states, and let the model learn from the steps. Return its losses, by name."""
+        self._model_check(experience, draws.number)
+        model, losses = self._world.model, {}
+        if self._owns_replay:
+            self.replay.add(state=self._world.export(experience.state_TB[experience.alive_TB]))
+        if isinstance(model, LearningModel):
+            losses = model.learn(experience.steps(), generator=draws.common)
+        return {f"model_{name}": value for name, value in losses.items()}
+
+    def rollouts(self, draws: Draws) -> Iterator[tuple[Rollout, Draws]]:
+        """Yield imagined rollouts, each with its random generators; the policy is to be updated from each.
+
+        There are `updates_per_step` of them for each visit so far, less those of earlier iterations, and at least one.
+        """
+        due = int(self.options.updates_per_step * self.replay.num_added) - self.num_updates
+        for number in range(max(due, 1)):
+            own = draws.update(number)
+            self._world.reset_numbers()
+            at_B = self.replay.sample(self.options.starts, generator=own.common)
+            start_B = self._world.adopt(self.replay.rows("state", at_B))
+            imagined = imagine(self._world, self.policy, start_B, self.options.length, generator=own.common)
+            self.model_calls += imagined.num_steps
+            yield imagined, own
+            self.num_updates += 1
+            if self.policy is not self._trained:
+                assert isinstance(self.policy, NetworkPolicy)
+                assert isinstance(self._trained, NetworkPolicy)
+                self.policy.network.follow(self._trained.network, self.options.polyak)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was kept and learned, as tensors on the CPU and plain values."""
+        model = self._world.model
+        return {
+            "num_updates": self.num_updates,
+            "replay": self.replay.state_dict() if self._owns_replay else None,
+            "model": model.state_dict() if isinstance(model, LearningModel) else None,
+            "policy": self.policy.state_dict() if self.policy is not self._trained else None,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load what `state_dict` returned; PgtsError unless it fits."""
+        check_count("num_updates", state["num_updates"], least=0)
+        self.num_updates, model = state["num_updates"], self._world.model
+        if self._owns_replay:
+            self.replay.load_state_dict(state["replay"])
+        if isinstance(model, LearningModel):
+            model.load_state_dict(state["model"])
+        if self.policy is not self._trained:
+            self.policy.load_state_dict(state["policy"])

@@ -1,0 +1,215 @@
+"""Episodes that go on from one iteration to the next."""
+
+from typing import Any, NamedTuple, final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pgts_torch.agent.episodes import Episodes
+from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.rollout import COLUMNS, Rollout, shared_generators
+from pgts_torch.agent.world import ModelWorld, World
+from pgts_torch.envs.vector import TabularVectorEnv
+from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.models.snapshots import env_name
+from pgts_torch.seeding import seed_sequence
+
+
+class _Row(NamedTuple):
+    """One step of each of B environments."""
+
+    before_B: Tensor
+    after_B: Tensor
+    read_before_B: Tensor | None
+    read_after_B: Tensor | None
+    action_B: np.ndarray
+    reward_B: np.ndarray
+    discount_B: np.ndarray
+    over_B: np.ndarray
+
+
+@final
+class OngoingEpisodes:
+    """Episodes that go on from one rollout to the next: an environment is reset only when its episode is over.
+
+    Episode e of environment b is reset with a seed from the stream (seed, "episode", *names, b, e). So the state of an
+    environment follows from e and the actions since, from which `load_state_dict` restores it.
+
+    Args:
+        world: the environments.
+        max_length: the largest number of steps of an episode; None: there is none.
+        seed, names: the prefix of the streams of seeds.
+
+    Raises:
+        PgtsError: several environments share one random generator, so that the state of one does not follow from its
+            own seed.
+    """
+
+    def __init__(self, world: World, *, max_length: int | None, seed: int, names: tuple[str | int, ...]) -> None:
+        B = world.env.num_envs
+        if B > 1 and isinstance(world.env, TabularVectorEnv):
+            raise PgtsError(
+                f"num_envs is {B}; episodes of {env_name(world.env)} that go on from one iteration to the next need "
+                "num_envs 1, because its environments share one random generator"
+            )
+        self._world, self._max_length, self._seed, self._names = world, max_length, seed, names
+        self._number_B = [0] * B
+        self._actions_B: list[list[int]] = [[] for _ in range(B)]
+        self._return_B = [0.0] * B
+        self._episodes = Episodes(world.env, gamma=world.gamma, seeds=self._seeds())
+        self._has_begun = False
+
+    def _seeds(self) -> list[int]:
+        """The seed of the present episode of each environment."""
+        return [
+            int(seed_sequence(self._seed, "episode", *self._names, b, number).generate_state(1)[0])
+            for b, number in enumerate(self._number_B)
+        ]
+
+    def collect(
+        self, policy: Policy, length: int, *, names: tuple[str | int, ...], generator: torch.Generator
+    ) -> Rollout:
+        """Take `length` steps in each environment.
+
+        Args:
+            names: the stream that the generators of the whole process are seeded from, for environments that use them.
+            generator: for actions.
+
+        Returns:
+            A rollout with a column for each part of an episode, those of the first environment first; `finished` has
+            the episodes that ended. Raises as `rollout`.
+        """
+        world, episodes = self._world, self._episodes
+        rows: list[_Row] = []
+        finished: list[tuple[float, int]] = []
+        with shared_generators(world, self._seed, names):
+            if not self._has_begun:
+                with episodes.named("at the start"):
+                    episodes.reset()
+                self._has_begun = True
+            observation_B, read_B = self._observe()
+            for t in range(length):
+                action_B = policy.sample(observation_B, generator=generator).cpu().numpy()
+                with episodes.named(f"in step {t}"):
+                    reward_B, discount_B, truncated_B = self._step(action_B)
+                    if world.reward_range is not None:
+                        world.reward_range.check(reward_B)
+                    after_B, read_after_B = self._observe()
+                too_long_B = np.array([len(actions) == self._max_length for actions in self._actions_B])
+                over_B = (discount_B == 0) | truncated_B | too_long_B
+                rows.append(_Row(observation_B, after_B, read_B, read_after_B, action_B, reward_B, discount_B, over_B))
+                observation_B, read_B = after_B, read_after_B
+                if over_B.any():
+                    finished += [(self._return_B[b], len(self._actions_B[b])) for b in over_B.nonzero()[0]]
+                    with episodes.named(f"at the end of step {t}"):
+                        self._begin(over_B)
+                        observation_B, read_B = self._observe()
+        return self._cut(rows, finished)
+
+    def _observe(self) -> tuple[Tensor, Tensor | None]:
+        world, observation = self._world, self._episodes.observation
+        encoded_B = world.encode(observation)
+        return encoded_B, world.read(observation, encoded_B) if isinstance(world, ModelWorld) else None
+
+    def _step(self, action_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        reward_B, discount_B, truncated_B = self._episodes.step(action_B, np.ones(len(action_B), dtype=bool))
+        for b, action in enumerate(action_B.tolist()):
+            self._actions_B[b].append(action)
+            self._return_B[b] += float(reward_B[b])
+        return reward_B, discount_B, truncated_B
+
+    def _begin(self, over_B: np.ndarray) -> None:
+        """Begin the next episode of these environments."""
+        for b in over_B.nonzero()[0]:
+            self._number_B[b], self._actions_B[b], self._return_B[b] = self._number_B[b] + 1, [], 0.0
+        self._episodes.restart(over_B, self._seeds())
+
+    def _cut(self, rows: list[_Row], finished: list[tuple[float, int]]) -> Rollout:
+        """The steps as a rollout, with a column for each part of an episode."""
+        over_TB = np.array([row.over_B for row in rows])
+        parts = []  # environment, first step and the step after the last one
+        for b in range(over_TB.shape[1]):
+            ends = [*(over_TB[:-1, b].nonzero()[0] + 1).tolist(), len(rows)]
+            parts += [(b, start, end) for start, end in zip([0, *ends], ends, strict=False)]
+        length = max(end - start for _, start, end in parts)
+        # step_TP: the step of each entry; in padding the last step of the part
+        step_TP = np.stack([np.minimum(np.arange(start, start + length), end - 1) for _, start, end in parts], 1)
+        env_P = np.array([b for b, _, _ in parts])
+        alive_TP = np.arange(length)[:, None] < np.array([end - start for _, start, end in parts])
+        action_TP, reward_TP, discount_TP = (
+            np.array([getattr(row, name) for row in rows])[step_TP, env_P] for name in _Row._fields[4:7]
+        )
+        weight_TP = np.concatenate([np.ones((1, len(parts))), discount_TP[:-1].cumprod(0)]) * alive_TP
+        columns = (action_TP, reward_TP, discount_TP, alive_TP, weight_TP, discount_TP)
+        device = self._world.device
+        tensors = {n: torch.from_numpy(c).to(device) for n, c in zip(COLUMNS, columns, strict=True)}
+
+        def both(before: str, after: str) -> Tensor:
+            """Rows [T + 1, P] from what was before each step and after it."""
+            before_TB, after_TB = (torch.stack([getattr(row, name) for row in rows]) for name in (before, after))
+            last_P = after_TB[step_TP[-1], env_P]
+            after_UP = torch.cat([before_TB[step_TP, env_P], last_P[None]])
+            padded = torch.from_numpy(~alive_TP)
+            after_UP[:-1][padded] = last_P.expand_as(after_UP[:-1])[padded]
+            return after_UP
+
+        observation_UP, state_UP = both("before_B", "after_B"), None
+        if isinstance(self._world, ModelWorld):
+            read_UP = both("read_before_B", "read_after_B")
+            state_UP = self._world.numbers(read_UP.flatten(0, 1)).view(read_UP.shape[:2])
+        return Rollout(observation_UP, **tensors, state_UB=state_UP, finished=tuple(finished))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The number of each environment's episode, its actions and its return so far, and what is observed."""
+        observed_B = self._observe()[0].cpu() if self._has_begun else None
+        actions = [torch.tensor(actions, dtype=torch.int64) for actions in self._actions_B]
+        return {
+            "number": list(self._number_B),
+            "actions": actions,
+            "return": list(self._return_B),
+            "observed": observed_B,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the episodes from their seeds and actions.
+
+        Raises:
+            PgtsError: episodes of another number of environments; or one that went elsewhere when it was repeated, so
+                that training cannot go on with the same bits.
+        """
+        B = self._world.env.num_envs
+        if [len(state[name]) for name in ("number", "actions", "return")] != [B] * 3:
+            raise PgtsError(f"it is of {len(state['number'])} environments; this training has {B}")
+        for number in state["number"]:
+            check_count("number", number, least=0)
+        self._number_B, self._return_B = list(state["number"]), list(state["return"])
+        recorded = [actions.tolist() for actions in state["actions"]]
+        self._actions_B, self._has_begun = recorded, state["observed"] is not None
+        if not self._has_begun:
+            return
+        self._episodes = Episodes(self._world.env, gamma=self._world.gamma, seeds=self._seeds())
+        longest = max(map(len, recorded))
+        with shared_generators(self._world, self._seed, ("restored",)), self._episodes.named("when it was repeated"):
+            self._episodes.reset()
+            for t in range(longest):
+                # all end together: an episode of k actions begins k steps before the end
+                due_B = np.array([len(actions) == longest - t for actions in recorded])
+                if t and due_B.any():
+                    self._episodes.restart(due_B, self._seeds())
+                begun_B = np.array([len(actions) >= longest - t for actions in recorded])
+                padded = [[0] * (longest - len(actions)) + actions for actions in recorded]
+                taken = [actions[t] for actions in padded]
+                self._episodes.step(np.array(taken), begun_B)
+            idle_B = np.array([not actions for actions in recorded])
+            if longest and idle_B.any():
+                self._episodes.restart(idle_B, self._seeds())
+        observed_B = self._observe()[0].cpu()
+        differs_B = (observed_B != state["observed"]).reshape(B, -1).any(-1)
+        if bool(differs_B.any()):
+            b = int(differs_B.nonzero()[0, 0])
+            raise PgtsError(
+                f"environment {b} of {env_name(self._world.env)} does not repeat its episode from the seed "
+                f"{self._seeds()[b]} and {len(recorded[b])} actions, so that the training cannot go on where it was: "
+                "the environment is no function of them; take the horizon 'fixed' (rollout.horizon), which begins anew"
+            )

@@ -1,0 +1,145 @@
+"""Worlds whose model was not written for the environment: one that is learned from its steps, or the caller's own.
+
+Their states are what is observed: numbers, or vectors.
+"""
+
+from typing import Any, final
+
+import torch
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor
+
+from pgts_torch.agent.world import ModelWorld, TabularWorld, World
+from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models.base import Model
+from pgts_torch.models.counts import CountsModel
+from pgts_torch.models.ensemble import EnsembleModel
+from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.tabular import TabularModel
+from pgts_torch.models.tensor import TensorModel
+from pgts_torch.options.models import Counts, Ensemble
+
+
+@final
+class VectorWorld(ModelWorld):
+    """Environments whose observations are vectors, which are the states of a model.
+
+    Args:
+        env: the environments.
+        model: its states are observations.
+        observation_key: the entry of dictionary observations that is used.
+    """
+
+    def __init__(
+        self, env: VectorEnv, model: TensorModel, *, gamma: float, observation_key: str | None, device: torch.device
+    ) -> None:
+        super().__init__(env, gamma=gamma, observation_key=observation_key, device=device)
+        self.model: TensorModel = model
+
+    def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B D"]:
+        """The observations, because they are the states."""
+        return encoded_B.to(self.model.state_dtype)
+
+    def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
+        """The numbers of state vectors."""
+        return self.model.number(read_N)
+
+    def observe(self, state_N: Int[Tensor, "N"]) -> Shaped[Tensor, "N D"]:
+        """The states, because they are the observations."""
+        return self.model.states(state_N)
+
+    def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        """The state vectors, on the CPU."""
+        return self.model.states(state_N).cpu()
+
+    def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
+        """The numbers of the exported vectors."""
+        return self.numbers(exported.to(self.device))
+
+    def reset_numbers(self) -> None:
+        """Drop all states, because hardly any is met again."""
+        self.model.clear()
+
+
+def learned_world(
+    env: VectorEnv,
+    options: Counts | Ensemble,
+    *,
+    gamma: float,
+    observation_key: str | None,
+    action_repeat: int,
+    capacity: int,
+    seed: int,
+    device: torch.device,
+) -> ModelWorld:
+    """Return the environments with a model that has learned nothing yet.
+
+    Args:
+        capacity: the number of steps that the model keeps.
+        seed: of its initial weights.
+
+    Raises:
+        MissingModel: it does not learn from such observations.
+    """
+    world = World(env, gamma=gamma, observation_key=observation_key, device=device)
+    space = world.observation_space
+    if isinstance(options, Counts):
+        if not isinstance(space, spaces.Discrete):
+            raise MissingModel(
+                f"model is 'counts', which needs numbered states; observations of {env_name(env)} are {space}: take "
+                "'ensemble' if they are vectors"
+            )
+        if action_repeat > 1:
+            raise PgtsError(f"action_repeat is {action_repeat}; in a table it must be 1")
+        table = CountsModel(int(space.n), world.num_actions, gamma=gamma, options=options, device=device)
+        return TabularWorld(env, None, model=table, gamma=gamma, device=device)
+    if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+        raise MissingModel(
+            f"model is 'ensemble', which learns from vectors of numbers; observations of {env_name(env)} are {space}"
+            + (": take 'counts'" if isinstance(space, spaces.Discrete) else "")
+        )
+    model = EnsembleModel(
+        space.shape[0],
+        world.num_actions,
+        gamma=gamma,
+        options=options,
+        capacity=capacity,
+        seed=seed,
+        device=device,
+        action_repeat=action_repeat,
+    )
+    return VectorWorld(env, model, gamma=gamma, observation_key=observation_key, device=device)
+
+
+def world_of(
+    env: VectorEnv, model: Model, *, gamma: float, observation_key: str | None, device: torch.device
+) -> ModelWorld:
+    """Return the environments with a model of the caller's own, whose states are observations.
+
+    Raises:
+        PgtsError: the model does not fit the environments.
+    """
+    world = World(env, gamma=gamma, observation_key=observation_key, device=device)
+    space, name = world.observation_space, type(model).__name__
+    if model.num_actions != world.num_actions:
+        raise PgtsError(f"{name} has {model.num_actions} actions; {env_name(env)} has {world.num_actions}")
+    if torch.device(model.device) != device:
+        raise PgtsError(f"{name} is on the device {model.device}; the training is on {device}")
+    if isinstance(space, spaces.Discrete) and not isinstance(model, TensorModel):
+        if model.num_states != space.n:
+            raise PgtsError(f"{name} has {model.num_states} states; {env_name(env)} has {space.n}")
+        mdp = model.mdp if isinstance(model, TabularModel) else None
+        return TabularWorld(env, mdp, model=model, gamma=gamma, device=device)
+    if isinstance(space, spaces.Box) and isinstance(model, TensorModel):
+        if space.shape != (model.state_size,):
+            raise PgtsError(
+                f"states of {name} have {model.state_size} numbers; observations of {env_name(env)} have the shape "
+                f"{space.shape}: both must be the same vectors"
+            )
+        return VectorWorld(env, model, gamma=gamma, observation_key=observation_key, device=device)
+    raise PgtsError(
+        f"{name} does not fit {env_name(env)}, whose observations are {space}: numbered observations need a model over "
+        "their numbers, vectors a TensorModel over such vectors"
+    )

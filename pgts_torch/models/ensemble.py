@@ -1,0 +1,326 @@
+"""Dynamics learned from the steps of an environment: an ensemble of networks."""
+
+import copy
+import itertools
+import math
+import warnings
+from typing import Any, NamedTuple, final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from pgts_torch.errors import NotFinite, PgtsError, check_count
+from pgts_torch.models.base import Experience, LearningModel, Transitions
+from pgts_torch.models.replay import ReplayBuffer
+from pgts_torch.models.tensor import TensorModel
+from pgts_torch.options.models import Ensemble
+from pgts_torch.seeding import stream, uniform
+
+_CLIP = 8.0
+"""Inputs are clipped at so many deviations."""
+
+_SELDOM = 0.02
+"""Probabilities of an end below this count as 0: a classifier never says 0, and many small ones would add up."""
+
+_ENDS = 0.25
+"""The share of a minibatch that is of steps after which episodes ended, which may be rare."""
+
+_AHEAD = (1, 4, 16)
+"""After how many steps the error is measured."""
+
+_BLOCK, _HELD_OUT = 32, 10
+"""Of every 10 blocks of 32 steps in a row the last one is held out."""
+
+_MOST_MEASURED = 256
+_ENOUGH_STEPS, _UNEXPLAINED = 2000, 0.5
+
+
+class Prediction(NamedTuple):
+    """What each of E members says of N pairs (state, action); `end_EN` is the probability that the episode ends."""
+
+    next_END: Float[Tensor, "E N D"]
+    reward_EN: Float[Tensor, "E N"]
+    end_EN: Float[Tensor, "E N"]
+
+
+@final
+class EnsembleModel(TensorModel, LearningModel):
+    """E networks that learn from steps alone what follows a state, which is a vector of D numbers, and an action.
+
+        next state - state, and reward      by least absolute (smooth) and squared errors, in units of their deviations
+        whether the episode ends            by the cross-entropy, with ends oversampled and their odds corrected
+
+    of minibatches of all steps seen so far but a held-out tenth, each member with its own weights and minibatches (Chua
+    et al. 2018; Lakshminarayanan et al. 2017). `step` gives the means over members, with the discount gamma (1 - p) for
+    the probability p of an end; `sample` samples the end. The model is deterministic but for ends, and is an estimate:
+    it is compared with steps of the environment to measure its error, not to judge it.
+
+    replay: the steps seen; column "state" has the states.
+
+    Args:
+        state_size: D.
+        num_actions: A.
+        gamma: discount of a step after which the episode goes on.
+        options: of networks and fits.
+        capacity: the number of steps that are kept.
+        seed: initial weights are from the stream (seed, "model").
+        action_repeat: see `TensorModel`.
+    """
+
+    def __init__(
+        self,
+        state_size: int,
+        num_actions: int,
+        *,
+        gamma: float,
+        options: Ensemble = Ensemble(),  # noqa: B008 - frozen
+        capacity: int = 100_000,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        action_repeat: int = 1,
+    ) -> None:
+        super().__init__(
+            state_size, num_actions, merge=False, dtype=torch.float64, device=device, action_repeat=action_repeat
+        )
+        self.gamma, self.options = gamma, options
+        self.replay: ReplayBuffer = ReplayBuffer(capacity)
+        self._warned, self._end_share = False, 0.0
+        sizes = [state_size + num_actions, *options.hidden, state_size + 2]
+        generator = stream(seed, "model")
+        # weight and bias of each layer, those of all members in one tensor
+        self._layers = [
+            (
+                self._parameter(torch.randn(options.members, a, b, generator=generator) / a**0.5),
+                self._parameter(torch.zeros(options.members, 1, b)),
+            )
+            for a, b in itertools.pairwise(sizes)
+        ]
+        self._layers[-1][0].data.mul_(0.1)
+        self._weights = [weight for layer in self._layers for weight in layer]
+        self._optimiser = torch.optim.Adam(
+            self._weights, lr=options.learning_rate, weight_decay=options.weight_decay, fused=True
+        )
+        # mean and deviation of states, of their changes and of rewards
+        self._moments = {
+            name: (torch.zeros(size, device=self.device), torch.ones(size, device=self.device))
+            for name, size in (("state", state_size), ("change", state_size), ("reward", 1))
+        }
+
+    def _parameter(self, value: Tensor) -> nn.Parameter:
+        return nn.Parameter(value.to(self.device))
+
+    @torch.inference_mode(False)
+    @torch.enable_grad()
+    def learn(self, experience: Experience, *, generator: torch.Generator) -> dict[str, float]:
+        """Keep the steps, and fit the networks to all that are kept.
+
+        Returns:
+            loss: the mean over the gradient steps. error_1, error_4, error_16: of the state so many steps ahead, on
+            held-out steps, as a root mean square in deviations of states; left out where too few are held out.
+            unexplained: the share of the variance of changes that is not predicted there.
+
+        Raises:
+            PgtsError: steps that name another discount than gamma; observations that are no vectors of D numbers.
+            NotFinite: a number of the steps, or a loss, is not finite.
+
+        Warns:
+            UserWarning: once, where half of what follows cannot be predicted: the observation may not be the state.
+        """
+        states, ends = self._checked(experience), experience.discount_N == 0
+        is_first = self.replay.num_added == 0
+        self.replay.add(
+            state=states,
+            action=experience.action_N,
+            reward=experience.reward_N.float(),
+            end=ends.float(),
+            next_state=experience.next_observation_N.float(),
+            follows=experience.follows_N,
+        )
+        self._measure_moments()
+        held_out = self._held_out()
+        trained = torch.nonzero(~held_out).flatten()
+        ended = trained[self.replay.rows("end", trained) > 0]
+        self._end_share = len(ended) / len(trained)
+        count = self.options.first_updates if is_first else round(self.options.updates_per_step * len(states))
+        loss = sum(self._fit(trained, ended, generator) for _ in range(count)) / max(count, 1)
+        self.generation += 1
+        return {"loss": loss, **self._errors(held_out)}
+
+    def _checked(self, experience: Experience) -> Float[Tensor, "N D"]:
+        observation_N, discount_N = experience.observation_N, experience.discount_N
+        if observation_N.shape[1:] != (self.state_size,):
+            raise PgtsError(
+                f"an observation has shape {tuple(observation_N.shape[1:])}; an ensemble learns from vectors of "
+                f"{self.state_size} numbers"
+            )
+        named_N = (discount_N != 0) & (discount_N != self.gamma)
+        if bool(named_N.any()):
+            raise PgtsError(
+                f"a step has the discount {float(discount_N[named_N][0])}; an ensemble learns ends only, and gamma is "
+                f"{self.gamma}"
+            )
+        return observation_N.float()
+
+    def _measure_moments(self) -> None:
+        state_ND, next_ND, reward_N = (self.replay.rows(name) for name in ("state", "next_state", "reward"))
+        for name, value in (("state", state_ND), ("change", next_ND - state_ND), ("reward", reward_N[:, None])):
+            mean, deviation = value.mean(0), value.std(0, correction=0)
+            if not bool((mean + deviation).isfinite().all()):
+                raise NotFinite(
+                    f"the mean of {name}s is {mean.tolist()}; what a model learns must be finite", what="model"
+                )
+            self._moments[name] = (mean.to(self.device), deviation.to(self.device))
+
+    def _held_out(self) -> Tensor:
+        """Which rows of the ring are held out, by the number of the row, so that they stay so."""
+        buffer, at_N = self.replay, torch.arange(len(self.replay))
+        rounds = (buffer.num_added - 1 - at_N) // buffer.capacity
+        return (at_N + rounds * buffer.capacity) // _BLOCK % _HELD_OUT == _HELD_OUT - 1
+
+    def _fit(self, trained: Int[Tensor, "R"], ended: Int[Tensor, "Q"], generator: torch.Generator) -> float:
+        """One gradient step, with a minibatch for each member, a quarter of it of steps after which episodes ended.
+        Return the loss."""
+        E, N = self.options.members, self.options.minibatch_size
+
+        def sampled(rows: Tensor, count: int) -> Tensor:
+            return rows[torch.randint(len(rows), (E, count), generator=generator, device=generator.device).cpu()]
+
+        extra = round(N * _ENDS) if len(ended) else 0
+        at = torch.cat([sampled(trained, N - extra), sampled(ended, extra)] if extra else [sampled(trained, N)], 1)
+        columns = ("state", "action", "reward", "end", "next_state")
+        state, action, reward, end, after = (self.replay.rows(c, at.flatten()).to(self.device) for c in columns)
+        # how much less often than here a row of the minibatch is among all steps
+        weight = 1 / (1 - _ENDS + _ENDS * end / self._end_share) if extra else torch.ones_like(end)
+        output = self._outputs(self._inputs(state, action).view(E, N, -1)).reshape(E * N, -1)
+        aimed = torch.cat([self._scaled("change", after - state), self._scaled("reward", reward[:, None])], -1)
+        changes, rewards, logits = output.split([self.state_size, 1, 1], -1)
+        loss = (
+            weight @ nn.functional.smooth_l1_loss(changes, aimed[:, :-1], reduction="none").mean(-1) / len(weight)
+            + weight @ (rewards - aimed[:, -1:]).square()[:, 0] / len(weight)
+            + nn.functional.binary_cross_entropy_with_logits(logits[:, 0], end)
+        )
+        self._optimiser.zero_grad()
+        loss.backward()
+        value = float(loss.detach())
+        if not value < float("inf"):
+            raise NotFinite(f"the loss of the learned model is {value}", what="model")
+        self._optimiser.step()
+        return value
+
+    def _scaled(self, name: str, value: Tensor) -> Tensor:
+        """The value in deviations from its mean; 0 where it is constant."""
+        mean, deviation = self._moments[name]
+        return torch.where(deviation > 0, (value - mean) / deviation, 0.0)
+
+    def _inputs(self, state_ND: Tensor, action_N: Tensor) -> Tensor:
+        one_hot_NA = nn.functional.one_hot(action_N, self.num_actions).float()
+        return torch.cat([self._scaled("state", state_ND).clamp(-_CLIP, _CLIP), one_hot_NA], -1)
+
+    def _outputs(self, x: Float[Tensor, "E N I"]) -> Float[Tensor, "E N O"]:
+        for weight, bias in self._layers[:-1]:
+            x = nn.functional.silu(torch.baddbmm(bias, x, weight))
+        return torch.baddbmm(self._layers[-1][1], x, self._layers[-1][0])
+
+    @torch.no_grad()
+    def members(self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]) -> Prediction:
+        """The predictions of all members."""
+        output = self._outputs(self._inputs(state_ND, action_N).expand(self.options.members, -1, -1))
+        (change_mean, change_scale), (reward_mean, reward_scale) = self._moments["change"], self._moments["reward"]
+        next_END = state_ND + change_mean + change_scale * output[..., : self.state_size]
+        end_EN = (output[..., -1] - self._log_odds_added).sigmoid()
+        return Prediction(
+            next_END, reward_mean + reward_scale * output[..., -2], torch.where(end_EN < _SELDOM, 0.0, end_EN)
+        )
+
+    @property
+    def _log_odds_added(self) -> float:
+        """By how much the log odds of an end are larger in minibatches than among all steps (King and Zeng 2001)."""
+        return math.log1p(_ENDS / ((1 - _ENDS) * self._end_share)) if self._end_share else 0.0
+
+    def step(
+        self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
+        """The means over members; the discount is gamma (1 - p)."""
+        next_END, reward_EN, end_EN = self.members(state_ND, action_N)
+        return reward_EN.mean(0).double(), self.gamma * (1 - end_EN.mean(0).double()), next_END.mean(0)
+
+    def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
+        """The means over members, and an end with their mean probability; with repeated actions the discount keeps its
+        mean, and no end is sampled."""
+        if self.action_repeat > 1:
+            return super().sample(state_N, action_N, key_N=key_N)
+        self.simulator_steps += len(state_N)
+        reward_N, discount_N, next_ND = self.step(self.states(state_N), action_N)
+        goes_on_N = uniform(key_N) * self.gamma < discount_N
+        return Transitions(reward_N, self.gamma * goes_on_N.double(), self.number(next_ND))
+
+    @torch.no_grad()
+    def _errors(self, held_out: Tensor) -> dict[str, float]:
+        """The errors on held-out steps, by name."""
+        errors = {}
+        for steps in _AHEAD:
+            starts = self._runs(held_out, steps)[-_MOST_MEASURED:]
+            if len(starts) == 0:
+                continue
+            state_ND = self.replay.rows("state", starts).to(self.device)
+            for ahead in range(steps):
+                at_N = (starts + ahead) % self.replay.capacity
+                state_ND = self.step(state_ND, self.replay.rows("action", at_N).to(self.device))[2]
+            true_ND = self.replay.rows("next_state", at_N).to(self.device)
+            errors[f"error_{steps}"] = float(
+                self._scaled("state", state_ND).sub(self._scaled("state", true_ND)).square().mean().sqrt()
+            )
+            if steps == 1:
+                errors["unexplained"] = float(
+                    self._scaled("change", state_ND - true_ND + self._moments["change"][0]).square().mean()
+                )
+        if errors.get("unexplained", 0.0) > _UNEXPLAINED and len(self.replay) >= _ENOUGH_STEPS and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"after {self.replay.num_added:,} steps {errors['unexplained']:.0%} of what changes in an observation "
+                "is not predicted from the one before: the observation may not be the state (give it what is missing, "
+                "as speeds or earlier observations), or chance decides what follows",
+                stacklevel=2,
+            )
+        return errors
+
+    def _runs(self, held_out: Tensor, steps: int) -> Int[Tensor, "R"]:
+        """The rows that begin `steps` held-out steps of one episode, in the order of the ring."""
+        good, follows = held_out.clone(), self.replay.rows("follows")
+        for ahead in range(1, steps):
+            good &= held_out.roll(-ahead) & follows.roll(1 - ahead)
+        good[len(good) - steps + 1 :] &= steps == 1  # these would go on at the beginning of the ring
+        return torch.nonzero(good).flatten()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights, optimiser, moments and replay."""
+        return {
+            "weights": [weight.detach().cpu().clone() for weight in self._weights],
+            "optimiser": copy.deepcopy(self._optimiser.state_dict()["state"]),
+            "moments": {name: [value.cpu() for value in pair] for name, pair in self._moments.items()},
+            "replay": self.replay.state_dict(),
+            "end_share": self._end_share,
+            "warned": self._warned,
+            "generation": self.generation,
+        }
+
+    @torch.no_grad()
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        shapes = [tuple(weight.shape) for weight in self._weights]
+        if (found := [tuple(weight.shape) for weight in state["weights"]]) != shapes:
+            raise PgtsError(f"the weights have shapes {found}; they must have {shapes}")
+        check_count("generation", state["generation"], least=0)
+        for weight, value in zip(self._weights, state["weights"], strict=True):
+            weight.copy_(value)
+        groups = self._optimiser.state_dict()["param_groups"]
+        self._optimiser.load_state_dict({"state": copy.deepcopy(state["optimiser"]), "param_groups": groups})
+        self._moments = {
+            name: (mean.to(self.device), deviation.to(self.device))
+            for name, (mean, deviation) in state["moments"].items()
+        }
+        self.replay.load_state_dict(state["replay"])
+        if not (isinstance(state["end_share"], float) and 0 <= state["end_share"] <= 1):
+            raise PgtsError(f"end_share is {state['end_share']!r}; it must be a share")
+        self._end_share = state["end_share"]
+        self._warned, self.generation = bool(state["warned"]), state["generation"]

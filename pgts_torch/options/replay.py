@@ -1,0 +1,44 @@
+"""Options of the replay of what was seen."""
+
+from typing import Literal
+
+from pgts_torch.options.fields import Count, Positive, Share
+from pgts_torch.options.part import Part
+
+
+class AutoReplay(Part):
+    """By the model: uniform where it is learned, else none."""
+
+    type: Literal["auto"] = "auto"
+
+
+class NoReplay(Part):
+    """Each iteration learns from its own rollouts, once."""
+
+    type: Literal["none"] = "none"
+
+
+class UniformReplay(Part):
+    """Each iteration makes many updates, from episodes that are imagined in the model and start in states seen so far,
+    all equally likely (Dyna, Sutton 1990)."""
+
+    type: Literal["uniform"] = "uniform"
+
+    capacity: Count = 100_000
+    """The number of visits that are kept; the oldest ones are dropped."""
+
+    updates_per_step: Positive = 0.5
+    """Updates of critic and policy for each environment step."""
+
+    starts: Count = 16
+    """Imagined episodes of an update."""
+
+    length: Count = 16
+    """The largest number of steps of an imagined episode."""
+
+    polyak: Share = 0.05
+    """The step of the slow copy of a network policy toward it after each update. Imagined episodes follow the copy, and
+    updates start from it; 1: there is no copy."""
+
+
+Replay = AutoReplay | NoReplay | UniformReplay

@@ -1,0 +1,199 @@
+"""Training from imagined episodes that start in replayed states."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from pgts_torch import PGTS
+from pgts_torch.agent.imagine import imagine
+from pgts_torch.agent.ongoing import OngoingEpisodes
+from pgts_torch.agent.world import TabularWorld, World
+from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.models import TabularModel
+from pgts_torch.options import CMPO, MLP, Counts, Ensemble, NetworkValues, StepsHorizon, UniformReplay
+from pgts_torch.seeding import stream
+from pgts_torch.tabular import exact
+from tests.agent.helpers import following, vector_env
+from tests.support import zoo
+
+SMALL = {
+    "depth": 1,
+    "model": Ensemble(members=2, hidden=[16], first_updates=20),
+    "replay": UniformReplay(updates_per_step=0.1, starts=4, length=5),
+    "horizon": StepsHorizon(length=30, first=50),
+    "policy": MLP(hidden=[16]),
+}
+
+
+class Slide(gymnasium.Env):
+    """A position that actions move; its noise is of its own generator, or of numpy's global one."""
+
+    observation_space = spaces.Box(-10, 10, (2,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, *, shared: bool = False) -> None:
+        self.shared = shared
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = self.np_random.normal(size=2)
+        return self.state.astype(np.float32), {}
+
+    def step(self, action):
+        noise = np.random.normal() if self.shared else self.np_random.normal()  # noqa: NPY002
+        self.state = self.state + np.array([0.1 * (2 * action - 1), 0.1 * noise])
+        return self.state.astype(np.float32), float(self.state[0]), bool(abs(self.state[0]) > 1), False, {}
+
+
+def world_of_slides(count: int, *, shared: bool = False) -> World:
+    env = SyncVectorEnv([lambda: Slide(shared=shared)] * count, autoreset_mode=AutoresetMode.DISABLED)
+    return World(env, gamma=0.9)
+
+
+def collected(episodes: OngoingEpisodes, *lengths: int) -> list:
+    policy = PGTS(Slide, depth=0, estimator="sampled", num_envs=1).policy
+    return [
+        episodes.collect(policy, length, names=("test", k), generator=stream(k, "test"))
+        for k, length in enumerate(lengths)
+    ]
+
+
+def test_episodes_go_on_from_one_rollout_to_the_next():
+    episodes = OngoingEpisodes(world_of_slides(3), max_length=17, seed=0, names=())
+    rollouts = collected(episodes, 20, 7, 40)
+    steps = [rollout.steps() for rollout in rollouts]
+    assert [rollout.num_steps for rollout in rollouts] == [60, 21, 120]
+    for rollout, step in zip(rollouts, steps, strict=True):
+        assert rollout.finished is not None
+        follows_N, over_N = step.follows_N, step.discount_N == 0
+        assert not bool((follows_N & over_N).any())
+        after_N = step.next_observation_N[:-1][follows_N[:-1]]
+        assert after_N.equal(step.observation_N[1:][follows_N[:-1]])
+        second_B = rollout.weight_TB[1]
+        assert second_B.tolist() == [0.9 if alive else 0.0 for alive in rollout.alive_TB[1].tolist()]
+    finished = [each for rollout in rollouts for each in rollout.finished]
+    assert all(length <= 17 for _, length in finished)
+    assert len({length for _, length in finished}) > 1
+    # all rewards belong to an episode: those that ended, and the three that did not
+    total = sum(float(step.reward_N.sum()) for step in steps)
+    open_returns = episodes.state_dict()["return"]
+    assert total == pytest.approx(sum(value for value, _ in finished) + sum(open_returns))
+
+
+def test_episodes_are_restored_from_their_seeds_and_actions():
+    one, other = (OngoingEpisodes(world_of_slides(3), max_length=17, seed=0, names=()) for _ in range(2))
+    collected(one, 20, 7)
+    other.load_state_dict(one.state_dict())
+    for mine, its in zip(collected(one, 9, 30), collected(other, 9, 30), strict=True):
+        assert mine.observation_UB.equal(its.observation_UB)
+        assert mine.reward_TB.equal(its.reward_TB)
+        assert mine.finished == its.finished
+
+
+def test_episodes_that_cannot_be_repeated_are_refused():
+    world = world_of_slides(1, shared=True)
+    one, other = (OngoingEpisodes(world, max_length=500, seed=0, names=()) for _ in range(2))
+    with pytest.warns(UserWarning, match="the whole process shares"):
+        collected(one, 5, 4)
+    with pytest.raises(
+        PgtsError, match=r"does not repeat its episode from the seed \d+ and \d+ actions.*horizon 'fixed'"
+    ):
+        other.load_state_dict(one.state_dict())
+    with pytest.raises(PgtsError, match="it is of 1 environments; this training has 2"):
+        OngoingEpisodes(world_of_slides(2), max_length=5, seed=0, names=()).load_state_dict(one.state_dict())
+    with pytest.raises(PgtsError, match="num_envs 1, because its environments share one random generator"):
+        OngoingEpisodes(World(vector_env(zoo("ladder"), 2), gamma=0.9), max_length=5, seed=0, names=())
+
+
+def test_imagined_returns_are_unbiased():
+    mdp = zoo("garnet")
+    world = TabularWorld(vector_env(mdp, 1), mdp)
+    pi_SA = torch.softmax(torch.randn(mdp.num_states, mdp.num_actions, generator=stream(0, "pi")).double(), -1)
+    start_B = torch.zeros(4000, dtype=torch.int64)
+    rollout = imagine(world, following(pi_SA), start_B, 100, generator=stream(1, "test"))
+    returns_B = rollout.returns()
+    v_S, error = exact.evaluate(mdp, pi_SA).v_S, float(returns_B.std()) / 4000**0.5
+    cut = float(rollout.weight_TB[-1].max() * v_S.abs().max())  # of what comes after the last step
+    assert abs(float(returns_B.mean() - v_S[0])) < 5 * error + cut  # outside with a probability below 1e-6
+    assert rollout.state_UB is not None
+    assert rollout.state_UB.equal(rollout.observation_UB)
+
+
+@pytest.mark.parametrize("model", ["auto", SMALL["model"]], ids=["given", "learned"])
+def test_a_training_with_replay_goes_on_bit_for_bit(model, tmp_path):
+    arguments = SMALL | {"model": model, "seed": 3}
+    whole = PGTS("CartPole-v1", **arguments).learn(200)
+    half = PGTS("CartPole-v1", **arguments).learn(100)
+    half.save(tmp_path / "half.pt")
+    rest = PGTS.load(tmp_path / "half.pt").learn(200)
+    assert rest.num_env_steps == whole.num_env_steps
+    assert rest.num_model_calls == whole.num_model_calls
+    for part in ("policy", "critic", "dyna"):
+        assert equal(getattr(rest, part).state_dict(), getattr(whole, part).state_dict())
+
+
+def equal(one, other) -> bool:
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(equal, one, other))
+    return one.equal(other) if isinstance(one, torch.Tensor) else one == other
+
+
+@pytest.mark.parametrize("model", ["auto", Counts()], ids=["given", "learned"])
+def test_a_table_learns_from_replay(model):
+    training = PGTS("pgts/Ladder-v0", depth=8, model=model, replay="uniform", seed=0).learn(1500)
+    mdp = zoo("ladder")
+    probs = training.policy.probs(torch.arange(mdp.num_states))
+    J = exact.evaluate(mdp, probs).J
+    assert J > 0.9 * exact.optimal(mdp).J
+
+
+def test_a_model_of_the_callers_own_is_searched():
+    mdp = zoo("ladder")
+    own = TabularModel(mdp)
+    training = PGTS("pgts/Ladder-v0", model=own, num_envs=2)
+    assert training.world.model is own
+    training.iterate()
+    assert training.num_model_calls > 0
+    with pytest.raises(PgtsError, match="model was given as"):
+        training.content()
+    with pytest.raises(PgtsError, match=r"TabularModel has 2 actions; Taxi"):
+        PGTS("Taxi-v4", model=own)
+    with pytest.raises(PgtsError, match="numbered observations need"):
+        PGTS("CartPole-v1", model=own)
+
+
+def test_what_does_not_go_with_a_learned_model_is_refused():
+    with pytest.raises(MissingModel, match=r"'ensemble'.* vectors of numbers.*'counts'"):
+        PGTS("pgts/Ladder-v0", model="ensemble")
+    with pytest.raises(MissingModel, match=r"'counts'.* numbered states.*'ensemble'"):
+        PGTS("CartPole-v1", model="counts")
+    with pytest.raises(PgtsError, match=r"stop_at is 0\.1, which needs an upper bound"):
+        PGTS("CartPole-v1", model="ensemble", stop_at=0.1)
+    with pytest.raises(PgtsError, match=r"replay\.type uniform"):
+        PGTS("CartPole-v1", horizon="steps")
+    with pytest.raises(PgtsError, match=r"estimator\.type sampled there is no lookahead"):
+        PGTS("CartPole-v1", model="ensemble", estimator="sampled", depth=0)
+
+
+def test_starts_that_are_not_sampled_bound_nothing():
+    with pytest.raises(PgtsError, match="start states are known from episodes only"):
+        PGTS("CartPole-v1", replay="uniform", depth="adaptive", reward_range=(0, 1))
+    training = PGTS("CartPole-v1", **SMALL | {"model": "auto", "reward_range": (0, 1)})
+    assert training.iterate().certificate == float("inf")
+
+
+def test_options_that_suit_replay_are_chosen():
+    training = PGTS("CartPole-v1", model="ensemble")
+    options = training.options
+    assert isinstance(options.replay, UniformReplay)
+    assert isinstance(options.rollout.horizon, StepsHorizon)
+    assert (options.rollout.num_envs, options.policy) == (1, MLP(normalize=True))
+    assert isinstance(options.critic, NetworkValues)
+    assert (options.critic.network, options.critic.num_epochs) == (options.policy, 1)
+    assert isinstance(options.update, CMPO)
+    assert training.dyna.policy is not training.policy

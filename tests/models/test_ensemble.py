@@ -1,0 +1,142 @@
+"""Dynamics learned from steps."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.models.base import Experience
+from pgts_torch.models.ensemble import EnsembleModel
+from pgts_torch.options import Ensemble
+from pgts_torch.search import expectimax
+from pgts_torch.seeding import stream
+
+GAMMA = 0.9
+SMALL = Ensemble(members=2, hidden=[32], first_updates=800)
+
+
+def swing(count: int, seed: int = 0, *, hidden: bool = False, length: int = 40) -> Experience:
+    """Steps of a linear system with two actions: it pays the first number, and ends where that is above 1.5.
+
+    hidden: whether the second number, without which nothing can be predicted, is replaced by noise.
+    """
+    random = np.random.default_rng(seed)
+    rows, state = [], np.zeros(2)
+    for t in range(count):
+        action = int(random.integers(2))
+        after = np.array([state[0] + 0.3 * state[1], 0.9 * state[1] - 0.1 * state[0] + (action - 0.5) * 0.8])
+        ended = after[0] > 1.5
+        over = ended or t % length == length - 1
+        rows.append((state, action, float(state[0]), 0.0 if ended else GAMMA, after, not over))
+        state = random.normal(size=2) * 0.5 if over else after
+    columns = [torch.from_numpy(np.array(column)) for column in zip(*rows, strict=True)]
+    if hidden:
+        columns[0][:, 1], columns[4][:, 1] = torch.from_numpy(random.normal(size=(2, count)))
+    return Experience(*columns)
+
+
+def trained(count: int = 600, *, seed: int = 0, options: Ensemble = SMALL) -> EnsembleModel:
+    model = EnsembleModel(2, 2, gamma=GAMMA, options=options, seed=seed)
+    model.learn(swing(count), generator=stream(seed, "learn"))
+    return model
+
+
+def test_what_follows_is_learned():
+    model, fresh = trained(), swing(400, seed=1)
+    reward_N, discount_N, next_ND = model.step(fresh.observation_N.float(), fresh.action_N)
+    change_ND = fresh.next_observation_N - fresh.observation_N
+    assert float((next_ND - fresh.next_observation_N).square().mean() / change_ND.var()) < 0.01
+    assert float((reward_N - fresh.reward_N).abs().mean()) < 0.05
+    ended_N = fresh.discount_N == 0
+    assert float((discount_N[ended_N, None] < discount_N[~ended_N]).double().mean()) > 0.98
+    assert float(discount_N[~ended_N].mean()) > 0.98 * GAMMA
+    # an untrained one says nothing of it
+    untrained = EnsembleModel(2, 2, gamma=GAMMA, options=SMALL)
+    off_ND = untrained.step(fresh.observation_N.float(), fresh.action_N)[2] - fresh.next_observation_N
+    assert float(off_ND.square().mean() / change_ND.var()) > 0.3
+
+
+def test_an_end_is_sampled_with_its_probability():
+    model = trained()
+    state_N = model.number(torch.tensor([[1.4, 0.1]]).repeat(4000, 1))
+    action_N = torch.ones(4000, dtype=torch.int64)
+    discount = float(model.step(torch.tensor([[1.4, 0.1]]), action_N[:1])[1])
+    assert 0 < discount < GAMMA
+    sampled = model.sample(state_N, action_N, key_N=torch.arange(4000))
+    share = float((sampled.discount_N > 0).double().mean())
+    p = discount / GAMMA
+    assert abs(share - p) < 5 * math.sqrt(p * (1 - p) / 4000)  # outside with a probability below 1e-6
+    assert set(sampled.discount_N.tolist()) == {0.0, GAMMA}
+    again = model.sample(state_N, action_N, key_N=torch.arange(4000))
+    assert again.discount_N.equal(sampled.discount_N)
+
+
+def test_a_lookahead_in_it_is_that_of_its_means():
+    model = trained()
+    roots = model.number(torch.tensor([[0.1, 0.2], [0.5, -0.5]]))
+    look = expectimax(model, roots, v_leaf=lambda state_N: model.states(state_N)[:, 0].double(), depth=1)
+    state_ND, action_N = model.states(roots).repeat_interleave(2, 0), torch.tensor([0, 1]).repeat(2)
+    reward_N, discount_N, next_ND = model.step(state_ND, action_N)
+    pairs_ND, actions_N = next_ND.repeat_interleave(2, 0), torch.tensor([0, 1]).repeat(4)
+    after_N, then_N, last_ND = model.step(pairs_ND, actions_N)
+    best_N = (after_N + then_N * last_ND[:, 0].double()).view(-1, 2).amax(-1)
+    torch.testing.assert_close(look.q_BA, (reward_N + discount_N * best_N).view(2, 2), rtol=1e-5, atol=1e-6)
+
+
+def test_errors_are_of_held_out_steps_and_fall_with_data():
+    few, many = (
+        EnsembleModel(2, 2, gamma=GAMMA, options=Ensemble(members=2, hidden=[32], first_updates=2 * count)).learn(
+            swing(count), generator=stream(0, "learn")
+        )
+        for count in (350, 1600)
+    )
+    assert {"loss", "unexplained", "error_1", "error_4", "error_16"} <= set(many)
+    assert many["error_1"] < many["error_16"]
+    assert many["error_4"] < few["error_4"]
+
+
+def test_observations_that_are_no_states_are_noticed():
+    model = EnsembleModel(2, 2, gamma=GAMMA, options=SMALL)
+    with pytest.warns(UserWarning, match="the observation may not be the state"):
+        model.learn(swing(2500, hidden=True), generator=stream(0, "learn"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(swing(100, seed=2, hidden=True), generator=stream(1, "learn"))  # said once
+        EnsembleModel(2, 2, gamma=GAMMA, options=SMALL).learn(swing(2500), generator=stream(0, "learn"))
+
+
+def test_a_constant_number_and_a_constant_reward_are_learned_exactly():
+    steps = swing(200)
+    constant = steps._replace(
+        observation_N=torch.cat([steps.observation_N, torch.full((200, 1), 7.0)], 1),
+        next_observation_N=torch.cat([steps.next_observation_N, torch.full((200, 1), 7.0)], 1),
+        reward_N=torch.full((200,), 1e-3, dtype=torch.float64),
+    )
+    model = EnsembleModel(3, 2, gamma=GAMMA, options=SMALL)
+    model.learn(constant, generator=stream(0, "learn"))
+    reward_N, _, next_ND = model.step(constant.observation_N.float(), constant.action_N)
+    assert next_ND[:, 2].tolist() == [7.0] * 200
+    torch.testing.assert_close(reward_N, constant.reward_N, rtol=1e-6, atol=0)
+
+
+def test_a_loaded_model_goes_on_bit_for_bit():
+    one, other = trained(300), EnsembleModel(2, 2, gamma=GAMMA, options=SMALL, seed=5)
+    other.load_state_dict(one.state_dict())
+    losses = [model.learn(swing(100, seed=3), generator=stream(7, "learn")) for model in (one, other)]
+    assert losses[0] == losses[1]
+    state_ND, action_N = torch.randn(8, 2, generator=stream(0, "test")), torch.arange(8) % 2
+    for mine, its in zip(one.step(state_ND, action_N), other.step(state_ND, action_N), strict=True):
+        assert mine.equal(its)
+
+
+def test_what_cannot_be_learned_is_refused():
+    model, steps = EnsembleModel(2, 2, gamma=GAMMA, options=SMALL), swing(50)
+    with pytest.raises(PgtsError, match=r"shape \(3,\); .* vectors of 2 numbers"):
+        model.learn(steps._replace(observation_N=torch.zeros(50, 3)), generator=stream(0, "learn"))
+    with pytest.raises(PgtsError, match=r"discount 0\.5; .* gamma is 0\.9"):
+        model.learn(steps._replace(discount_N=torch.full((50,), 0.5)), generator=stream(0, "learn"))
+    with pytest.raises(NotFinite, match="the mean of rewards is"):
+        model.learn(steps._replace(reward_N=torch.full((50,), torch.nan)), generator=stream(0, "learn"))
