@@ -74,7 +74,7 @@ def test_after_kills_at_random_moments_every_byte_is_that_of_an_uninterrupted_ru
         killed += code == -signal.SIGKILL
         if code != -signal.SIGKILL:
             assert left(folder) == expected
-            compared, folder = compared + 1, tmp_path / str(killed)
+            compared, folder = compared + 1, tmp_path / str(compared)
     assert training(folder) in (0, 2)
     assert left(folder) == expected
     if kills >= 25:
