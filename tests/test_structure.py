@@ -282,3 +282,27 @@ def test_a_bar_in_a_formula_does_not_end_its_cell():
 def test_methods_of_public_classes_are_read_and_private_ones_are_not():
     source = 'class A:\n  "[PGTS Sec. 2]"\n  def f(self):\n    "[PGTS Sec. 3]"\n  def _g(self): ...\ndef _h(): ...'
     assert dict(documented(ast.parse(source), "m")) == {"m.A": "[PGTS Sec. 2]", "m.A.f": "[PGTS Sec. 3]"}
+
+
+# Theory
+
+THEORY_TESTS = ("tests/tabular/test_stationary_sets.py", "study/tests/test_theory.py")
+"""The files whose tests docs/theory.md names without a file."""
+
+
+def unknown_tests(text: str) -> set[str]:
+    """The tests and files of tests that a text names and that do not exist."""
+    files = set(re.findall(r"`((?:tests|study)/[\w/]+\.py)`", text))
+    known = [node for file in THEORY_TESTS for node in ast.parse((ROOT / file).read_text()).body]
+    names = {node.name for node in known if isinstance(node, ast.FunctionDef)}
+    return {file for file in files if not (ROOT / file).exists()} | (set(re.findall(r"`(test_\w+)`", text)) - names)
+
+
+def test_every_test_that_the_page_on_theory_names_exists():
+    text = (ROOT / "docs" / "theory.md").read_text()
+    assert len(re.findall(r"`test_\w+`", text)) > 20
+    assert unknown_tests(text) == set()
+
+
+def test_a_test_that_does_not_exist_would_be_found_on_the_page_on_theory():
+    assert unknown_tests("`test_of_nothing` in `tests/test_nothing.py`") == {"test_of_nothing", "tests/test_nothing.py"}

@@ -48,7 +48,8 @@ class PGTS:
             a VectorEnv that can reset by mask (`EnvSource`). The model of the lookahead is the environment's table
             (pgts/*, or a P table), else its dynamics in torch (CartPole, Acrobot, MountainCar, Pendulum), else a
             simulator that is restored from snapshots.
-        depth, max_depth, tolerance, stop_at: m, or how it is chosen, and when training ends (`options.search.Depth`).
+        depth, max_depth, tolerance, stop_at: m, or how it is chosen, and when training ends: see
+            `options.search.LookaheadOptions`.
         search: the search for the lookahead: "auto", MCTS(simulations=32), {"type": "sampled", "samples": 8}, ...
         estimator: "lookahead", or SampledAdvantages() of actions taken, which needs depth 0, a network and no model.
         policy, critic, update, horizon: options of these parts (`pgts_torch.options`), their names, or the parts
@@ -57,7 +58,8 @@ class PGTS:
             process, beside which another number is an error.
         actions_per_dimension: the number of evenly spaced values, from the lowest to the highest, for each dimension of
             continuous actions; None: actions are discrete, or MultiDiscrete, whose combinations are numbered.
-        action_repeat, model_check: of the model (`options.search.Depth`, `TensorModel`, `ModelCheck`).
+        action_repeat, model_check: how often the model repeats an action, and whether it is checked against steps of
+            the environment: see there, too.
         observation_key: the entry of dictionary observations that policy and critic use.
         reward_range: the lowest and the highest reward of a single step; a reward outside of it is an error. `stop_at`
             and an adaptive depth need it where the model has no largest reward (simulators).
@@ -104,9 +106,11 @@ class PGTS:
         arguments = {name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()}
         self.seed, self.device, self.ranks = seed, make_device(device), present_ranks()
         parts = self._parts = make_parts(arguments, self.ranks)
-        self.options, self.source, self.world, self.policy, self.critic, self.update = parts[:6]
-        self.search, self.certificates, self.depth_choice, self.estimator, self.model_check = parts[6:11]
-        self.episodes, self.dyna = parts[11:]
+        self.options, self.source, self.world = parts.options, parts.source, parts.world
+        self.policy, self.critic, self.update = parts.policy, parts.critic, parts.update
+        self.search, self.certificates, self.depth_choice = parts.search, parts.certificates, parts.depth_choice
+        self.estimator, self.model_check = parts.estimator, parts.model_check
+        self.episodes, self.dyna = parts.episodes, parts.dyna
         self.gamma, self.horizon = self.world.gamma, self.options.rollout.horizon
         self.num_iterations = self.num_env_steps = self.num_model_calls = 0
         self._arguments = arguments | {"env": self.source.description, "device": str(self.device)}
@@ -172,7 +176,7 @@ class PGTS:
             raise PgtsError("with sampled advantages there is no lookahead")
         depth = self.depth_choice.depths[-1] if depth is None else depth
         generator = self.ranks.draws(self.seed, self.num_iterations, self.device).search()
-        return self.depth_choice.look(state_N, depth, generator)
+        return self.depth_choice.look.alone(state_N, depth=depth, generator=generator)
 
     def learn(self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool = False) -> Self:
         """Iterate until there are `total_steps` environment steps, including those before this call.

@@ -1,7 +1,8 @@
 """The lookahead of a policy: a search with the critic's values at the leaves, which several processes can share."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import zip_longest
 from typing import Any, final
 
@@ -23,6 +24,8 @@ _VALUES = ("q_BA", "stderr_BA", "pruned_BA", "bias_BA")
 class PolicyLookahead:
     """(T^m Q)(s, .) at states of a model, with the critic's estimate of Q^pi or v^pi at the leaves.
 
+    alone: the search with this critic and policy, `alone(state_N, depth=m, generator=generator)`, in this process only.
+
     Args:
         world: gives the observations of states, for policy and critic.
         policy: gives the prior of a tree search.
@@ -34,11 +37,8 @@ class PolicyLookahead:
     def __init__(self, world: ModelWorld, policy: Policy, critic: Critic, search: Search, ranks: Ranks) -> None:
         self.world, self.policy, self.critic, self.search, self._ranks = world, policy, critic, search, ranks
         self._generation = world.model.generation
-        self._leaves = {f"{critic.target}_leaf": self._leaf, "prior": self._prior}
-
-    def __call__(self, state_N: Int[Tensor, "N"], depth: int, generator: torch.Generator) -> Lookahead:
-        """Return the lookahead from all these states, computed in this process."""
-        return self.search(state_N, depth=depth, generator=generator, **self._leaves)
+        leaves: dict[str, Any] = {f"{critic.target}_leaf": self._leaf, "prior": self._prior}
+        self.alone: Callable[..., Lookahead] = partial(search, **leaves)
 
     def in_parts(self, state_N: Int[Tensor, "N"], depth: int, generator: torch.Generator) -> Lookahead:
         """Return the lookahead from states that all ranks have; each rank computes its part of them.
@@ -47,10 +47,11 @@ class PolicyLookahead:
             PgtsError, RankLost: as `Ranks.gather`.
         """
         if self._ranks.size == 1:
-            return self(state_N, depth, generator)
+            return self.alone(state_N, depth=depth, generator=generator)
         mine = self._ranks.part(state_N)
         looks = self._ranks.gather(
-            "lookahead", lambda: _moved(self(mine, depth, generator), "cpu") if len(mine) else None
+            "lookahead",
+            lambda: _moved(self.alone(mine, depth=depth, generator=generator), "cpu") if len(mine) else None,
         )
         return _moved(_joined([look for look in looks if look is not None]), state_N.device)
 

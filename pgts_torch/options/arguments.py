@@ -10,10 +10,14 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.options.mistakes import explain
 from pgts_torch.options.part import Part
 from pgts_torch.options.rollouts import Rollouts
-from pgts_torch.options.search import Depth
+from pgts_torch.options.search import LookaheadOptions
 from pgts_torch.options.training import Training
 
-_FLAT = {"env": ("observation_key",), "rollout": tuple(Rollouts.model_fields), "search": tuple(Depth.model_fields)}
+_FLAT = {
+    "env": ("observation_key",),
+    "rollout": tuple(Rollouts.model_fields),
+    "search": tuple(LookaheadOptions.model_fields),
+}
 """The sections whose options are arguments of `PGTS` of their own."""
 
 _PARTS = ("policy", "critic", "estimator", "update", "model", "replay")
@@ -53,7 +57,7 @@ def checked(options: Mapping[str, Any]) -> Training:
 def described(options: Training) -> dict[str, Any]:
     """Return plain arguments from which `read` returns the same options."""
     plain = options.plain()
-    kind = {name: value for name, value in plain["search"].items() if name not in Depth.model_fields}
+    kind = {name: value for name, value in plain["search"].items() if name not in LookaheadOptions.model_fields}
     flat = {name: getattr(getattr(options, section), name) for section, names in _FLAT.items() for name in names}
     return flat | {name: plain[name] for name in _PARTS} | {"search": kind, "horizon": plain["rollout"]["horizon"]}
 

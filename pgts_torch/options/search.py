@@ -121,7 +121,7 @@ Kind = Auto | Expectimax | Sampled | MCTS
 """The values of the argument `search` of `PGTS`, between which `search.kind` chooses in a configuration."""
 
 
-class Depth(Part):
+class LookaheadOptions(Part):
     """The lookahead T^m Q at the visited states."""
 
     depth: Natural | Literal["adaptive"] = 4
@@ -161,21 +161,21 @@ class Depth(Part):
         return value
 
 
-class AutoSearch(Auto, Depth):
+class AutoSection(Auto, LookaheadOptions):
     """The search that suits the model and the budget."""
 
 
-class ExpectimaxSearch(Expectimax, Depth):
+class ExpectimaxSection(Expectimax, LookaheadOptions):
     """Enumerates all outcomes of all actions."""
 
 
-class SampledSearch(Sampled, Depth):
+class SampledSection(Sampled, LookaheadOptions):
     """Samples outcomes of all actions."""
 
 
-class MCTSSearch(MCTS, Depth):
+class MCTSSection(MCTS, LookaheadOptions):
     """A tree search that expands the most promising states (Monte-Carlo tree search)."""
 
 
-Search = AutoSearch | ExpectimaxSearch | SampledSearch | MCTSSearch
+SearchSection = AutoSection | ExpectimaxSection | SampledSection | MCTSSection
 """The section `search` of a configuration."""

@@ -21,7 +21,7 @@ from pgts_torch.options.rollouts import (
     SampledAdvantages,
     StepsHorizon,
 )
-from pgts_torch.options.search import AutoSearch, Search
+from pgts_torch.options.search import AutoSection, SearchSection
 from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient, Update
 
 
@@ -60,7 +60,7 @@ class Training(Part):
     critic: AutoCritic | Critic = Field(default=AutoCritic(), discriminator="type")
     """Where the values at the leaves of the lookahead come from."""
 
-    search: Search = Field(default=AutoSearch(), discriminator="kind")
+    search: SearchSection = Field(default=AutoSection(), discriminator="kind")
     """The search that computes the lookahead."""
 
     estimator: Estimator = Field(default=LookaheadAdvantages(), discriminator="type")
@@ -132,7 +132,7 @@ class Training(Part):
         search, policy, critic = (info.data.get(name) for name in ("search", "policy", "critic"))
         if isinstance(estimator, LookaheadAdvantages):
             return estimator
-        for name, needed in AutoSearch(depth=0) if search is not None else ():
+        for name, needed in AutoSection(depth=0) if search is not None else ():
             if (value := getattr(search, name)) != needed:
                 raise conflict(
                     f"search.{name} is {value}; with estimator.type sampled there is no lookahead, it must be "

@@ -15,8 +15,8 @@ from pgts_torch.options.search import MCTS, Expectimax, Sampled
 from pgts_torch.search.empirical import FixedSamples
 from pgts_torch.search.expectimax import search_levels
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_finite
-from pgts_torch.search.mcts import grow
-from pgts_torch.search.sampled import plan_levels, sparse
+from pgts_torch.search.mcts import search_tree
+from pgts_torch.search.sampled import plan_levels, search_samples
 from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import sample_keys
 
@@ -158,7 +158,7 @@ class SampledSearch(Search):
         plan_levels(options, 1, model)
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
-        return sparse(leaves, self._model, root_B, self.options, generator, replicates=REPLICATES)
+        return search_samples(leaves, self._model, root_B, self.options, generator, replicates=REPLICATES)
 
     def __str__(self) -> str:
         return f"sampled, {self.options.samples} outcomes of each action, shared by {self.options.share}"
@@ -188,7 +188,7 @@ class MCTSSearch(Search):
             samples = FixedSamples(sampling(self.model, "mcts"), samples=self._samples, key=key)
             topology = Topology(samples, max_bytes=self.options.max_bytes)
             calls_each = self._samples
-        look = grow(leaves, topology, root_B, self.options, generator)
+        look = search_tree(leaves, topology, root_B, self.options, generator)
         return replace(look, model_calls=look.model_calls * calls_each)
 
     def __str__(self) -> str:

@@ -61,7 +61,7 @@ def search_levels(
         return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
     calls_before, expansions = topology.table.model_calls, leaves.expansions
     levels = topology.levels(root_B, expansions, max_nodes=max_nodes)
-    bottom = levels.leaves(expansions)
+    bottom = levels.bottom(expansions)
     q_NA = levels.back_up(leaves.v(bottom), expansions) if expansions else leaves.q(bottom)
     return Lookahead.enumerated(
         q_NA.index_select(0, levels.root_row_B),

@@ -40,7 +40,7 @@ class Levels:
         """How many of `expansions` levels, counted from the leaves, are the closed set."""
         return max(0, expansions - len(self.outcomes))
 
-    def leaves(self, expansions: int) -> Int[Tensor, "N"]:
+    def bottom(self, expansions: int) -> Int[Tensor, "N"]:
         """The states at the bottom of `expansions` levels."""
         # The last step leads into the closed set, not into a frontier.
         if self.closed is not None and expansions >= len(self.outcomes):

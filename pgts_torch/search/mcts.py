@@ -97,11 +97,13 @@ def mcts(
     )
     if root == "rule" and generator is not None:
         raise PgtsError("only root='gumbel' uses a generator")
-    return grow(Leaves(model, depth, q_leaf, v_leaf, prior), topology_of(model, topology), root_B, options, generator)
+    return search_tree(
+        Leaves(model, depth, q_leaf, v_leaf, prior), topology_of(model, topology), root_B, options, generator
+    )
 
 
 @torch.no_grad()
-def grow(
+def search_tree(
     leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], options: MCTS, generator: torch.Generator | None
 ) -> Lookahead:
     """`mcts`, with leaves and topology at hand."""

@@ -71,11 +71,13 @@ def sampled(
         NodeBudgetExceeded: more than `max_nodes` or `max_bytes` would be needed.
     """
     options = Sampled(samples=samples, share=share, max_nodes=max_nodes, max_bytes=max_bytes)
-    return sparse(Leaves(model, depth, q_leaf, v_leaf), model, root_B, options, generator, replicates=replicates)
+    return search_samples(
+        Leaves(model, depth, q_leaf, v_leaf), model, root_B, options, generator, replicates=replicates
+    )
 
 
 @torch.no_grad()
-def sparse(
+def search_samples(
     leaves: Leaves,
     model: SamplingModel,
     root_B: Int[Tensor, "B"],
@@ -84,7 +86,7 @@ def sparse(
     *,
     replicates: int,
 ) -> Lookahead:
-    """`sampled`, with its leaves at hand."""
+    """`sampled`, with the leaves at hand."""
     check_roots(root_B, model.num_states)
     plan = plan_levels(options, leaves.expansions, model)
     if replicates < 0 or replicates == 1:
@@ -153,12 +155,12 @@ def _expanded(
             break
     steps: list[Step] = list(zip(levels.frontiers, levels.outcomes, strict=False))
     if levels.closed is None:
-        return steps, levels.leaves(expansions), levels.nodes_per_level(expansions)
+        return steps, levels.bottom(expansions), levels.nodes_per_level(expansions)
     if options.share == "search":
         # States recur: the remaining levels are the closed set, again and again.
         topology.levels(empirical.root_B, expansions, max_nodes=options.max_nodes)
         steps += [(levels.closed_states, levels.closed)] * levels.sweeps(expansions)
-        return steps, levels.leaves(expansions), levels.nodes_per_level(expansions)
+        return steps, levels.bottom(expansions), levels.nodes_per_level(expansions)
     # Paths, and states at a level, never recur: where no new node is met, no outcome of the level before has weight.
     widths = [len(frontier) for frontier in levels.frontiers]
     return steps, None, (*widths, *[0] * (expansions + 1 - len(widths)))

@@ -65,7 +65,7 @@ def test_the_evidence_is_that_of_bets_made_step_by_step_in_any_order():
 def test_true_probabilities_are_never_called_wrong_and_e_is_as_seldom_large_as_it_may_be(runs, batches):
     """Runs of 1,800 steps, in the long form of 6,450.
 
-    If Prop. 7 holds, P(E ever reaches x) <= 1/x in a run, and each of the five counts is above its limit with a
+    If Prop. 9 holds, P(E ever reaches x) <= 1/x in a run, and each of the five counts is above its limit with a
     probability below 1e-6: the number of runs in which that happens is at most binomial.
     """
     evidence_RTM = np.stack([followed(CLAIMED, seed=seed, batches=batches, batch=150)[1] for seed in range(runs)])

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.cli.main import main
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.tracking import read_metrics
+from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import check_finite
 from tests.experiment.runs import SHORT, SMALL, arguments, left, train_with_signals
 from tests.forks import PATIENCE, launched
@@ -111,20 +111,20 @@ def test_a_number_that_is_not_finite_in_the_second_process_stops_both_and_is_wri
     folder = tmp_path / "run"
 
     def work() -> int:
-        look, iterate, models = PolicyLookahead.__call__, PGTS.iterate, list[PGTS]()
+        look, iterate, models = Search.__call__, PGTS.iterate, list[PGTS]()
 
         def watched(self: PGTS) -> Any:
             models.append(self)
             return iterate(self)
 
-        def blind(self: PolicyLookahead, state_N: torch.Tensor, *rest: Any) -> Any:
-            found = look(self, state_N, *rest)
+        def blind(self: Search, state_N: torch.Tensor, **options: Any) -> Any:
+            found = look(self, state_N, **options)
             if models[-1].ranks.rank == 1 and models[-1].num_iterations == 1:
                 check_finite("lookahead", "the lookahead", found.q_BA * torch.nan, state_N)
             return found
 
         # In this process, which ends here.
-        PGTS.iterate, PolicyLookahead.__call__ = watched, blind  # type: ignore[method-assign]
+        PGTS.iterate, Search.__call__ = watched, blind  # type: ignore[method-assign]
         return main(arguments(folder))
 
     assert launched(2, work) == [1, 1]
