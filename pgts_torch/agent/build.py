@@ -74,7 +74,7 @@ def chosen(options: Training, world: World) -> Training:
     Raises:
         PgtsError: options that do not go together.
     """
-    policy, critic, update = options.policy, options.critic, options.update
+    policy, critic, update, replay = options.policy, options.critic, options.update, options.replay
     numbered, replayed = isinstance(world, TabularWorld), isinstance(options.replay, UniformReplay)
     if isinstance(policy, AutoPolicy):
         network = default_network(world.observation_space)
@@ -89,8 +89,13 @@ def chosen(options: Training, world: World) -> Training:
     if isinstance(update, AutoUpdate):
         lookahead = CMPO(**_SMALL_STEPS) if replayed else CMPO()
         neural = PPO() if isinstance(options.estimator, SampledAdvantages) else lookahead
-        update = neural if isinstance(policy, Network) else Projected() if isinstance(policy, Simplex) else Mirror()
-    return checked(dict(options) | {"policy": policy, "critic": critic, "update": update})
+        mirror = Mirror(step_size=20.0) if replayed else Mirror()
+        update = neural if isinstance(policy, Network) else Projected() if isinstance(policy, Simplex) else mirror
+    if isinstance(replay, UniformReplay):
+        if replay.starts == "all" and not numbered:
+            raise PgtsError("replay.starts is 'all', which is for tables; observations here are no numbered states")
+        replay = replay.filled("tables" if numbered else "vectors")
+    return checked(dict(options) | {"policy": policy, "critic": critic, "update": update, "replay": replay})
 
 
 def make_search(options: Kind, world: World) -> Search:

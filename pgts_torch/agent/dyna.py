@@ -4,6 +4,7 @@ import copy
 from collections.abc import Iterator
 from typing import Any, final
 
+from pgts_torch.agent.explorer import Explorer
 from pgts_torch.agent.imagine import imagine
 from pgts_torch.agent.model_check import ModelCheck
 from pgts_torch.agent.neural import NetworkPolicy
@@ -27,29 +28,42 @@ class Dyna:
     policy: the policy that imagined episodes follow: a slow copy of the one that is trained, which moves toward it by
         `polyak` after each update; the policy itself where that is a table.
     replay: the visited states, in column "state".
-    model_calls: the number of steps in the model so far.
 
     Args:
         world: the environments and their model.
         trained: the policy that is trained.
         model_check: holds the steps of the environment to the model before it is queried.
+        explorer: a policy that visits; None: the trained one does.
     """
 
-    def __init__(self, world: ModelWorld, trained: Policy, options: UniformReplay, model_check: ModelCheck) -> None:
+    def __init__(
+        self,
+        world: ModelWorld,
+        trained: Policy,
+        options: UniformReplay,
+        model_check: ModelCheck,
+        explorer: Explorer | None = None,
+    ) -> None:
         self._world, self._trained, self.options, self._model_check = world, trained, options, model_check
+        self.explorer, self._model = explorer, world.model if explorer is None else explorer.world.model
         self.policy = trained
         if isinstance(trained, NetworkPolicy) and options.polyak < 1:
             self.policy = copy.deepcopy(trained)
-        model = world.model
+        model = self._model
         own = model.replay if isinstance(model, LearningModel) else None
         self._owns_replay = own is None
         self.replay = ReplayBuffer(options.capacity) if own is None else own
-        self.num_updates = self.model_calls = 0
+        self.num_updates = self._steps = 0
+
+    @property
+    def model_calls(self) -> int:
+        """For how many (state, action) the model has been queried, but for the lookahead of the trained policy."""
+        return self._steps + (0 if self.explorer is None else self.explorer.model_calls)
 
     def learn(self, experience: Rollout, draws: Draws) -> dict[str, float]:
         """Keep the visited states, and let the model learn from the steps. Return its losses, by name."""
         self._model_check(experience, draws.number)
-        model, losses = self._world.model, {}
+        model, losses = self._model, {}
         if self._owns_replay:
             self.replay.add(state=self._world.export(experience.state_TB[experience.alive_TB]))
         if isinstance(model, LearningModel):
@@ -61,35 +75,47 @@ class Dyna:
 
         There are `updates_per_step` of them for each visit so far, less those of earlier iterations, and at least one.
         """
+        assert self.options.updates_per_step is not None
         due = int(self.options.updates_per_step * self.replay.num_added) - self.num_updates
         for number in range(max(due, 1)):
             own = draws.update(number)
             self._world.reset_numbers()
-            at_B = self.replay.sample(self.options.starts, generator=own.common)
-            start_B = self._world.adopt(self.replay.rows("state", at_B))
+            start_B = self._world.adopt(self._starts(own))
             imagined = imagine(self._world, self.policy, start_B, self.options.length, generator=own.common)
-            self.model_calls += imagined.num_steps
+            self._steps += imagined.num_steps
             yield imagined, own
             self.num_updates += 1
+            if self.explorer is not None:
+                self.explorer.improve(start_B, self.options.length, own)
             if self.policy is not self._trained:
                 assert isinstance(self.policy, NetworkPolicy)
                 assert isinstance(self._trained, NetworkPolicy)
                 self.policy.network.follow(self._trained.network, self.options.polyak)
 
+    def _starts(self, draws: Draws) -> Any:
+        """The states that imagined episodes start in, as the world exports them."""
+        if self.options.starts == "all":
+            return self.replay.rows("state").unique()
+        assert self.options.starts is not None
+        return self.replay.rows("state", self.replay.sample(self.options.starts, generator=draws.common))
+
     def state_dict(self) -> dict[str, Any]:
         """What was kept and learned, as tensors on the CPU and plain values."""
-        model = self._world.model
+        model = self._model
         return {
             "num_updates": self.num_updates,
             "replay": self.replay.state_dict() if self._owns_replay else None,
             "model": model.state_dict() if isinstance(model, LearningModel) else None,
+            "explorer": None if self.explorer is None else self.explorer.state_dict(),
             "policy": self.policy.state_dict() if self.policy is not self._trained else None,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load what `state_dict` returned; PgtsError unless it fits."""
         check_count("num_updates", state["num_updates"], least=0)
-        self.num_updates, model = state["num_updates"], self._world.model
+        self.num_updates, model = state["num_updates"], self._model
+        if self.explorer is not None:
+            self.explorer.load_state_dict(state["explorer"])
         if self._owns_replay:
             self.replay.load_state_dict(state["replay"])
         if isinstance(model, LearningModel):

@@ -12,6 +12,7 @@ from pgts_torch.agent.rollout import COLUMNS, Rollout, shared_generators
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.models.base import LearningModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.seeding import seed_sequence
 
@@ -70,7 +71,7 @@ class OngoingEpisodes:
     def collect(
         self, policy: Policy, length: int, *, names: tuple[str | int, ...], generator: torch.Generator
     ) -> Rollout:
-        """Take `length` steps in each environment.
+        """Take `length` steps in each environment, or fewer where a model that learns is to learn from them at once.
 
         Args:
             names: the stream that the generators of the whole process are seeded from, for environments that use them.
@@ -81,6 +82,7 @@ class OngoingEpisodes:
             the episodes that ended. Raises as `rollout`.
         """
         world, episodes = self._world, self._episodes
+        model = world.model if isinstance(world.model, LearningModel) else None
         rows: list[_Row] = []
         finished: list[tuple[float, int]] = []
         with shared_generators(world, self._seed, names):
@@ -105,6 +107,11 @@ class OngoingEpisodes:
                     with episodes.named(f"at the end of step {t}"):
                         self._begin(over_B)
                         observation_B, read_B = self._observe()
+                if model is None:
+                    continue
+                is_news = model.is_news(rows[-1].before_B, torch.from_numpy(action_B))
+                if is_news or (model.learns_after_episodes and over_B.any()):
+                    break
         return self._cut(rows, finished)
 
     def _observe(self) -> tuple[Tensor, Tensor | None]:

@@ -1,5 +1,6 @@
 """Make the parts of a training from the arguments of `PGTS`."""
 
+import copy
 from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.depth import DepthChoice
 from pgts_torch.agent.dyna import Dyna
 from pgts_torch.agent.estimators import Estimator, LookaheadEstimator, SampledEstimator
+from pgts_torch.agent.explorer import Explorer
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.model_check import ModelCheck
 from pgts_torch.agent.ongoing import OngoingEpisodes
@@ -21,9 +23,10 @@ from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.updates import Update
-from pgts_torch.agent.world import ModelWorld, World
+from pgts_torch.agent.world import ModelWorld, TabularWorld, World
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
+from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.options.arguments import read
@@ -58,6 +61,12 @@ class Parts(NamedTuple):
         searched = 0 if self.search is None else self.search.model_calls
         return self.critic.model_calls + searched + (0 if self.dyna is None else self.dyna.model_calls)
 
+    @property
+    def visiting(self) -> Policy:
+        """The policy that acts in the environments."""
+        explorer = None if self.dyna is None else self.dyna.explorer
+        return self.policy if explorer is None else explorer.policy
+
 
 def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
     """Make all parts, from the environments to the model check; parts that are given as objects are used as they are.
@@ -89,24 +98,16 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
     search, certificates, depth_choice, dyna = None, None, None, None
     if isinstance(options.replay, UniformReplay):
         assert isinstance(world, ModelWorld)
-        dyna = Dyna(world, policy, options.replay, model_check)
+        world, explorer = _with_explorer(world, policy, critic, update, options, ranks)
+        dyna = Dyna(world, policy, options.replay, model_check, explorer)
     if isinstance(options.estimator, SampledAdvantages):
         estimator: Estimator = SampledEstimator(policy, critic, options.estimator.lambda_, update.state_weight)
     else:
-        search = make_search(options.search, world)
         assert isinstance(world, ModelWorld)
-        depths, stop_at = options.search.depths, options.search.stop_at
-        certificates = Certificates(
-            world, search, critic, num_depths=len(depths), ranks=ranks, samples_starts=dyna is None
-        )
-        if stop_at is not None:
-            certificates.check(f"stop_at is {stop_at}")
-        if options.search.depth == "adaptive":
-            certificates.check("depth is adaptive")
         followed = policy if dyna is None else dyna.policy
-        look = PolicyLookahead(world, followed, critic, search, ranks)
-        tolerance = options.search.filled("adaptive").tolerance
-        depth_choice = DepthChoice(look, certificates, depths=depths, tolerance=tolerance, stop_at=stop_at)
+        search, certificates, depth_choice = _lookahead(
+            world, followed, critic, options, ranks, samples_starts=dyna is None
+        )
         estimator = LookaheadEstimator(depth_choice, update.state_weight)
     check_parts(arguments, world, policy, update)
     horizon, episodes = options.rollout.horizon, None
@@ -128,6 +129,39 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
         episodes,
         dyna,
     )
+
+
+def _lookahead(
+    world: ModelWorld, policy: Policy, critic: Critic, options: Training, ranks: Ranks, *, samples_starts: bool
+) -> tuple[Search, Certificates, DepthChoice]:
+    """Return the search for a policy, its certificates, and how deep it looks."""
+    search = make_search(options.search, world)
+    depths, stop_at = options.search.depths, options.search.stop_at
+    certificates = Certificates(
+        world, search, critic, num_depths=len(depths), ranks=ranks, samples_starts=samples_starts
+    )
+    if stop_at is not None:
+        certificates.check(f"stop_at is {stop_at}")
+    if options.search.depth == "adaptive":
+        certificates.check("depth is adaptive")
+    look = PolicyLookahead(world, policy, critic, search, ranks)
+    tolerance = options.search.filled("adaptive").tolerance
+    return search, certificates, DepthChoice(look, certificates, depths=depths, tolerance=tolerance, stop_at=stop_at)
+
+
+def _with_explorer(
+    world: ModelWorld, policy: Policy, critic: Critic, update: Update, options: Training, ranks: Ranks
+) -> tuple[ModelWorld, Explorer | None]:
+    """Return the world with its table without optimism, and a policy that explores with it; where the model is a table
+    with optimism."""
+    table = world.model
+    if not isinstance(table, CountsModel) or table.options.optimism == "none":
+        return world, None
+    visiting, its_critic, its_update = copy.deepcopy((policy, critic, update))
+    search, _, depth_choice = _lookahead(world, visiting, its_critic, options, ranks, samples_starts=False)
+    estimator = LookaheadEstimator(depth_choice, update.state_weight)
+    explorer = Explorer(world, visiting, its_critic, its_update, search, estimator)
+    return TabularWorld(world.env, None, model=table.plain(), gamma=world.gamma, device=world.device), explorer
 
 
 def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks) -> tuple[EnvSource, World]:

@@ -125,7 +125,7 @@ class PGTS:
         calls_before = self._parts.model_calls
 
         # Visit states with pi_k: those where the estimate d(s) of d^{pi_k}(s) is positive.
-        experience = visit(self.world, self.policy, self.episodes, self.horizon, draws, self.ranks)
+        experience = visit(self.world, self._parts.visiting, self.episodes, self.horizon, draws, self.ranks)
         if self.dyna is None:
             batch, losses = self._improve(experience, draws)
         else:

@@ -79,9 +79,16 @@ class LearningModel(Model):
 
     replay: the steps that it keeps, whose column "state" has states in the form that `ModelWorld.adopt` takes; None: it
         keeps none.
+    learns_after_episodes: whether steps are learned as soon as an episode is over, else after a fixed number of them.
     """
 
     replay: ReplayBuffer | None = None
+    learns_after_episodes: bool = False
+
+    def is_news(self, observation_B: Shaped[Tensor, "B ..."], action_B: Int[Tensor, "B"]) -> bool:
+        """Whether learning from these steps, which are to be learned later, would change much: then they are learned at
+        once, also in the middle of an episode."""
+        return False
 
     @abstractmethod
     def learn(self, experience: Experience, *, generator: torch.Generator) -> dict[str, float]:

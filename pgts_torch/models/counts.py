@@ -70,6 +70,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
     """
 
     dtype = torch.float64
+    learns_after_episodes = True
 
     def __init__(
         self,
@@ -161,7 +162,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
             memory.replace(counts, None if memory.sampled is None else self._sampled(counts, generator))
         return {"new_outcomes": len(memory.counts.pair_C) - known, "unknown_worth": self.unknown_worth}
 
-    def is_news(self, state_B: Int[Tensor, "B"], action_B: Int[Tensor, "B"]) -> bool:
+    def is_news(self, observation_B: Int[Tensor, "B"], action_B: Int[Tensor, "B"]) -> bool:
         """Note steps that are to be learned later. Return whether learning them now would change much.
 
         It would where a pair is new (with rmax: becomes known), and where a pair has been visited as often since the
@@ -169,7 +170,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
         """
         memory, news = self._memory, False
         least = 1 + self._extra(memory.counts) if self.options.optimism == "rmax" else 1
-        for pair in (state_B * self.num_actions + action_B).tolist():
+        for pair in (observation_B * self.num_actions + action_B).tolist():
             memory.since[pair] += 1
             before = memory.counts.visits(pair)
             now = before + memory.since[pair]

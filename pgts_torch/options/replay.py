@@ -3,7 +3,7 @@
 from typing import Literal
 
 from pgts_torch.options.fields import Count, Positive, Share
-from pgts_torch.options.part import Part
+from pgts_torch.options.part import Part, null
 
 
 class AutoReplay(Part):
@@ -27,11 +27,11 @@ class UniformReplay(Part):
     capacity: Count = 100_000
     """The number of visits that are kept; the oldest ones are dropped."""
 
-    updates_per_step: Positive = 0.5
+    updates_per_step: Positive | None = null(tables=0.2, vectors=0.5)
     """Updates of critic and policy for each environment step."""
 
-    starts: Count = 16
-    """Imagined episodes of an update."""
+    starts: Count | Literal["all"] | None = null(tables="all", vectors=16)
+    """Imagined episodes of an update; all: one from each state seen so far, for tables only."""
 
     length: Count = 16
     """The largest number of steps of an imagined episode."""

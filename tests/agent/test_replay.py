@@ -8,6 +8,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from pgts_torch import PGTS
+from pgts_torch.agent.evaluate import Greedy
 from pgts_torch.agent.imagine import imagine
 from pgts_torch.agent.ongoing import OngoingEpisodes
 from pgts_torch.agent.world import TabularWorld, World
@@ -15,7 +16,7 @@ from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import TabularModel
 from pgts_torch.options import CMPO, MLP, Counts, Ensemble, NetworkValues, StepsHorizon, UniformReplay
 from pgts_torch.seeding import stream
-from pgts_torch.tabular import exact
+from pgts_torch.tabular import deep_sea, exact
 from tests.agent.helpers import following, vector_env
 from tests.support import zoo
 
@@ -122,11 +123,19 @@ def test_imagined_returns_are_unbiased():
     assert rollout.state_UB.equal(rollout.observation_UB)
 
 
-@pytest.mark.parametrize("model", ["auto", SMALL["model"]], ids=["given", "learned"])
-def test_a_training_with_replay_goes_on_bit_for_bit(model, tmp_path):
-    arguments = SMALL | {"model": model, "seed": 3}
-    whole = PGTS("CartPole-v1", **arguments).learn(200)
-    half = PGTS("CartPole-v1", **arguments).learn(100)
+@pytest.mark.parametrize(
+    ("env", "arguments"),
+    [
+        ("CartPole-v1", SMALL),
+        ("CartPole-v1", SMALL | {"model": "auto"}),
+        ("FrozenLake-v1", {"model": "counts", "depth": 8}),
+        ("FrozenLake-v1", {"replay": UniformReplay(starts=4, length=5), "depth": 8}),
+    ],
+    ids=["ensemble", "dynamics", "counts", "table"],
+)
+def test_a_training_with_replay_goes_on_bit_for_bit(env, arguments, tmp_path):
+    whole = PGTS(env, seed=3, **arguments).learn(200)
+    half = PGTS(env, seed=3, **arguments).learn(100)
     half.save(tmp_path / "half.pt")
     rest = PGTS.load(tmp_path / "half.pt").learn(200)
     assert rest.num_env_steps == whole.num_env_steps
@@ -150,6 +159,27 @@ def test_a_table_learns_from_replay(model):
     probs = training.policy.probs(torch.arange(mdp.num_states))
     J = exact.evaluate(mdp, probs).J
     assert J > 0.9 * exact.optimal(mdp).J
+
+
+def test_a_policy_explores_beside_the_one_that_is_trained():
+    """On the deep sea random actions find the treasure once in 2^9 episodes; and half of what is left leads nowhere."""
+    arguments = {"env_kwargs": {"n": 10, "start": 0}, "model": "counts", "depth": 16, "seed": 0}
+    training, mdp = PGTS("pgts/DeepSea-v0", **arguments).learn(100), deep_sea(10, start=0)
+    state_S, explorer = torch.arange(mdp.num_states), training.dyna.explorer
+    assert explorer is not None
+    assert not torch.equal(explorer.policy.probs(state_S), training.policy.probs(state_S))
+    training.learn(600)
+    assert exact.evaluate(mdp, Greedy(training.policy).probs(state_S)).J == pytest.approx(exact.optimal(mdp).J)
+    without = PGTS("pgts/DeepSea-v0", **arguments | {"model": Counts(optimism="none")}).learn(600)
+    assert without.dyna.explorer is None
+    assert exact.evaluate(mdp, Greedy(without.policy).probs(state_S)).J <= 0
+
+
+def test_news_are_learned_at_once():
+    training = PGTS("CliffWalking-v1", model="counts", depth=4, seed=0)
+    lengths = [training.iterate().experience.num_steps for _ in range(5)]
+    assert lengths == [1] * 5  # each step from a state that was never left in this way
+    assert training.world.model.num_outcomes >= 2
 
 
 def test_a_model_of_the_callers_own_is_searched():
