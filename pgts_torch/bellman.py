@@ -1,7 +1,7 @@
-"""What may follow a state and an action, and the one Bellman kernel that everything else is built on.
+"""The outcomes of states and actions, and the one Bellman backup that exact solvers and searches share.
 
 A tabular MDP is a table of outcomes for all its states. A level of a lookahead is a table of outcomes for its frontier.
-Both are `Outcomes` and both are backed up by `backup`, so exact truth and search cannot drift apart.
+Both are `Outcomes` and both are backed up by `backup`, so exact values and searches cannot differ in what they compute.
 """
 
 import warnings
@@ -17,22 +17,22 @@ from torch import Tensor
 _INT32_LIMIT = 2**31
 
 LARGE = 2**23
-"""A table of so many outcomes is multiplied by scipy."""
+"""From so many outcomes on, `Outcomes.expected` uses scipy."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcomes:
     """What may follow each of N states under each of A actions: at most K weighted children.
 
-    A terminal outcome has discount 0: nothing after it counts. There is no other mark for it, and no gamma beside it.
-    Rows with fewer than K outcomes are padded with probability 0.
+    A terminal outcome has discount 0, so nothing after it counts: there is no `done` flag and no separate gamma. Where
+    (s, a) has fewer than K outcomes the others are padding, with probability 0.
 
     Args:
         reward_NA: expected immediate reward r(s, a), in reward units; -inf where the action is not allowed.
         prob_NAK: probability p_k of each outcome; every (s, a) sums to 1.
         discount_NAK: gamma_k in [0, 1] of each outcome. An expanded (stride 0) tensor costs no memory.
-        child_NAK: position of each child in the table of `num_children` values that `backup` reads.
-        num_children: how many values that table holds.
+        child_NAK: index of each child, the next state, in the vector of values that `backup` takes.
+        num_children: the length of that vector.
     """
 
     reward_NA: Float[Tensor, "N A"]
@@ -119,11 +119,11 @@ class Outcomes:
 
 
 def policy_mean(pi_NA: Float[Tensor, "N A"], q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
-    """What the actions of a policy are worth on the average:
+    """The mean of the action values under a policy:
 
         <pi(.|s), q(s, .)> = sum over a with pi(a|s) > 0 of pi(a|s) q(s, a)
 
-    So actions that the policy never takes do not count where they are not allowed, q = -inf, either.
+    Actions of probability 0 are left out, because q is -inf where an action is not allowed, and 0 * -inf is NaN.
     """
     return torch.where(pi_NA > 0, pi_NA * q_NA, 0.0).sum(-1)
 
@@ -146,12 +146,12 @@ def backup(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
 
 
 def sweep(outcomes: Outcomes, v_S: Float[Tensor, "S"], times: int) -> Float[Tensor, "S"]:
-    """The values v after `times` sweeps over states whose children are these same states.
+    """The values after `times` sweeps of value iteration, for outcomes whose children are these same states.
 
         v(s) <- max_a q(s, a),   q = `backup` of v
 
-    The sweeps share two buffers: half the time of separate backups where states are few and calls cost most, and no
-    fresh memory where they are many.
+    The sweeps share two buffers: that takes half the time of separate backups where states are few and the calls cost
+    most, and no fresh memory where they are many.
     """
     with torch.no_grad():
         reward = outcomes.reward_NA.reshape(-1)

@@ -1,4 +1,4 @@
-"""Many updates from episodes that are imagined in the model and start in states seen before."""
+"""Dyna: many updates from episodes that are imagined in the model and start in states visited before."""
 
 import copy
 from collections.abc import Iterator
@@ -20,20 +20,20 @@ from pgts_torch.options.replay import UniformReplay
 
 @final
 class Dyna:
-    """Learns the model, where it learns, from each rollout of the environment, and makes the rollouts that the policy
-    learns from: imagined ones, which start in states sampled from all that were visited (Sutton 1990).
+    """Fits a model that can learn to each rollout of the environment, and makes the rollouts that the policy is updated
+    from: episodes in the model that start in states sampled from those visited so far (Sutton 1990).
 
     All ranks imagine the same rollouts, from the same states.
 
-    policy: the policy that imagined episodes follow: a slow copy of the one that is trained, which moves toward it by
-        `polyak` after each update; the policy itself where that is a table.
-    replay: the visited states, in column "state".
+    policy: the policy that imagined episodes follow. For a network it is a slow copy of the trained one, a moving
+        average that steps toward it by `polyak` after each update; with polyak 1, and for a table, the trained policy.
+    replay: the visited states, in the column "state".
 
     Args:
         world: the environments and their model.
         trained: the policy that is trained.
-        model_check: holds the steps of the environment to the model before it is queried.
-        explorer: a policy that visits; None: the trained one does.
+        model_check: compares steps of the environment with a model that claims to be exact, before it is queried.
+        explorer: a policy that visits states in place of the trained one, which does if this is None.
     """
 
     def __init__(
@@ -61,7 +61,14 @@ class Dyna:
         return self._steps + (0 if self.explorer is None else self.explorer.model_calls)
 
     def learn(self, experience: Rollout, draws: Draws) -> dict[str, float]:
-        """Keep the visited states, and let the model learn from the steps. Return its losses, by name."""
+        """Check the steps against the model, keep the visited states, and let the model learn from the steps.
+
+        Returns:
+            The losses and errors of the model, by name.
+
+        Raises:
+            ModelMismatch: a step contradicts the model.
+        """
         self._model_check(experience, draws.number)
         model, losses = self._model, {}
         if self._owns_replay:
@@ -71,9 +78,10 @@ class Dyna:
         return {f"model_{name}": value for name, value in losses.items()}
 
     def rollouts(self, draws: Draws) -> Iterator[tuple[Rollout, Draws]]:
-        """Yield imagined rollouts, each with its random generators; the policy is to be updated from each.
+        """Yield imagined rollouts, each with its random generators. The caller updates the policy after each one.
 
-        There are `updates_per_step` of them for each visit so far, less those of earlier iterations, and at least one.
+        Their number is `updates_per_step` times the number of visits in all iterations so far, minus the rollouts that
+        earlier iterations have made, and at least one.
         """
         assert self.options.updates_per_step is not None
         due = int(self.options.updates_per_step * self.replay.num_added) - self.num_updates

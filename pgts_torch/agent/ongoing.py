@@ -18,7 +18,12 @@ from pgts_torch.seeding import seed_sequence
 
 
 class _Row(NamedTuple):
-    """One step of each of B environments."""
+    """One step of each of B environments.
+
+    before_B, after_B: the observations before and after it.
+    read_before_B, read_after_B: the states there, as `ModelWorld.read` returns them; None where there is no model.
+    over_B: whether the episode ended with this step: it terminated, was truncated or reached the largest length.
+    """
 
     before_B: Tensor
     after_B: Tensor
@@ -34,8 +39,8 @@ class _Row(NamedTuple):
 class OngoingEpisodes:
     """Episodes that go on from one rollout to the next: an environment is reset only when its episode is over.
 
-    Episode e of environment b is reset with a seed from the stream (seed, "episode", *names, b, e). So the state of an
-    environment follows from e and the actions since, from which `load_state_dict` restores it.
+    Episode e of environment b is reset with a seed from the stream (seed, "episode", *names, b, e). So the number e and
+    the actions since that reset determine the state of the environment, and `load_state_dict` restores it by them.
 
     Args:
         world: the environments.
@@ -78,8 +83,11 @@ class OngoingEpisodes:
             generator: for actions.
 
         Returns:
-            A rollout with a column for each part of an episode, those of the first environment first; `finished` has
-            the episodes that ended. Raises as `rollout`.
+            A rollout with a column for each episode, or part of one, that lies in these steps; those of the first
+            environment come first. `finished` has the episodes that ended.
+
+        Raises:
+            PgtsError: as `rollout`.
         """
         world, episodes = self._world, self._episodes
         model = world.model if isinstance(world.model, LearningModel) else None
@@ -127,20 +135,20 @@ class OngoingEpisodes:
         return reward_B, discount_B, truncated_B
 
     def _begin(self, over_B: np.ndarray) -> None:
-        """Begin the next episode of these environments."""
+        """Begin the next episode in the environments whose episode is over."""
         for b in over_B.nonzero()[0]:
             self._number_B[b], self._actions_B[b], self._return_B[b] = self._number_B[b] + 1, [], 0.0
         self._episodes.restart(over_B, self._seeds())
 
     def _cut(self, rows: list[_Row], finished: list[tuple[float, int]]) -> Rollout:
-        """The steps as a rollout, with a column for each part of an episode."""
+        """Return the steps as a rollout, with a column for each episode or part of one."""
         over_TB = np.array([row.over_B for row in rows])
-        parts = []  # environment, first step and the step after the last one
+        parts = []  # one for each column: its environment, its first step and the step after its last one
         for b in range(over_TB.shape[1]):
             ends = [*(over_TB[:-1, b].nonzero()[0] + 1).tolist(), len(rows)]
             parts += [(b, start, end) for start, end in zip([0, *ends], ends, strict=False)]
         length = max(end - start for _, start, end in parts)
-        # step_TP: the step of each entry; in padding the last step of the part
+        # step_TP: which of the steps stands in each row of each of the P columns; in padding the last one of the part
         step_TP = np.stack([np.minimum(np.arange(start, start + length), end - 1) for _, start, end in parts], 1)
         env_P = np.array([b for b, _, _ in parts])
         alive_TP = np.arange(length)[:, None] < np.array([end - start for _, start, end in parts])
@@ -153,7 +161,7 @@ class OngoingEpisodes:
         tensors = {n: torch.from_numpy(c).to(device) for n, c in zip(COLUMNS, columns, strict=True)}
 
         def both(before: str, after: str) -> Tensor:
-            """Rows [T + 1, P] from what was before each step and after it."""
+            """Columns of these two fields as [T + 1, P]: `before` each step, then `after` the last, also in padding."""
             before_TB, after_TB = (torch.stack([getattr(row, name) for row in rows]) for name in (before, after))
             last_P = after_TB[step_TP[-1], env_P]
             after_UP = torch.cat([before_TB[step_TP, env_P], last_P[None]])
@@ -168,7 +176,8 @@ class OngoingEpisodes:
         return Rollout(observation_UP, **tensors, state_UB=state_UP, finished=tuple(finished))
 
     def state_dict(self) -> dict[str, Any]:
-        """The number of each environment's episode, its actions and its return so far, and what is observed."""
+        """Return, for each environment, the number of its episode, the actions and the return since the reset, and the
+        latest observation."""
         observed_B = self._observe()[0].cpu() if self._has_begun else None
         actions = [torch.tensor(actions, dtype=torch.int64) for actions in self._actions_B]
         return {
@@ -182,8 +191,8 @@ class OngoingEpisodes:
         """Restore the episodes from their seeds and actions.
 
         Raises:
-            PgtsError: episodes of another number of environments; or one that went elsewhere when it was repeated, so
-                that training cannot go on with the same bits.
+            PgtsError: episodes of another number of environments; or an environment that, with the same seed and
+                actions, comes to another observation, so that training cannot go on with the same bits.
         """
         B = self._world.env.num_envs
         if [len(state[name]) for name in ("number", "actions", "return")] != [B] * 3:
@@ -200,7 +209,7 @@ class OngoingEpisodes:
         with shared_generators(self._world, self._seed, ("restored",)), self._episodes.named("when it was repeated"):
             self._episodes.reset()
             for t in range(longest):
-                # all end together: an episode of k actions begins k steps before the end
+                # All episodes reach their latest step together: one of k actions is reset k steps before the end.
                 due_B = np.array([len(actions) == longest - t for actions in recorded])
                 if t and due_B.any():
                     self._episodes.restart(due_B, self._seeds())
@@ -218,5 +227,6 @@ class OngoingEpisodes:
             raise PgtsError(
                 f"environment {b} of {env_name(self._world.env)} does not repeat its episode from the seed "
                 f"{self._seeds()[b]} and {len(recorded[b])} actions, so that the training cannot go on where it was: "
-                "the environment is no function of them; take the horizon 'fixed' (rollout.horizon), which begins anew"
+                "its steps depend on something else; take the horizon 'fixed' (rollout.horizon), which resets in each "
+                "iteration"
             )

@@ -52,14 +52,20 @@ class PGTS:
             `options.search.LookaheadOptions`.
         search: the search for the lookahead: "auto", MCTS(simulations=32), {"type": "sampled", "samples": 8}, ...
         estimator: "lookahead", or SampledAdvantages() of actions taken, which needs depth 0, a network and no model.
-        policy, critic, update, horizon: options of these parts (`pgts_torch.options`), their names, or the parts
-            themselves. Default: tables where observations are numbered states, else networks.
-        num_envs: episodes in each iteration, of all processes together. Default: 16; or those of a VectorEnv, in each
-            process, beside which another number is an error.
+        policy, critic, update: options of these parts (`pgts_torch.options`), their names, or the parts themselves.
+            Default: tables where observations are numbered states, else networks.
+        model: what the lookahead queries. "auto": that of the environment, as above; "ensemble" (observations are
+            vectors) or "counts" (numbered states): one that is learned from the steps; or a `Model` whose states are
+            the observations.
+        replay: "uniform": many updates an iteration, from episodes imagined in the model, which start in states
+            visited so far; "none": one update, from the episodes of the iteration; "auto": uniform if the model learns.
+        horizon: when the episodes of an iteration end (`options.rollouts`); "auto" depends on the replay.
+        num_envs: environments, of all processes together. Default: 16, or 1 with the horizon steps; or those of a
+            VectorEnv, in each process, beside which another number is an error.
         actions_per_dimension: the number of evenly spaced values, from the lowest to the highest, for each dimension of
             continuous actions; None: actions are discrete, or MultiDiscrete, whose combinations are numbered.
-        action_repeat, model_check: how often the model repeats an action, and whether it is checked against steps of
-            the environment: see there, too.
+        action_repeat, model_check: how often the model repeats each action, and whether it is checked against steps of
+            the environment: see there too.
         observation_key: the entry of dictionary observations that policy and critic use.
         reward_range: the lowest and the highest reward of a single step; a reward outside of it is an error. `stop_at`
             and an adaptive depth need it where the model has no largest reward (simulators).
@@ -124,12 +130,13 @@ class PGTS:
         draws = self.ranks.draws(self.seed, self.num_iterations, self.device)
         calls_before = self._parts.model_calls
 
-        # Visit states with pi_k: those where the estimate d(s) of d^{pi_k}(s) is positive.
+        # Visit states by episodes of pi_k, or of an `Explorer` where the model has optimism: the states where d(s), an
+        # estimate of the occupancy d^{pi_k}(s), is positive.
         experience = visit(self.world, self._parts.visiting, self.episodes, self.horizon, draws, self.ranks)
         if self.dyna is None:
             batch, losses = self._improve(experience, draws)
         else:
-            # Learn from many imagined rollouts, which start in states visited so far.
+            # Do lines 2 and 3 for many imagined rollouts, which start in states visited so far.
             losses = self.dyna.learn(experience, draws)
             for imagined, own_draws in self.dyna.rollouts(draws):
                 batch, latest = self._improve(imagined, own_draws)
@@ -149,7 +156,7 @@ class PGTS:
         # Look m steps ahead from the visited states: (T^m Q^{pi_k})(s, .).
         batch = self.estimator(rollout, draws)
 
-        # Check steps of the environment against the model, before pi is updated.
+        # Compare the steps of the environment with the model, before pi is updated (with replay `Dyna.learn` has).
         if self.dyna is None:
             self.model_check(rollout, self.num_iterations)
 

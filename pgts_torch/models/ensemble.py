@@ -18,26 +18,29 @@ from pgts_torch.options.models import Ensemble
 from pgts_torch.seeding import stream, uniform
 
 _CLIP = 8.0
-"""Inputs are clipped at so many deviations."""
+"""Standardised inputs are clipped to +- this."""
 
 _SELDOM = 0.02
-"""Probabilities of an end below this count as 0: a classifier never says 0, and many small ones would add up."""
+"""Smaller probabilities of an end count as 0: a classifier never returns 0, and over many steps small ones add up."""
 
 _ENDS = 0.25
-"""The share of a minibatch that is of steps after which episodes ended, which may be rare."""
+"""The share of a minibatch that is sampled from steps that ended an episode, which may be rare among all steps."""
 
 _AHEAD = (1, 4, 16)
-"""After how many steps the error is measured."""
+"""The numbers of steps ahead for which the prediction error is measured."""
 
 _BLOCK, _HELD_OUT = 32, 10
 """Of every 10 blocks of 32 steps in a row the last one is held out."""
 
 _MOST_MEASURED = 256
+"""The most starts, the latest ones, from which an error is measured."""
+
 _ENOUGH_STEPS, _UNEXPLAINED = 2000, 0.5
+"""With so many steps and a larger share of the variance of changes unexplained, a warning is given."""
 
 
 class Prediction(NamedTuple):
-    """What each of E members says of N pairs (state, action); `end_EN` is the probability that the episode ends."""
+    """The predictions of E members for N pairs (state, action); `end_EN` is the probability that the episode ends."""
 
     next_END: Float[Tensor, "E N D"]
     reward_EN: Float[Tensor, "E N"]
@@ -46,17 +49,19 @@ class Prediction(NamedTuple):
 
 @final
 class EnsembleModel(TensorModel, LearningModel):
-    """E networks that learn from steps alone what follows a state, which is a vector of D numbers, and an action.
+    """E networks that learn from steps alone what follows a state, a vector of D numbers, and an action:
 
-        next state - state, and reward      by least absolute (smooth) and squared errors, in units of their deviations
-        whether the episode ends            by the cross-entropy, with ends oversampled and their odds corrected
+        change of the state      smooth L1 loss, in standard deviations of changes
+        reward                   squared error, in standard deviations of rewards
+        end of the episode       cross-entropy; ends are oversampled, and the predicted odds corrected for that
 
-    of minibatches of all steps seen so far but a held-out tenth, each member with its own weights and minibatches (Chua
-    et al. 2018; Lakshminarayanan et al. 2017). `step` gives the means over members, with the discount gamma (1 - p) for
-    the probability p of an end; `sample` samples the end. The model is deterministic but for ends, and is an estimate:
-    it is compared with steps of the environment to measure its error, not to judge it.
+    The networks are fitted to minibatches of all steps seen so far except a tenth, which is held out. Each member has
+    its own initial weights and minibatches (Lakshminarayanan et al. 2017; Chua et al. 2018). `step` returns the means
+    over members, with the discount gamma (1 - p) for the probability p of an end; `sample` samples the end, the one
+    thing that is random in this model. The model is an estimate: steps of the environment measure its error, and no
+    step contradicts it.
 
-    replay: the steps seen; column "state" has the states.
+    replay: the steps seen; its column "state" has the states.
 
     Args:
         state_size: D.
@@ -88,7 +93,7 @@ class EnsembleModel(TensorModel, LearningModel):
         self._warned, self._end_share = False, 0.0
         sizes = [state_size + num_actions, *options.hidden, state_size + 2]
         generator = stream(seed, "model")
-        # weight and bias of each layer, those of all members in one tensor
+        # the weight [E, inputs, outputs] and the bias [E, 1, outputs] of each layer
         self._layers = [
             (
                 self._parameter(torch.randn(options.members, a, b, generator=generator) / a**0.5),
@@ -96,12 +101,12 @@ class EnsembleModel(TensorModel, LearningModel):
             )
             for a, b in itertools.pairwise(sizes)
         ]
-        self._layers[-1][0].data.mul_(0.1)
+        self._layers[-1][0].data.mul_(0.1)  # at first all members predict little but the mean
         self._weights = [weight for layer in self._layers for weight in layer]
         self._optimiser = torch.optim.Adam(
             self._weights, lr=options.learning_rate, weight_decay=options.weight_decay, fused=True
         )
-        # mean and deviation of states, of their changes and of rewards
+        # mean and standard deviation of states, of their changes and of rewards
         self._moments = {
             name: (torch.zeros(size, device=self.device), torch.ones(size, device=self.device))
             for name, size in (("state", state_size), ("change", state_size), ("reward", 1))
@@ -116,16 +121,16 @@ class EnsembleModel(TensorModel, LearningModel):
         """Keep the steps, and fit the networks to all that are kept.
 
         Returns:
-            loss: the mean over the gradient steps. error_1, error_4, error_16: of the state so many steps ahead, on
-            held-out steps, as a root mean square in deviations of states; left out where too few are held out.
-            unexplained: the share of the variance of changes that is not predicted there.
+            loss: the mean over the gradient steps. error_1, error_4, error_16: the root mean square error of the state
+            predicted so many steps ahead, on held-out steps, in standard deviations of states; left out where too few
+            are held out. unexplained: the share of the variance of changes that is not predicted there.
 
         Raises:
-            PgtsError: steps that name another discount than gamma; observations that are no vectors of D numbers.
+            PgtsError: steps with a discount other than gamma and 0; observations that are no vectors of D numbers.
             NotFinite: a number of the steps, or a loss, is not finite.
 
         Warns:
-            UserWarning: once, where half of what follows cannot be predicted: the observation may not be the state.
+            UserWarning: once, where half of the variance of changes is unexplained: observations may not be states.
         """
         states, ends = self._checked(experience), experience.discount_N == 0
         is_first = self.replay.num_added == 0
@@ -157,8 +162,8 @@ class EnsembleModel(TensorModel, LearningModel):
         named_N = (discount_N != 0) & (discount_N != self.gamma)
         if bool(named_N.any()):
             raise PgtsError(
-                f"a step has the discount {float(discount_N[named_N][0])}; an ensemble learns ends only, and gamma is "
-                f"{self.gamma}"
+                f"a step has the discount {float(discount_N[named_N][0])}; an ensemble learns only whether an episode "
+                f"ends, so that discounts must be 0 or gamma, and gamma is {self.gamma}"
             )
         return observation_N.float()
 
@@ -173,14 +178,19 @@ class EnsembleModel(TensorModel, LearningModel):
             self._moments[name] = (mean.to(self.device), deviation.to(self.device))
 
     def _held_out(self) -> Tensor:
-        """Which rows of the ring are held out, by the number of the row, so that they stay so."""
+        """Which rows of the ring are held out. The number of a step decides, so that it is never trained on."""
         buffer, at_N = self.replay, torch.arange(len(self.replay))
+        # A row holds its latest step: the number of that is the row, plus the capacity for each round before it.
         rounds = (buffer.num_added - 1 - at_N) // buffer.capacity
         return (at_N + rounds * buffer.capacity) // _BLOCK % _HELD_OUT == _HELD_OUT - 1
 
     def _fit(self, trained: Int[Tensor, "R"], ended: Int[Tensor, "Q"], generator: torch.Generator) -> float:
-        """One gradient step, with a minibatch for each member, a quarter of it of steps after which episodes ended.
-        Return the loss."""
+        """Take one gradient step, with a minibatch for each member. Return the loss.
+
+        Args:
+            trained: the rows that are not held out.
+            ended: those of them that ended an episode; if there are any, a quarter of each minibatch is of these.
+        """
         E, N = self.options.members, self.options.minibatch_size
 
         def sampled(rows: Tensor, count: int) -> Tensor:
@@ -190,7 +200,8 @@ class EnsembleModel(TensorModel, LearningModel):
         at = torch.cat([sampled(trained, N - extra), sampled(ended, extra)] if extra else [sampled(trained, N)], 1)
         columns = ("state", "action", "reward", "end", "next_state")
         state, action, reward, end, after = (self.replay.rows(c, at.flatten()).to(self.device) for c in columns)
-        # how much less often than here a row of the minibatch is among all steps
+        # The frequency of a row among all steps, divided by that in the minibatch, where ends are oversampled. The loss
+        # of ends has no such weight: their log odds are corrected by `_log_odds_added`.
         weight = 1 / (1 - _ENDS + _ENDS * end / self._end_share) if extra else torch.ones_like(end)
         output = self._outputs(self._inputs(state, action).view(E, N, -1)).reshape(E * N, -1)
         aimed = torch.cat([self._scaled("change", after - state), self._scaled("reward", reward[:, None])], -1)
@@ -209,7 +220,7 @@ class EnsembleModel(TensorModel, LearningModel):
         return value
 
     def _scaled(self, name: str, value: Tensor) -> Tensor:
-        """The value in deviations from its mean; 0 where it is constant."""
+        """The standardised value: (value - mean) / deviation; 0 where it has been constant."""
         mean, deviation = self._moments[name]
         return torch.where(deviation > 0, (value - mean) / deviation, 0.0)
 
@@ -246,8 +257,8 @@ class EnsembleModel(TensorModel, LearningModel):
         return reward_EN.mean(0).double(), self.gamma * (1 - end_EN.mean(0).double()), next_END.mean(0)
 
     def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
-        """The means over members, and an end with their mean probability; with repeated actions the discount keeps its
-        mean, and no end is sampled."""
+        """The means over members; the episode ends with their mean probability, and the discount is then 0, else gamma.
+        With repeated actions no end is sampled, and the discount is the mean one, as that of `step`."""
         if self.action_repeat > 1:
             return super().sample(state_N, action_N, key_N=key_N)
         self.simulator_steps += len(state_N)
@@ -257,7 +268,7 @@ class EnsembleModel(TensorModel, LearningModel):
 
     @torch.no_grad()
     def _errors(self, held_out: Tensor) -> dict[str, float]:
-        """The errors on held-out steps, by name."""
+        """The errors on held-out steps, by name (`learn`)."""
         errors = {}
         for steps in _AHEAD:
             starts = self._runs(held_out, steps)[-_MOST_MEASURED:]
@@ -271,7 +282,7 @@ class EnsembleModel(TensorModel, LearningModel):
             errors[f"error_{steps}"] = float(
                 self._scaled("state", state_ND).sub(self._scaled("state", true_ND)).square().mean().sqrt()
             )
-            if steps == 1:
+            if steps == 1:  # `_scaled` subtracts the mean change, which the difference of two states does not have
                 errors["unexplained"] = float(
                     self._scaled("change", state_ND - true_ND + self._moments["change"][0]).square().mean()
                 )
@@ -286,11 +297,11 @@ class EnsembleModel(TensorModel, LearningModel):
         return errors
 
     def _runs(self, held_out: Tensor, steps: int) -> Int[Tensor, "R"]:
-        """The rows that begin `steps` held-out steps of one episode, in the order of the ring."""
+        """The rows where `steps` held-out steps of one episode begin, one after another in the ring."""
         good, follows = held_out.clone(), self.replay.rows("follows")
         for ahead in range(1, steps):
             good &= held_out.roll(-ahead) & follows.roll(1 - ahead)
-        good[len(good) - steps + 1 :] &= steps == 1  # these would go on at the beginning of the ring
+        good[len(good) - steps + 1 :] &= steps == 1  # those after them are at the beginning of the ring
         return torch.nonzero(good).flatten()
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Full-width lookahead in which equal states are one node: T^m Q at any number of states, at a cost linear in m."""
+"""Full-width lookahead that merges equal states: T^m Q at many roots, at a cost linear in m where states recur."""
 
 import torch
 from jaxtyping import Int
@@ -24,23 +24,24 @@ def expectimax(
 ) -> Lookahead:
     """(T^m Q)(s, .) at the roots for m = depth.        [PGTS Sec. 3]
 
-    With `q_leaf` = Q the roots are expanded m levels and max_a Q(s, a) stands at the bottom. With `v_leaf` = v they are
-    expanded m + 1 levels with v at the bottom, which is T^m Q for Q = r + gamma P v: the lowest backup takes no maximum
-    before it, the others do.
+    With `q_leaf` = Q the roots are expanded m levels, and the leaves have the values max_a Q(s, a). With `v_leaf` = v
+    they are expanded m + 1 levels, and the leaves have the values v: the lowest backup gives Q = r + gamma P v, and the
+    m backups above it are T.
 
-    Paths of one level that meet in a state are one node, also across roots, and once a level brings no new state the
-    closed set is swept without further queries. The result is exact, also in stochastic models.
+    Paths that meet in a state at the same level share one node, also across roots. Once a level has no new state, every
+    state met so far leads to such states only (a closed set); the remaining levels are sweeps over it, without further
+    queries. The result is exact, also in stochastic models.
 
     Args:
         model: enumerates the outcomes of a state.
-        root_B: states of the model, int64; repeated ones cost nothing.
+        root_B: states of the model, int64; repeated ones cost nothing extra.
         depth: m, a finite whole number of at least 0.
         q_leaf: an estimate of Q^pi: states [N] to [N, A].
         v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.
         topology: what earlier searches of the same model found; this search adds to it. Default: a fresh one.
         max_nodes: the most nodes, summed over levels.
-        max_width: W, the most states of each level below the roots that are expanded; the critic values the others
-            at once (`pgts_torch.search.pruned`). None: all of them.
+        max_width: W, the most states of each level below the roots that are expanded; the others get the critic's
+            values, as leaves do (`pgts_torch.search.pruned`). None: all are expanded.
 
     Raises:
         PgtsError: a bad depth or width, roots that are no states, leaf values of a wrong shape or not finite (naming
@@ -56,7 +57,7 @@ def expectimax(
 def search_levels(
     leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_nodes: int, max_width: int | None = None
 ) -> Lookahead:
-    """`expectimax`, with leaves and topology at hand: expand the levels, value the leaves, back up."""
+    """`expectimax`, with leaves and topology at hand: expand the levels, call the critic at the bottom, back up."""
     if max_width is not None:
         return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
     calls_before, expansions = topology.table.model_calls, leaves.expansions
