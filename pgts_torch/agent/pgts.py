@@ -22,6 +22,7 @@ from pgts_torch.agent.ranks import Draws, present_ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
+from pgts_torch.agent.world import TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.environments import Given
@@ -174,7 +175,9 @@ class PGTS:
 
     def policy_table(self) -> Float[Tensor, "S A"]:
         """pi(.|s) for all states, on the CPU in float64; PgtsError where states are not numbered."""
-        return exact_probs(self.policy, torch.arange(self.mdp.num_states, device=self.device))
+        if not isinstance(self.world, TabularWorld):
+            raise PgtsError(f"states of {self.source.name} are not numbered")
+        return exact_probs(self.policy, torch.arange(self.world.mdp_shape[0], device=self.device))
 
     def lookahead(self, state_N: Int[Tensor, "N"], *, depth: int | None = None) -> Lookahead:
         """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves. The default of m

@@ -167,6 +167,7 @@ def test_a_policy_explores_beside_the_one_that_is_trained():
     training, mdp = PGTS("pgts/DeepSea-v0", **arguments).learn(100), deep_sea(10, start=0)
     state_S, explorer = torch.arange(mdp.num_states), training.dyna.explorer
     assert explorer is not None
+    assert training.policy_table().equal(training.policy.probs(state_S))
     assert not torch.equal(explorer.policy.probs(state_S), training.policy.probs(state_S))
     training.learn(600)
     assert exact.evaluate(mdp, Greedy(training.policy).probs(state_S)).J == pytest.approx(exact.optimal(mdp).J)
