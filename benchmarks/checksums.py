@@ -49,6 +49,9 @@ VARIANTS: dict[str, list[str]] = {
     "MCTS": ["--env.id", "Taxi-v4", "--search.kind", "mcts", "--search.simulations", "16"],
     "pruned": ["--env.id", "Taxi-v4", "--search.kind", "expectimax", "--search.max_width", "8"],
     "exact critic": ["--env.id", "pgts/Tightrope-v0", "--critic.type", "exact", "--search.stop_at", "0.01"],
+    "ensemble": ["--env.id", "CartPole-v1", "--model.type", "ensemble", "--search.depth", "1"],
+    "counts": ["--env.id", "FrozenLake-v1", "--model.type", "counts", "--search.depth", "16"],
+    "dynamics with replay": ["--env.id", "CartPole-v1", "--replay.type", "uniform", "--search.depth", "1"],
     "simplex table": ["--env.id", "pgts/Ladder-v0", "--policy.type", "simplex"],
 }
 
