@@ -201,26 +201,28 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
         """Reward, and probability, discount and next state of the outcomes, of pairs in any shape X."""
         if self._columns[0] != self.generation:
             self._columns = self.generation, self._made_columns()
-        pair_C, share_C, unknown_C, reward_C, discount_C, next_C = self._columns[1]
+        pair_C, share_C, unknown_C, reward_C, worth_C, discount_C, next_C = self._columns[1]
         pair_X = state * self.num_actions + action
         first_X = torch.searchsorted(pair_C, pair_X)
         # Rows of pairs of fewer outcomes, and of none, end in the row behind all others, which has probability 0.
         row_XK = first_X.unsqueeze(-1) + torch.arange(self.num_outcomes, device=self.device)
         row_XK = row_XK.clamp(max=len(pair_C) - 1)
         row_XK = torch.where(pair_C[row_XK] == pair_X.unsqueeze(-1), row_XK, len(pair_C) - 1)
-        prob_XK, unknown_X = share_C[row_XK], unknown_C[row_XK[..., 0]]
-        reward_X = (prob_XK * reward_C[row_XK]).sum(-1) + unknown_X * self.unknown_worth
+        reward_X = reward_C[row_XK].sum(-1) + worth_C[row_XK[..., 0]]
         # No pair fills all places: the last one is that of the unknown outcome, of discount 0.
-        prob_XK[..., -1] = unknown_X
+        prob_XK = share_C[row_XK]
+        prob_XK[..., -1] = unknown_C[row_XK[..., 0]]
         child_XK = torch.where(row_XK < len(pair_C) - 1, next_C[row_XK], state.unsqueeze(-1))
         return reward_X, prob_XK, discount_C[row_XK], child_XK
 
     def _made_columns(self) -> tuple[Tensor, ...]:
-        """Pair, probability, probability of the unknown, mean reward, discount and next state of each outcome, and last
-        of a pair that was never visited."""
-        counts = self.counts
-        last = (self.num_states * self.num_actions, 0.0, 1.0, 0.0, 0.0, 0)
-        columns = counts.pair_C, *self._probabilities(counts), counts.reward_C, counts.discount_C, counts.next_C
+        """Pair, probability, probability of the unknown, what the outcome and the unknown add to r(s, a), discount and
+        next state of each outcome; and last of a pair that was never visited."""
+        counts, worth = self.counts, self.unknown_worth
+        share_C, unknown_C = self._probabilities(counts)
+        reward_C, worth_C = share_C * counts.reward_C, unknown_C * worth
+        columns = counts.pair_C, share_C, unknown_C, reward_C, worth_C, counts.discount_C, counts.next_C
+        last = self.num_states * self.num_actions, 0, 1, 0, worth, 0, 0
         padded = (np.append(x_C, np.asarray(x, dtype=x_C.dtype)) for x_C, x in zip(columns, last, strict=True))
         return tuple(torch.from_numpy(x_C).to(self.device) for x_C in padded)
 
