@@ -2,8 +2,8 @@
 
     python benchmarks/cycles.py [--mdps N] [--iterations K] [--quick]
 
-Draws MDPs of 3 to 5 states and 2 actions, gamma 0.9, rewards in {-1, 0, 1}, and takes the default mirror step at the
-states with d(s) > 1e-6, with exact d and T^m Q, from the uniform policy or from logits drawn in [-12, 0]. Restless: the
+Samples MDPs of 3 to 5 states and 2 actions, gamma 0.9, rewards in {-1, 0, 1}, and takes the default mirror step at the
+states with d(s) > 1e-6, with exact d and T^m Q, from the uniform policy or random logits in [-12, 0]. Restless: the
 policy at a visited state still moves by more than 0.01 in each of the last 40 iterations. Low: J falls, in one of
 these, below 99 % of the way from the uniform policy to J*.
 """
@@ -55,10 +55,10 @@ def moved(log_MSA: Tensor, pi_MSA: Tensor, look_MSA: Tensor, seen_MS: Tensor) ->
     return torch.where(moves, next_MSA, log_MSA)
 
 
-def search(batch: Batch, depth: int, iterations: int, *, drawn: bool) -> tuple[Tensor, Tensor, Tensor]:
+def search(batch: Batch, depth: int, iterations: int, *, is_random: bool) -> tuple[Tensor, Tensor, Tensor]:
     """J in the last iterations [K, M]; which are low, and which never came to rest [M]."""
     log_MSA = torch.zeros_like(batch.reward_MSA)
-    if drawn:
+    if is_random:
         log_MSA -= 12 * torch.from_numpy(numpy_stream(1, "cycles").random(log_MSA.shape))
     J_KM: list[Tensor] = []
     restless_M = torch.ones(len(log_MSA), dtype=torch.bool)
@@ -91,8 +91,8 @@ def main() -> None:
     print("start    states  depth   MDPs  restless  and low  low in all")
     for S in (3, 4, 5):
         batch = Batch(50 if given.quick else given.mdps, S)
-        for start, depth in itertools.product(("uniform", "drawn"), (0, 1, 2, 4)):
-            J_KM, low_M, restless_M = search(batch, depth, given.iterations, drawn=start == "drawn")
+        for start, depth in itertools.product(("uniform", "random"), (0, 1, 2, 4)):
+            J_KM, low_M, restless_M = search(batch, depth, given.iterations, is_random=start == "random")
             both_M = low_M & restless_M
             print(
                 f"{start:8} {S:6} {depth:6} {len(low_M):6} {restless_M.sum():9} {both_M.sum():8} {low_M.sum():11}",

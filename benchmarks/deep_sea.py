@@ -55,7 +55,7 @@ def run(key: Key) -> Record:
         from deep_sea_rivals import deep_sea_run
 
         # A batch of 100 episodes more is more than the N (N + 1) calls of any lookahead.
-        record = deep_sea_run(method, size, seed, gamma=GAMMA, copies=BATCH, episodes=EPISODES + BATCH, enough=ENOUGH)
+        record = deep_sea_run(method, size, seed, gamma=GAMMA, num_envs=BATCH, episodes=EPISODES + BATCH, enough=ENOUGH)
     else:
         record = tree_search_run(method, size, seed)
     return {**record, "seconds": time.process_time() - started}

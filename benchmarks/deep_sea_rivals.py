@@ -25,12 +25,12 @@ class Cells(VecEnv):
     An observation is the number of the cell; `RowOf` makes a row of weights of it.
     """
 
-    def __init__(self, size: int, copies: int, *, gamma: float, seed: int) -> None:
+    def __init__(self, size: int, num_envs: int, *, gamma: float, seed: int) -> None:
         mdp = deep_sea(size, gamma=gamma, mapping_seed=seed)
-        self.env = TabularVectorEnv(mdp, copies, autoreset_mode=AutoresetMode.SAME_STEP)
+        self.env = TabularVectorEnv(mdp, num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
         self.first_seed, self.episodes, self.found = seed, 0, 0
         space = spaces.Box(0, mdp.num_states, shape=(1,), dtype=np.float32)
-        super().__init__(copies, space, self.env.single_action_space)
+        super().__init__(num_envs, space, self.env.single_action_space)
 
     def reset(self) -> np.ndarray:
         return self._shown(self.env.reset(seed=self.first_seed)[0])
@@ -94,14 +94,14 @@ class _Until(BaseCallback):
 
 
 def deep_sea_run(
-    method: str, size: int, seed: int, *, gamma: float, copies: int, episodes: int, enough: float
+    method: str, size: int, seed: int, *, gamma: float, num_envs: int, episodes: int, enough: float
 ) -> Record:
     """PPO or A2C with default settings, and two layers of 64 units for policy and critic each; for PPO a batch is one
     episode of each copy, seen in 4 epochs of 4 minibatches as in its settings for Atari."""
-    env = Cells(size, copies, gamma=gamma, seed=seed)
+    env = Cells(size, num_envs, gamma=gamma, seed=seed)
     shared = {"features_extractor_class": RowOf, "share_features_extractor": False, "net_arch": [WIDTH]}
     if method == "ppo":
-        options: dict[str, Any] = {"n_steps": size, "n_epochs": 4, "batch_size": size * copies // 4}
+        options: dict[str, Any] = {"n_steps": size, "n_epochs": 4, "batch_size": size * num_envs // 4}
         model = PPO("MlpPolicy", env, gamma=gamma, seed=seed, device="cpu", policy_kwargs=shared, **options)
     else:
         model = A2C("MlpPolicy", env, gamma=gamma, seed=seed, device="cpu", policy_kwargs=shared)

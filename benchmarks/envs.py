@@ -1,10 +1,10 @@
-"""How many transitions a second do many copies of an environment make, against Gymnasium's loop over single ones?
+"""How many transitions a second do vectorised environments make, against Gymnasium's loop over single ones?
 
     python benchmarks/envs.py [--json PATH] [--quick]
 
 One thread. Every figure is the median of several repeats; all forms take turns within each repeat, and the ratio is the
-median of theirs, so that a busy machine slows both sides alike. Uniformly random actions are drawn beforehand; copies
-start over by `AutoresetMode.SAME_STEP` at the registered time limits.
+median of theirs, so that a busy machine slows both sides alike. Uniformly random actions are sampled beforehand;
+environments are reset by `AutoresetMode.SAME_STEP` at the registered time limits.
 """
 
 import argparse
@@ -23,8 +23,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 import pgts_torch
 
 NAMES = ("Ladder", "Tightrope", "Random", "Grid", "DeepSea")
-COPIES = (1, 64, 1024, 4096)
-SYNC_COPIES = 64
+NUM_ENVS = (1, 64, 1024, 4096)
+SYNC_ENVS = 64
 REPEATS, QUICK_REPEATS = 9, 3
 SECONDS = 0.1
 """How long one repeat lasts, about."""
@@ -51,23 +51,26 @@ class Runner:
 
 
 def measure(name: str, repeats: int) -> dict[str, Any]:
-    """Transitions a second of one environment: the fast form at each number of copies, Gymnasium's loop at one."""
+    """Transitions a second of one environment: the fast form by number of environments, Gymnasium's loop at one."""
     id, mode = f"pgts/{name}-v0", AutoresetMode.SAME_STEP
-    fast = {copies: Runner(gymnasium.make_vec(id, num_envs=copies, autoreset_mode=mode)) for copies in COPIES}
+    fast = {num_envs: Runner(gymnasium.make_vec(id, num_envs=num_envs, autoreset_mode=mode)) for num_envs in NUM_ENVS}
     sync = Runner(
-        gymnasium.make_vec(id, num_envs=SYNC_COPIES, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode})
+        gymnasium.make_vec(id, num_envs=SYNC_ENVS, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode})
     )
     rounds = [
-        ({copies: runner.transitions_per_second() for copies, runner in fast.items()}, sync.transitions_per_second())
+        (
+            {num_envs: runner.transitions_per_second() for num_envs, runner in fast.items()},
+            sync.transitions_per_second(),
+        )
         for _ in range(repeats)
     ]
     return {
         "environment": id,
         "transitions_per_second": {
-            copies: statistics.median(rates[copies] for rates, _ in rounds) for copies in COPIES
+            num_envs: statistics.median(rates[num_envs] for rates, _ in rounds) for num_envs in NUM_ENVS
         },
         "sync_transitions_per_second": statistics.median(loop for _, loop in rounds),
-        "ratio_to_sync": statistics.median(rates[SYNC_COPIES] / loop for rates, loop in rounds),
+        "ratio_to_sync": statistics.median(rates[SYNC_ENVS] / loop for rates, loop in rounds),
     }
 
 
@@ -78,9 +81,9 @@ def main() -> None:
     args = parser.parse_args()
     names, repeats = (NAMES[:2], QUICK_REPEATS) if args.quick else (NAMES, REPEATS)
     torch.set_num_threads(1)
-    columns = [f"{copies} copies" for copies in COPIES]
+    columns = [f"{num_envs} envs" for num_envs in NUM_ENVS]
     print(f"{'transitions / s':<18}" + "".join(f"{column:>14}" for column in columns), end="")
-    print(f"{f'sync, {SYNC_COPIES}':>14}{f'ratio at {SYNC_COPIES}':>14}")
+    print(f"{f'sync, {SYNC_ENVS}':>14}{f'ratio at {SYNC_ENVS}':>14}")
     results = []
     for name in names:
         result = measure(name, repeats)

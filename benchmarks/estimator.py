@@ -3,17 +3,17 @@
     python benchmarks/estimator.py [--quick] [--device cpu] [--json PATH] [--picture PATH]
 
 Every search estimates T^m Q^pi at the same 16 states (on DeepSea the 20 of the diagonal), v^pi of the uniform policy at
-its leaves, with a growing budget: outcomes C drawn of each action, nodes W kept at each level, or simulations. Budgets
+its leaves, with a growing budget: outcomes C sampled of each action, nodes W kept at each level, simulations. Budgets
 end where a search is exact, took more than half a second or would have more than a million nodes. --quick: two depths,
 no mctx.
 
 error: mean of |q - T^m Q| over roots and actions, as a share of the range of T^m Q over them.
 right: share of roots at which the action with the highest value has the highest T^m Q.
 calls: model calls of a search from one root alone, the mean over every eighth. A call of ours is one (state,
-    action) whose outcomes are listed, or one drawn outcome of it. A call of mctx is one simulation: one drawn outcome
-    of one (state, action), the only one that this edge of its tree ever has.
+    action) whose outcomes are enumerated, or one sampled outcome of it. A call of mctx is one simulation: one sampled
+    outcome of one (state, action), the only one that this edge of its tree ever has.
 ms: time of one search from all roots together, by the number of roots. No search knows anything from earlier ones.
-unmerged: what listing all outcomes costs without merging, counted: a node for each path. Its values are exact.
+unmerged: what enumerating all outcomes costs without merging, counted: a node for each path. Its values are exact.
 """
 
 import statistics
@@ -108,7 +108,7 @@ def our_searches(task: Task) -> dict[str, Iterator[tuple[int, Search]]]:
     def wide(root_B: torch.Tensor, budget: int | None) -> Lookahead:
         return expectimax(task.model, root_B, max_width=budget, **common)
 
-    def drawn(root_B: torch.Tensor, budget: int, share: Share) -> Lookahead:
+    def from_samples(root_B: torch.Tensor, budget: int, share: Share) -> Lookahead:
         generator = stream(0, "estimator", budget)
         return sampled(task.model, root_B, samples=budget, share=share, generator=generator, replicates=0, **common)
 
@@ -122,7 +122,7 @@ def our_searches(task: Task) -> dict[str, Iterator[tuple[int, Search]]]:
     return {
         "expectimax": budgets(wide, (None,)),
         "expectimax, max_width": budgets(wide, WIDTHS),
-        **{f"sampled, {share}": budgets(drawn, SAMPLES, share=share) for share in SHARES},
+        **{f"sampled, {share}": budgets(from_samples, SAMPLES, share=share) for share in SHARES},
         "mcts, tree": budgets(grown, SIMULATIONS, merge=False),
         "mcts, merged": budgets(grown, SIMULATIONS, merge=True),
     }
@@ -191,17 +191,17 @@ def cheapest(rows: list[dict[str, Any]], error: float) -> dict[str, Any] | None:
 
 
 def against_the_trees(methods: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
-    """Calls without merging by calls with it: all outcomes listed, and drawn, at each error of the tree of samples.
+    """Calls without merging by calls with it: outcomes enumerated, and sampled, at each error of the tree of samples.
 
-    The drawn tree is held to `expectimax` and to the cheapest of the searches that draw and merge.
+    The sampled tree is compared with `expectimax` and with the cheapest of the searches that sample and merge.
     """
     full, tree = methods["expectimax"][0]["calls"], methods[FULL_TREE][0]["calls"]
-    drawn = []
+    from_samples = []
     for row in methods[TREE]:
         error = max(row["error"], EXACT)
         rows = [found for share in SHARES[1:] if (found := cheapest(methods[f"sampled, {share}"], error))]
         merged = min((found["calls"] for found in rows), default=None)
-        drawn.append(
+        from_samples.append(
             {
                 "error": row["error"],
                 "tree_calls": row["calls"],
@@ -210,7 +210,7 @@ def against_the_trees(methods: dict[str, list[dict[str, Any]]]) -> dict[str, Any
                 "ratio_to_expectimax": row["calls"] / full,
             }
         )
-    return {"expectimax_calls": full, "unmerged_calls": tree, "ratio": tree / full, "drawn": drawn}
+    return {"expectimax_calls": full, "unmerged_calls": tree, "ratio": tree / full, "from_samples": from_samples}
 
 
 # The bias of a maximum over samples
@@ -287,22 +287,22 @@ def print_task(name: str, depths: dict[int, Any]) -> None:
 
 def print_summary(report: dict[str, Any]) -> None:
     print("\nModel calls per root without merging, by those with it; the same error")
-    print(f"{'':<17}{'':>3}{'all outcomes listed: exact':>28}  {'outcomes drawn, to the error of the tree':>44}")
+    print(f"{'':<17}{'':>3}{'outcomes enumerated: exact':>28}  {'outcomes sampled, to the error of the tree':>44}")
     columns = ("tree", "merged", "ratio", "error", "tree", "merged", "ratio", "exact")
     print(f"{'':<17}{'m':>3}" + "".join(f"{column:>{10 if k else 8}}" for k, column in enumerate(columns)))
     for name, depths in report["tasks"].items():
         for m, at in depths.items():
             row = at["against_the_trees"]
-            listed = [short(row[key]) for key in ("unmerged_calls", "expectimax_calls", "ratio")]
-            drawn = ["-"] * 5
-            if row["drawn"]:
-                last = min(row["drawn"], key=lambda found: found["error"])
+            enumerated = [short(row[key]) for key in ("unmerged_calls", "expectimax_calls", "ratio")]
+            from_samples = ["-"] * 5
+            if row["from_samples"]:
+                last = min(row["from_samples"], key=lambda found: found["error"])
                 numbers = [last[key] for key in ("tree_calls", "merged_calls", "ratio", "ratio_to_expectimax")]
                 error = f"{last['error']:.1e}" if last["error"] > EXACT else "0"
-                drawn = [error] + [short(number) if number else "-" for number in numbers]
-            cells = "".join(f"{cell:>{10 if k else 8}}" for k, cell in enumerate(listed + drawn))
+                from_samples = [error] + [short(number) if number else "-" for number in numbers]
+            cells = "".join(f"{cell:>{10 if k else 8}}" for k, cell in enumerate(enumerated + from_samples))
             print(f"{name:<17}{m:>3}{cells}")
-    print("drawn: at the smallest error of the unmerged tree of samples within a million nodes, and the")
+    print("sampled: at the smallest error of the unmerged tree of samples within a million nodes, and the")
     print("cheapest sampled search with merging that is as right; exact: ratio to expectimax, error 0.")
 
     if any(method.startswith("mctx") for method in next(iter(report["tasks"].values()))[DEPTHS[0]]["methods"]):

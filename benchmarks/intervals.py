@@ -3,8 +3,8 @@
     python benchmarks/intervals.py [--quick]
 
 Random MDPs of 12 states and 2 actions in which every action has two outcomes, a likely and an unlikely one. Leaf values
-are those of a random policy (values), or 0 and the highest, so that what is drawn is a Bernoulli variable (prizes). The
-unlikely outcome has a probability between 0 and 1/2 (even), or of 0.02 to 0.1 (rare).
+are those of a random policy (values), or 0 and the highest, so that what is sampled is a Bernoulli variable (prizes).
+The unlikely outcome has a probability between 0 and 1/2 (even), or of 0.02 to 0.1 (rare).
 """
 
 import argparse

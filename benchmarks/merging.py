@@ -29,7 +29,7 @@ def searcher(mdp: TabularMDP, root_B: torch.Tensor, depth: int, device: str, *, 
 
 
 def new_leaf_values(repeats: int, device: str) -> dict[str, Any]:
-    """The second search from the same roots, other leaf values: time against the first, and what the model is asked."""
+    """The second search from the same roots, other leaf values: time against the first, and calls of the model."""
     return {name: _second_search(MDPS[name](), repeats, device) for name in ("Grid", "Taxi", "Garnet(200,4,5)")}
 
 

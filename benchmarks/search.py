@@ -6,7 +6,7 @@
    the same MDP from the same roots with the same leaves and priors, jitted, 64 simulations.
 2. mcts: simulations a second from 128 roots, depth 8, 64 simulations each, beside the two policies of mctx.
 3. New leaf values for roots that were searched before: what is saved.
-4. Depth 32 and depth 64 on known states: how the time grows, and what the model is asked.
+4. Depth 32 and depth 64 on known states: how the time grows, and how many calls the model gets.
 5. Depth 1 to 64 from one root: nodes, model calls and time with merging, and without it as far as that fits.
 6. DeepSea(50): deeper and deeper from the start until another action looks best than at depth 0.
 7. One backup over 10^6 nodes: which share of the memory bandwidth it reaches.

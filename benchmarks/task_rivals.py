@@ -1,8 +1,8 @@
 """PPO, A2C and DQN of stable-baselines3 with the tuned settings of RL Baselines3 Zoo, as its users would run them.
 
-For FrozenLake, CliffWalking and Taxi the zoo has none: there they run with their defaults in 8 copies, PPO with batches
-of 2,048 steps as by default, in minibatches of 256 as on CartPole. For DoorKey it has those of PPO; the others run with
-their defaults on the same normalised observations.
+For FrozenLake, CliffWalking and Taxi the zoo has none: there they run with their defaults in 8 environments, PPO with
+batches of 2,048 steps as by default, in minibatches of 256 as on CartPole. For DoorKey it has those of PPO; the
+others run with their defaults on the same normalised observations.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def falling(first: float) -> Callable[[float], float]:
 
 
 WIDE = {"net_arch": [256, 256]}
-COPIES = {"CartPole-v1": 8, "Acrobot-v1": 16, "MountainCar-v0": 16}
+NUM_ENVS = {"CartPole-v1": 8, "Acrobot-v1": 16, "MountainCar-v0": 16}
 NORMALIZED = ("Acrobot-v1", "MountainCar-v0", "MiniGrid-DoorKey-5x5-v0")
 TUNED: dict[tuple[str, str], dict[str, Any]] = {
     ("ppo", "CartPole-v1"): {
@@ -85,9 +85,9 @@ def train(
     method: str, env_id: str, episodes: int, *, seed: int, gamma: float, budget: int, watch: Callable[..., bool]
 ) -> None:
     """One training, watched by evaluations of so many episodes."""
-    copies = 1 if method == "dqn" else COPIES.get(env_id, 8)
-    env = _copies(env_id, copies, "train", seed)
-    fresh = _copies(env_id, min(50, episodes), "eval", seed + 1000)
+    num_envs = 1 if method == "dqn" else NUM_ENVS.get(env_id, 8)
+    env = _envs(env_id, num_envs, "train", seed)
+    fresh = _envs(env_id, min(50, episodes), "eval", seed + 1000)
     untuned = {"n_steps": 256, "batch_size": 256} if method == "ppo" else {}
     options = {"gamma": gamma} | TUNED.get((method, env_id), untuned)
     if method == "dqn" and env_id in EXPLORATION_STEPS:
@@ -108,7 +108,7 @@ def train(
     model.learn(budget, callback=Watched())
 
 
-def _copies(env_id: str, count: int, use: str, seed: int) -> VecEnv:
+def _envs(env_id: str, count: int, use: str, seed: int) -> VecEnv:
     def make() -> gymnasium.Env:
         limit = gymnasium.spec(env_id).max_episode_steps or UNLIMITED[use]
         env = gymnasium.make(env_id, max_episode_steps=limit)

@@ -4,10 +4,10 @@
                                [--runs FILE] [--json FILE] [--picture FILE]
 
 Each shipped configuration against PPO, A2C and DQN of stable-baselines3, with the tuned settings of its zoo where it
-has some (`task_rivals.py`). All are evaluated alike, by greedy episodes in fresh copies, at 500 environment steps and
-then at each 1.25 times as many. A run ends when its budget of environment steps is spent, or at the third evaluation in
-a row that reaches the stated return; it is said to have reached it at the first of these three. Seconds are CPU seconds
-without the evaluations.
+has some (`task_rivals.py`). All are evaluated alike, by greedy episodes in fresh environments, at 500 environment steps
+and then at each 1.25 times as many. A run ends when its budget of environment steps is spent, or at the third
+evaluation in a row that reaches the stated return; it is said to have reached it at the first of these three. Seconds
+are CPU seconds without the evaluations.
 """
 
 import time

@@ -3,8 +3,8 @@
     python benchmarks/throughput.py [--json FILE] [--quick] [--only training|lookahead] [--device DEVICE]
 
 Training: PPO and A2C at m = 0 with sampled advantages on CartPole against those of stable-baselines3, with the same
-networks, copies, transitions an update, passes, minibatches and optimiser. Lookahead: seconds and model calls of an
-iteration by depth, in tables, in torch dynamics and in simulators. The policy hardly moves there (its steps are 1e-9
+networks, environments, transitions an update, passes, minibatches and optimiser. Lookahead: seconds and model calls of
+an iteration by depth, in tables, in torch dynamics and in simulators. The policy hardly moves there (its steps are 1e-9
 long), so every depth looks from the same states.
 
 One thread of one core. The peer needs stable-baselines3, DoorKey needs MiniGrid; without them they are left out.
@@ -86,16 +86,16 @@ def our_training(case: Case, steps: int, seed: int) -> dict[str, float]:
         gamma=GAMMA,
         seed=seed,
     )
-    asked: list[int] = []
+    queries: list[int] = []
     with common.timed(visit_module, "rollout") as collecting:
         begin = time.process_time()
-        model.learn(steps, callback=lambda _, iteration: asked.append(iteration.experience.alive_TB.numel()))
+        model.learn(steps, callback=lambda _, iteration: queries.append(iteration.experience.alive_TB.numel()))
         seconds = time.process_time() - begin
-    return _figures(model.num_env_steps, len(asked), sum(asked), seconds, sum(collecting))
+    return _figures(model.num_env_steps, len(queries), sum(queries), seconds, sum(collecting))
 
 
 def peer_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, float]:
-    """The same by stable-baselines3: copies without a monitor, no logging, separate networks as by default.
+    """The same by stable-baselines3: environments without a monitor, no logging, separate networks as by default.
 
     Args:
         batch: transitions an update, where the case leaves it open; taken in whole minibatches.
@@ -107,9 +107,9 @@ def peer_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, 
     options: dict[str, Any] = {"n_steps": n_steps, "learning_rate": RATE, "gamma": GAMMA, "gae_lambda": LAMBDA}
     options |= {"max_grad_norm": CLIP, "ent_coef": 0.0, "seed": seed, "device": "cpu"}
     options |= {"n_epochs": EPOCHS, "batch_size": MINIBATCH} if case.kind == "PPO" else {"use_rms_prop": False}
-    copies = DummyVecEnv([lambda: gymnasium.make("CartPole-v1", disable_env_checker=True)] * case.num_envs)
+    envs = DummyVecEnv([lambda: gymnasium.make("CartPole-v1", disable_env_checker=True)] * case.num_envs)
     network = {"net_arch": {"pi": list(HIDDEN), "vf": list(HIDDEN)}, "activation_fn": torch.nn.Tanh}
-    model = getattr(stable_baselines3, case.kind)("MlpPolicy", copies, policy_kwargs=network, **options)
+    model = getattr(stable_baselines3, case.kind)("MlpPolicy", envs, policy_kwargs=network, **options)
     with common.timed(model, "collect_rollouts") as collecting:
         begin = time.process_time()
         model.learn(steps)
@@ -117,11 +117,11 @@ def peer_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, 
     return _figures(model.num_timesteps, len(collecting), model.num_timesteps, seconds, sum(collecting))
 
 
-def _figures(steps: int, updates: int, asked: int, seconds: float, collecting: float) -> dict[str, float]:
-    """Transitions an update, how often the policy was asked for each, and transitions a CPU second by part."""
+def _figures(steps: int, updates: int, queries: int, seconds: float, collecting: float) -> dict[str, float]:
+    """Transitions an update, how often the policy was queried for each, and transitions a CPU second by part."""
     return {
         "batch": steps / updates,
-        "asked": asked / steps,
+        "queries": queries / steps,
         "whole": steps / seconds,
         "learning": steps / (seconds - collecting),
         "collecting": steps / collecting,
@@ -148,7 +148,7 @@ def training_line(row: dict[str, Any]) -> str:
         part: {side: statistics.median(values) for side, values in of.items()} for part, of in row["figures"].items()
     }
     batch = middle["batch"]
-    line = f"{row['case']:17}{batch['ours']:7.0f}{batch['SB3']:6.0f}{middle['asked']['ours']:9.2f}"
+    line = f"{row['case']:17}{batch['ours']:7.0f}{batch['SB3']:6.0f}{middle['queries']['ours']:9.2f}"
     for part in ("whole", "learning", "collecting"):
         line += f"{middle[part]['ours']:9,.0f}{middle[part]['SB3']:8,.0f}{row['ratios'][part]:7.2f}"
     return line
@@ -216,7 +216,7 @@ def main(arguments: list[str] | None = None) -> None:
     if args.only != "lookahead":
         if importlib.util.find_spec("stable_baselines3"):
             print("CartPole-v1, m = 0, sampled advantages; transitions a CPU second, medians")
-            print(f"{'':17}{'batch':>13}{'asked':>9}{'whole training':>24}{'learning':>24}{'collecting':>24}")
+            print(f"{'':17}{'batch':>13}{'queries':>9}{'whole training':>24}{'learning':>24}{'collecting':>24}")
             print(f"{'':17}{'ours':>7}{'SB3':>6}{'ours':>9}" + f"{'ours':>9}{'SB3':>8}{'ratio':>7}" * 3)
             report["training"] = []
             for case in CASES:
@@ -244,14 +244,14 @@ def main(arguments: list[str] | None = None) -> None:
     common.write(report, args.json)
 
 
-TRAINING_NOTE = """batch: transitions an update. asked: how often our policy is asked for each transition: a copy whose
-episode is over rests until the longest one ends, and what the policy says of it is not kept. learning: all but
-collecting, which in SB3 includes values and GAE. 8 x episode: whole episodes of 8 copies; 64 x 8: 64 copies, 8 steps
-each.
+TRAINING_NOTE = """batch: transitions an update. queries: of our policy, for each transition; an environment whose
+episode is over rests until the longest one ends, and what the policy returns for it is not kept. learning: all but
+collecting, which in SB3 includes values and GAE. 8 x episode: whole episodes of 8 environments; 64 x 8: 64
+environments, 8 steps each.
 """
 
 LOOKAHEAD_NOTE = """first: nothing is known of the model yet; later: median of the next iterations.
-to m = 0: ratio of the later ones. looking: the lookahead's part of a later iteration. calls: asked of the model in the
+to m = 0: ratio of the later ones. looking: the lookahead's part of a later iteration. calls: of the model in the
 first iteration, and in a later one. Acrobot and DoorKey: episodes of 50 steps."""
 
 

@@ -8,8 +8,8 @@ One estimate is made of 16 episodes of one policy: the direction in the logits o
 
 with q from the actions taken (REINFORCE: discounted rewards to go; GAE, lambda 0.95), or T^m Q of a critic for all
 actions. The critic is a table, TD(0.9) with step size 0.5 on four earlier rollouts of 16 episodes of the same policy,
-anew for each estimate; or the exact v^pi. Episodes are cut where gamma^t falls below 1 %, rewards after that count as 0
-for REINFORCE. Directions:
+fitted again for each estimate; or the exact v^pi. Episodes are cut where gamma^t falls below 1 %, later rewards count
+as 0 for REINFORCE. Directions:
 
     ascent      the exact gradient of J, d^pi and Q^pi exact
     wanted      what the estimate is one of: d^pi and T^m Q^pi exact; for REINFORCE and GAE the gradient of J
@@ -143,8 +143,8 @@ def measured(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], estimates: int) -> di
     gamma = float(mdp.outcomes.discount_NAK.max())
     horizon = FixedHorizon(length=math.ceil(math.log(LEFT_OUT) / math.log(gamma)))
 
-    def act(copies: int, name: str) -> Rollout:
-        env = TabularVectorEnv(mdp, copies, autoreset_mode=AutoresetMode.DISABLED)
+    def act(num_envs: int, name: str) -> Rollout:
+        env = TabularVectorEnv(mdp, num_envs, autoreset_mode=AutoresetMode.DISABLED)
         world = TabularWorld(env, mdp)
         generator = stream(0, "variance", name)
         return rollout(world, policy, horizon, seed=0, names=("variance", name), generator=generator)

@@ -60,7 +60,7 @@ FAULTS: dict[str, dict[str, str]] = {
         "environment that truncates its own episodes": "never stepped past it; the critic's value stands there",
         "environment leaves the process, or raises what cannot be printed": "as any other error of the environment",
         "environment raises an error in close": "a warning",
-        "observation that changes inside the lookahead": "state, action, what is shown and what is declared are named",
+        "observation that changes inside the lookahead": "state, action, observation and declared space are named",
         "grad switched off": "trains with the same bits",
         "reward that is not one number": "environment, step, seed and its shape are named, `failure.json`, exit code 2",
         "discount outside [0, 1]": "environment, step and seed are named at every depth, `failure.json`, exit code 2",
@@ -101,13 +101,13 @@ FAULTS: dict[str, dict[str, str]] = {
         "a greedy policy that is worse than sampled actions": "the summary says so",
     },
     "Proofs": {
-        "an episode that begins in one of several states": "a proof is over all start states, not over those drawn",
+        "an episode that begins in one of several states": "a proof is over all start states, not over sampled ones",
         "no largest reward is known": "stop_at and adaptive depth are refused, with what to set: env.reward_range",
         "a reward outside reward_range": "training stops before the policy is moved by it, exit code 2",
     },
     "Memory": {
-        "lookahead of too many nodes": "refused before the model is asked, with the number and what to set",
-        "lookahead larger than memory": "refused before the model is asked, with the number and what to set",
+        "lookahead of too many nodes": "refused before the model is queried, with the number and what to set",
+        "lookahead larger than memory": "refused before the model is queried, with the number and what to set",
     },
     "Saved models": {
         "flipped bits and missing ends of a saved model": "refused, none accepted",
