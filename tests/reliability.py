@@ -205,7 +205,7 @@ def document() -> str:
         "# What can go wrong",
         "",
         "Each fault below is made to happen by the tests beside it. `python -m tests.reliability` writes this page",
-        "from the marks of the tests; a test holds it to them.",
+        "from the marks of the tests; a test compares it with them.",
     ]
     for group, faults in FAULTS.items():
         lines += ["", f"## {group}", "", "| fault | what happens | test |", "|---|---|---|"]

@@ -134,7 +134,7 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
 def _lookahead(
     world: ModelWorld, policy: Policy, critic: Critic, options: Training, ranks: Ranks, *, samples_starts: bool
 ) -> tuple[Search, Certificates, DepthChoice]:
-    """Return the search for a policy, its certificates, and how deep it looks."""
+    """Return the search for a policy, its certificates, and the choice of its depth."""
     search = make_search(options.search, world)
     depths, stop_at = options.search.depths, options.search.stop_at
     certificates = Certificates(
@@ -152,8 +152,11 @@ def _lookahead(
 def _with_explorer(
     world: ModelWorld, policy: Policy, critic: Critic, update: Update, options: Training, ranks: Ranks
 ) -> tuple[ModelWorld, Explorer | None]:
-    """Return the world with its table without optimism, and a policy that explores with it; where the model is a table
-    with optimism."""
+    """Return the world that the trained policy learns in, and the explorer.
+
+    Where the model is a table with optimism they are a world with the same table without optimism, and an explorer in
+    the given world; else the given world, and None.
+    """
     table = world.model
     if not isinstance(table, CountsModel) or table.options.optimism == "none":
         return world, None

@@ -1,4 +1,4 @@
-"""The exact theory of a tabular MDP, in float64: what every estimate in this library is held to."""
+"""The exact theory of a tabular MDP, in float64: what every estimate in this library is tested against."""
 
 from dataclasses import dataclass
 
