@@ -5,7 +5,7 @@ Both are `Outcomes` and both are backed up by `backup`, so exact values and sear
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -106,6 +106,13 @@ class Outcomes:
             self.child_NAK[row_N],
             self.num_children,
         )
+
+    def paying(self, reward_NA: Float[Tensor, "N A"]) -> Self:
+        """The same outcomes with other rewards, and with the same `weight` in memory; an action that is not allowed
+        stays so."""
+        other = replace(self, reward_NA=torch.where(self.reward_NA > -torch.inf, reward_NA, -torch.inf))
+        vars(other)["weight"] = self.weight
+        return other
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
         """The same outcomes on another device or in another floating dtype."""

@@ -17,7 +17,7 @@ from pgts_torch.agent.world import ModelWorld
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Lookahead
 
-_VALUES = ("q_BA", "stderr_BA", "pruned_BA", "bias_BA")
+_VALUES = ("q_BA", "stderr_BA", "pruned_BA", "bias_BA", "doubt_BA")
 
 
 @final

@@ -1,7 +1,7 @@
 """Models of environments: what a lookahead may ask."""
 
 from pgts_torch.models.actions import with_torques
-from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.base import EnumeratingModel, FallibleModel, SamplingModel, Transitions
 from pgts_torch.models.classic import Acrobot, CartPole, MountainCar, Pendulum
 from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.fidelity import check_model
@@ -16,6 +16,7 @@ __all__ = [
     "CartPole",
     "CountsModel",
     "EnumeratingModel",
+    "FallibleModel",
     "MountainCar",
     "Pendulum",
     "SamplingModel",

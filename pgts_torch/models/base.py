@@ -103,6 +103,21 @@ class LearningModel(Model):
         """Load what `state_dict` returned; PgtsError if it does not fit."""
 
 
+class FallibleModel(Model):
+    """A model that says by how much a step in it may differ from one in the environment."""
+
+    @abstractmethod
+    def step_error(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"] | None:
+        """e(s, a) of states that it was queried for, finite and in reward units, at least 0:
+
+            |r'(s, a) + sum_k p'_k gamma'_k v(s'_k) - (r(s, a) + sum_k p_k gamma_k v(s_k))| <= e(s, a)
+
+        where ' marks the model, for all v with values in a range of which the model says what it is: so e is a bound
+        whatever v is, in proportion to the width of the range. A subclass says whether e is a bound, with which
+        probability, or an estimate. None: it does not know.
+        """
+
+
 class EnumeratingModel(Model):
     """A model that enumerates all outcomes of a state.
 

@@ -1,6 +1,7 @@
 """A table that counts what followed each state and action, and is optimistic about what it has not seen."""
 
 import copy
+import math
 from collections import Counter
 from typing import Any, final
 
@@ -11,7 +12,14 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import PgtsError, check_count
-from pgts_torch.models.base import EnumeratingModel, Experience, LearningModel, SamplingModel, Transitions
+from pgts_torch.models.base import (
+    EnumeratingModel,
+    Experience,
+    FallibleModel,
+    LearningModel,
+    SamplingModel,
+    Transitions,
+)
 from pgts_torch.models.outcome_counts import OutcomeCounts
 from pgts_torch.models.rewards import value_range
 from pgts_torch.models.steps import check_rewards
@@ -41,7 +49,7 @@ class _Memory:
 
 
 @final
-class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
+class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel):
     """A table of S numbered states, which are also the observations, learned by counting.
 
         P(s', d | s, a) = (1 - u) n(s, a, s', d) / n(s, a),        r(s, a) = (1 - u) mean reward + u worth
@@ -91,6 +99,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
         empty = np.empty(0)
         self._memory = _Memory((empty, empty) if options.optimism == "posterior" else None)
         self._columns: tuple[int, tuple[Tensor, ...]] = (-1, ())
+        self._errors: tuple[int, Tensor] = (-1, torch.empty(0))
 
     @property
     def generation(self) -> int:  # type: ignore[override]
@@ -127,8 +136,9 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
     def plain(self) -> "CountsModel":
         """The same table without optimism. It goes on learning with this one, and so needs a `Topology` of its own."""
         plain = copy.copy(self)
-        plain.options = Counts(optimism="none", value_range=self.options.value_range)
-        plain._columns = (-1, ())
+        kept = self.options.value_range, self.options.confidence
+        plain.options = Counts(optimism="none", value_range=kept[0], confidence=kept[1])
+        plain._columns, plain._errors = (-1, ()), (-1, torch.empty(0))
         return plain
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
@@ -144,6 +154,22 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
         level_N1 = uniform(key_N, self.dtype).unsqueeze(-1) * cumulative_NK[:, -1:]
         k_N1 = (cumulative_NK <= level_N1).sum(-1, keepdim=True)
         return Transitions(reward_N, discount_NK.gather(-1, k_N1)[:, 0], child_NK.gather(-1, k_N1)[:, 0])
+
+    def step_error(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"] | None:
+        """e(s, a) for the value range [l, u] and `Counts.confidence` c; None without them. With probability c
+
+            e(s, a) = (u - l) min(1, sqrt( ln(2^{S+1} S A n (n + 1) / (1 - c)) / 2n ) + TV)
+
+        bounds the error for all v in [l, u]^S, all pairs and all n, so whatever the visits were chosen by; n is the
+        number of visits, TV the distance in total variation from what was seen, 0 without optimism (docs/theory.md,
+        Sec. 8; Hoeffding's inequality over the corners of the cube, as in Weissman et al. 2003).
+        """
+        confidence = self.options.confidence
+        if confidence is None:
+            return None
+        if self._errors[0] != self.generation:
+            self._errors = self.generation, self._made_errors(confidence)
+        return self._errors[1][state_N]
 
     def learn(self, experience: Experience, *, generator: torch.Generator) -> dict[str, float]:
         """Count these steps; many calls give the bits of one. With optimism posterior also sample new probabilities.
@@ -226,6 +252,20 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
         padded = (np.append(x_C, np.asarray(x, dtype=x_C.dtype)) for x_C, x in zip(columns, last, strict=True))
         return tuple(torch.from_numpy(x_C).to(self.device) for x_C in padded)
 
+    def _made_errors(self, confidence: float) -> Float[Tensor, "S A"]:
+        """`step_error` of all states, as a share of the range for each pair, times its width."""
+        counts, (low, high) = self.counts, self.value_range
+        pairs = self.num_states * self.num_actions
+        share_C, unknown_C = self._probabilities(counts)
+        n_C = counts.summed(counts.count_C).astype(np.float64)
+        surely = math.inf if confidence == 1 else -math.log1p(-confidence)
+        log_C = (self.num_states + 1) * math.log(2) + np.log(pairs * n_C * (n_C + 1)) + surely
+        moved_C = counts.summed(np.abs(share_C - counts.count_C / n_C)) + unknown_C
+        error_P = np.ones(pairs)
+        error_P[counts.pair_C] = np.minimum(1, np.sqrt(log_C / (2 * n_C)) + moved_C / 2)
+        error_SA = torch.from_numpy((high - low) * error_P).view(self.num_states, self.num_actions)
+        return error_SA.to(self.device)
+
     def _extra(self, counts: OutcomeCounts) -> float:
         """c of `Counts.optimism`."""
         return self.options.strength * (counts.most - 1)
@@ -275,5 +315,17 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel):
         off = np.flatnonzero(~((discount_N >= 0) & (discount_N <= 1)))
         if len(off):
             raise PgtsError(f"discount_N[{off[0]}] is {discount_N[off[0]]}; it must be in [0, 1]")
+        if self.options.confidence is not None:
+            # What a step makes of the lowest and of the highest value.
+            (low, high), slack = self.value_range, 1e-9 * sum(map(abs, self.value_range))
+            off = np.flatnonzero(
+                (reward_N + discount_N * low < low - slack) | (reward_N + discount_N * high > high + slack)
+            )
+            if len(off):
+                raise PgtsError(
+                    f"reward_N[{off[0]}] is {reward_N[off[0]]}, with discount {discount_N[off[0]]}: from a value in "
+                    f"value_range, which is {[low, high]}, such a step leads out of it, which confidence rules out: "
+                    "widen it"
+                )
         pair_N = columns["observation_N"].astype(np.int64) * A + columns["action_N"]
         return pair_N, columns["next_observation_N"].astype(np.int64), discount_N, reward_N

@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from pgts_torch.options.fields import Ascending, Count, NonNegative, Positive, Sizes, conflict
+from pgts_torch.options.fields import Ascending, Count, NonNegative, Positive, Share, Sizes, conflict
 from pgts_torch.options.part import Part, null
 
 
@@ -37,6 +37,20 @@ class Counts(Part):
 
     value_range: Ascending | None = None
     """The lowest and the highest value of a state, in reward units; null: what the rewards seen so far allow."""
+
+    confidence: Share | None = None
+    """The probability with which the error that is stated of the table, for search.doubt, is not exceeded anywhere,
+    however it was learned; null: none is stated. It needs model.value_range, and a step from any value of it to stay in
+    it."""
+
+    @field_validator("confidence")
+    @classmethod
+    def _has_range(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None and info.data.get("value_range", ...) is None:
+            raise conflict(
+                f"model.confidence is {value}, which needs model.value_range: rewards seen so far prove none"
+            )
+        return value
 
     @field_validator("strength")
     @classmethod

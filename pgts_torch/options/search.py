@@ -38,6 +38,19 @@ class Expectimax(Budget):
     max_width: Count | None = None
     """The largest number of states that are expanded at a level; null: all."""
 
+    doubt: bool = False
+    """Whether to compute by how much lookahead values may be off because the model is (`search/doubt`); 0 for exact
+    models."""
+
+    @field_validator("doubt")
+    @classmethod
+    def _is_of_full_width(cls, value: Any, info: ValidationInfo) -> Any:
+        if value and info.data.get("max_width") is not None:
+            raise conflict(
+                f"search.doubt needs all states of a level, but search.max_width is {info.data['max_width']}"
+            )
+        return value
+
 
 class Sampled(Budget):
     """Samples outcomes of all actions."""

@@ -194,6 +194,15 @@ class Training(Part):
             )
         return model
 
+    @field_validator("model")
+    @classmethod
+    def _says_its_error(cls, model: Any, info: ValidationInfo) -> Any:
+        if getattr(info.data.get("search"), "doubt", False) and isinstance(model, Counts) and model.confidence is None:
+            raise conflict(
+                "search.doubt is true, which needs model.confidence and model.value_range where counts are learned"
+            )
+        return model
+
     @field_validator("replay")
     @classmethod
     def _goes_on(cls, replay: Any, info: ValidationInfo) -> Any:

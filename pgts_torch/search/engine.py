@@ -10,7 +10,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.models.base import EnumeratingModel, Model, SamplingModel
+from pgts_torch.models.base import EnumeratingModel, FallibleModel, Model, SamplingModel
 from pgts_torch.options.search import MCTS, Expectimax, Sampled
 from pgts_torch.search.empirical import FixedSamples
 from pgts_torch.search.expectimax import search_levels
@@ -32,11 +32,13 @@ class Search(ABC):
     topology: what it remembers of a model that enumerates outcomes; None: it remembers no outcomes.
     choices: the names of the attributes by which earlier searches decide how later ones are made.
     uses_prior: whether it starts from the probabilities of the current policy.
+    leaf_error: the error of the critic from which the doubt of the lookahead is computed; None: it is not.
     """
 
     topology: Topology | None = None
     choices: tuple[str, ...] = ()
     uses_prior: bool = False
+    leaf_error: float | None = None
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -64,7 +66,7 @@ class Search(ABC):
         """
         if self.uses_prior and prior is None:
             raise PgtsError("the prior of the search is that of the policy: give prior")
-        leaves = Leaves(self.model, depth, q_leaf, v_leaf, prior if self.uses_prior else None)
+        leaves = Leaves(self.model, depth, q_leaf, v_leaf, prior if self.uses_prior else None, self.leaf_error)
         look = self.look_ahead(leaves, root_B, generator)
         check_finite("lookahead", "the lookahead", look.q_BA, root_B)
         self.model_calls += look.model_calls
@@ -133,6 +135,11 @@ class ExpectimaxSearch(Search):
         super().__init__(model)
         self.options = options
         self.topology: Topology = Topology(enumerating(model, "expectimax"), max_bytes=options.max_bytes)
+        if options.doubt and not (model.exact or isinstance(model, FallibleModel)):
+            raise PgtsError(
+                f"search.doubt needs a model that says its error, a FallibleModel; {type(model).__name__} does not"
+            )
+        self.leaf_error = 0.0 if options.doubt else None  # the doubt is that of the model
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
         max_nodes, max_width = self.options.max_nodes, self.options.max_width

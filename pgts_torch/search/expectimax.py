@@ -1,12 +1,13 @@
 """Full-width lookahead that merges equal states: T^m Q at many roots, at a cost linear in m where states recur."""
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.models.base import EnumeratingModel
+from pgts_torch.models.base import EnumeratingModel, FallibleModel
 from pgts_torch.options.search import MAX_NODES, Expectimax
-from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead
+from pgts_torch.search.levels import Levels
+from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, checked_errors
 from pgts_torch.search.pruned import pruned
 from pgts_torch.search.topology import Topology, topology_of
 
@@ -21,6 +22,7 @@ def expectimax(
     topology: Topology | None = None,
     max_nodes: int = MAX_NODES,
     max_width: int | None = None,
+    leaf_error: float | Leaf | None = None,
 ) -> Lookahead:
     """(T^m Q)(s, .) at the roots for m = depth.        [PGTS Sec. 3]
 
@@ -42,14 +44,18 @@ def expectimax(
         max_nodes: the most nodes, summed over levels.
         max_width: W, the most states of each level below the roots that are expanded; the others get the critic's
             values, as leaves do (`pgts_torch.search.pruned`). None: all are expanded.
+        leaf_error: a bound of the critic's error, against its policy's values in the environment: one number, or states
+            to the shape of the critic's values; 0: it makes none. With it, and where the model is exact or says its own
+            error (`FallibleModel`), the result has `doubt_BA`, at no further model call. None: it has none.
 
     Raises:
-        PgtsError: a bad depth or width, roots that are no states, leaf values of a wrong shape or not finite (naming
-            the state).
+        PgtsError: a bad depth or width, leaf_error with max_width, roots that are no states, leaf values of a wrong
+            shape or not finite (naming the state), errors that are no bounds.
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
-    options = Expectimax(max_width=max_width, max_nodes=max_nodes)
-    leaves, topology = Leaves(model, depth, q_leaf, v_leaf), topology_of(model, topology)
+    options = Expectimax(max_width=max_width, max_nodes=max_nodes, doubt=leaf_error is not None)
+    leaves = Leaves(model, depth, q_leaf, v_leaf, leaf_error=leaf_error)
+    topology = topology_of(model, topology)
     return search_levels(leaves, topology, root_B, max_nodes=options.max_nodes, max_width=options.max_width)
 
 
@@ -64,9 +70,36 @@ def search_levels(
     levels = topology.levels(root_B, expansions, max_nodes=max_nodes)
     bottom = levels.bottom(expansions)
     q_NA = levels.back_up(leaves.v(bottom), expansions) if expansions else leaves.q(bottom)
+    doubt_NA = None if leaves.leaf_error is None else _doubt(leaves, levels, topology.model, bottom)
     return Lookahead.enumerated(
         q_NA.index_select(0, levels.root_row_B),
         model_calls=topology.table.model_calls - calls_before,
         critic_calls=leaves.calls,
         nodes_per_level=levels.nodes_per_level(expansions),
+        doubt_BA=None if doubt_NA is None else doubt_NA.index_select(0, levels.root_row_B),
     )
+
+
+def _doubt(
+    leaves: Leaves, levels: Levels, model: EnumeratingModel, bottom: Int[Tensor, "leaves"]
+) -> Float[Tensor, "N A"] | None:
+    """The bound E of the error of all actions in frontier 0, `Lookahead.doubt_BA`: values of an MDP that pays the
+    errors of the model, with the errors of the critic at the bottom. 0 where an action is not allowed."""
+
+    if _step_error(model, bottom[:1]) is None:
+        return None
+    error_N, expansions = leaves.errors(bottom), leaves.expansions
+    if expansions == 0:
+        return error_N
+    error_N = error_N if error_N.ndim == 1 else error_N.amax(-1)
+    doubt_NA = levels.back_up(error_N, expansions, reward=lambda state_N: _step_error(model, state_N))
+    return doubt_NA.masked_fill(doubt_NA == -torch.inf, 0.0)
+
+
+def _step_error(model: EnumeratingModel, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"] | None:
+    """What the model says of its error, checked; 0 where it is exact, None where it does not say."""
+    shape = len(state_N), model.num_actions
+    if model.exact:
+        return torch.zeros(shape, dtype=model.dtype, device=model.device)
+    error_NA = model.step_error(state_N) if isinstance(model, FallibleModel) else None
+    return None if error_NA is None else checked_errors(error_NA, shape, model, state_N, "the model's error")

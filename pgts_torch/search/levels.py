@@ -1,6 +1,6 @@
 """The levels of a lookahead: which states it has at which depth, and how values go up through them."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from jaxtyping import Float, Int
@@ -47,13 +47,25 @@ class Levels:
             return self.closed_states
         return self.frontiers[expansions]
 
-    def back_up(self, v_N: Float[Tensor, "leaves"], expansions: int) -> Float[Tensor, "N A"]:
-        """Values of all actions in frontier 0, from values v of the leaves below `expansions` >= 1 levels."""
+    def back_up(
+        self, v_N: Float[Tensor, "leaves"], expansions: int, *, reward: Callable[[Tensor], Tensor | None] | None = None
+    ) -> Float[Tensor, "N A"]:
+        """Values of all actions in frontier 0, from values v of the leaves below `expansions` >= 1 levels.
+
+        Args:
+            reward: takes the place of the rewards of allowed actions; states [N] to [N, A], or to None: those stay.
+        """
+
+        def paying(outcomes: Outcomes, states: Tensor) -> Outcomes:
+            reward_NA = None if reward is None else reward(states)
+            return outcomes if reward_NA is None else outcomes.paying(reward_NA)
+
         # Levels below the last frontier all are the closed set, which needs one table for all of them.
         if sweeps := self.sweeps(expansions):
             assert self.closed is not None
-            v_N = sweep(self.closed, v_N, sweeps)
-        return back_up(reversed(self.outcomes[:expansions]), v_N)
+            v_N = sweep(paying(self.closed, self.closed_states), v_N, sweeps)
+        steps = range(min(expansions, len(self.outcomes)))
+        return back_up((paying(self.outcomes[k], self.frontiers[k]) for k in reversed(steps)), v_N)
 
     def nodes_per_level(self, expansions: int) -> tuple[int, ...]:
         """How many nodes each of the levels 0 .. expansions holds."""

@@ -38,6 +38,13 @@ class Lookahead:
     bias_BA: how much q is too high because maxima were taken over sampled values, in reward units, as far as the sample
         itself can tell; None where nothing was sampled.
     samples: the fewest outcomes that were sampled of a (state, action); None where none were.
+    doubt_BA: at least |q - T^m Q|, with T and Q of the environment, in reward units: what the model and the critic may
+        be wrong by, added up along the best plan for errors,
+
+            E_0 = error of the critic,     E_{j+1}(s, a) = e(s, a) + sum_k p_k gamma_k max_a' E_j(s'_k, a')
+
+        e the error of the model (`FallibleModel.step_error`), which may be an estimate. None: not asked for, or the
+        model does not say.
     value_range: between which numbers the model's values lie; both the same (0) where its actions have one outcome
         each, so that equal samples leave no doubt.
     """
@@ -51,6 +58,7 @@ class Lookahead:
     bias_BA: Float[Tensor, "B A"] | None = None
     samples: int | None = None
     value_range: tuple[float, float] = (-math.inf, math.inf)
+    doubt_BA: Float[Tensor, "B A"] | None = None
 
     @classmethod
     def enumerated(
@@ -61,15 +69,16 @@ class Lookahead:
         model_calls: int,
         critic_calls: int,
         nodes_per_level: tuple[int, ...],
+        doubt_BA: Float[Tensor, "B A"] | None = None,
     ) -> Self:
         """What a search finds that enumerates outcomes: without sampling error, and by default of full width."""
         zero_BA = q_BA.new_zeros(()).expand_as(q_BA)  # one number in memory
-        return cls(
-            q_BA, zero_BA, zero_BA if pruned_BA is None else pruned_BA, model_calls, critic_calls, nodes_per_level
-        )
+        pruned_BA = zero_BA if pruned_BA is None else pruned_BA
+        return cls(q_BA, zero_BA, pruned_BA, model_calls, critic_calls, nodes_per_level, doubt_BA=doubt_BA)
 
     def interval(self, confidence: float = 0.95) -> tuple[Float[Tensor, "B A"], Float[Tensor, "B A"]]:
-        """Lower and upper bounds of T^m Q, as far as sampled outcomes put it in doubt: q - bias -+ t stderr.
+        """Lower and upper bounds of T^m Q, as far as sampled outcomes put it in doubt: q - bias -+ t stderr;
+        and the doubt on both sides, where there is one: then they are bounds of T^m Q in the environment.
 
         t is the quantile of Student's distribution with C - 1 degrees of freedom, C = `samples`. Where samples agree so
         far that stderr is 0 the interval comes from the range of the values instead: with values in [l, u]
@@ -83,8 +92,8 @@ class Lookahead:
         Measured on random MDPs with two outcomes of each action (`benchmarks/intervals.py`, docs/benchmarks.md), 95 %:
         with one level they hold the truth at least so often for C = 2, 4, 8 and 16. They hold it less often over more
         levels, where maxima over samples make q too high and `bias_BA` is a part of that, most among tied actions;
-        and where few of many outcomes carry most of a value and none of these was sampled while others differ. What the
-        critic gets wrong and what was pruned are not in them.
+        and where few of many outcomes carry most of a value and none of these was sampled while others differ. What was
+        pruned is not in them, nor, without a doubt, what the critic gets wrong.
 
         Raises:
             PgtsError: confidence is not between 0 and 1.
@@ -94,6 +103,8 @@ class Lookahead:
         q_BA, C = self.q_BA, self.samples
         if C is None or C < 2:
             half_BA = NormalDist().inv_cdf((1 + confidence) / 2) * self.stderr_BA
+            if self.doubt_BA is not None:
+                half_BA = half_BA + self.doubt_BA
             return q_BA - half_BA, q_BA + half_BA
         center_BA = q_BA if self.bias_BA is None else q_BA - self.bias_BA
         half_BA = float(scipy.special.stdtrit(C - 1, (1 + confidence) / 2)) * self.stderr_BA
@@ -132,19 +143,27 @@ class Leaves:
         q_leaf: an estimate of Q^pi: states [N] to [N, A]; -inf where an action is not allowed.
         v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.
         prior: the policy, states [N] to probabilities [N, A]. Default: uniform.
+        leaf_error: a bound of the critic's error, one number or of the shape of the critic's values.
 
     Raises:
         PgtsError: a bad depth, or not exactly one critic.
     """
 
     def __init__(
-        self, model: Model, depth: int, q_leaf: Leaf | None, v_leaf: Leaf | None, prior: Leaf | None = None
+        self,
+        model: Model,
+        depth: int,
+        q_leaf: Leaf | None,
+        v_leaf: Leaf | None,
+        prior: Leaf | None = None,
+        leaf_error: float | Leaf | None = None,
     ) -> None:
         if (q_leaf is None) == (v_leaf is None):
             raise PgtsError("give exactly one of q_leaf and v_leaf")
         self.calls = 0
         self.expansions = check_count("depth", depth, least=0) + (v_leaf is not None)
         self._model, self._q_leaf, self._v_leaf, self._prior = model, q_leaf, v_leaf, prior
+        self.leaf_error = leaf_error
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         """v, or max_a Q(s, a); PgtsError, with the state, if the critic's values are of a wrong shape or not finite."""
@@ -156,6 +175,15 @@ class Leaves:
         """Q(s, .), -inf where an action is not allowed; as `v` otherwise. Only for critics of Q^pi."""
         assert self._q_leaf is not None
         return self._called(self._q_leaf, state_N, (len(state_N), self._model.num_actions))
+
+    def errors(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"] | Float[Tensor, "N A"]:
+        """The bounds of the error of v, or of Q; PgtsError, with the state, if they cannot be bounds."""
+        shape = (len(state_N),) if self._q_leaf is None else (len(state_N), self._model.num_actions)
+        if callable(self.leaf_error):
+            return checked_errors(self.leaf_error(state_N), shape, self._model, state_N, "the critic's error")
+        assert self.leaf_error is not None
+        error = torch.full(shape, self.leaf_error, dtype=self._model.dtype, device=self._model.device)
+        return checked_errors(error, shape, self._model, state_N, "leaf_error")
 
     def prior(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
         """pi(.|s), or uniform probabilities; PgtsError, with the state, if the policy's are no distribution."""
@@ -178,6 +206,21 @@ class Leaves:
             raise PgtsError(f"the critic's values have shape {tuple(values.shape)}; of {len(state_N)} leaves: {shape}")
         check_finite("value", "the critic's value", values, state_N)
         return values
+
+
+def checked_errors(
+    error_N: Tensor, shape: tuple[int, ...], model: Model, state_N: Int[Tensor, "N"], name: str
+) -> Tensor:
+    """Bounds of errors in the dtype of the model; PgtsError unless they have this shape, are finite and at least 0."""
+    if error_N.shape != shape:
+        raise PgtsError(f"{name} has shape {tuple(error_N.shape)}; of {len(state_N)} states: {shape}")
+    off = torch.nonzero(~((error_N >= 0) & (error_N < torch.inf)))
+    if len(off):
+        row = int(off[0, 0])
+        raise PgtsError(
+            f"{name} in state {int(state_N[row])} is {error_N[row].tolist()}; it must be finite and at least 0"
+        )
+    return error_N.to(model.dtype)
 
 
 def unexpanded(leaves: Leaves, root_B: Int[Tensor, "B"]) -> Lookahead:

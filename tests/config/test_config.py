@@ -164,6 +164,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a number >= 0 or null": st.none() | st.floats(0, allow_infinity=False),
     "a number in [0, 1]": st.floats(0, 1),
     "a number in (0, 1]": st.floats(0, 0.5, exclude_min=True),
+    "a number in (0, 1] or null": st.none() | st.floats(0, 1, exclude_min=True),
     "a number in [0, 1] or null": st.none() | st.floats(0, 1),
     "a number in (0, 1] or mean": st.just("mean") | st.floats(0, 1, exclude_min=True),
     "true or false": st.booleans(),
@@ -235,6 +236,13 @@ def configurations(draw: st.DrawFn) -> Config:
         given |= {"search.merge": False} if given["search.backup"] == "mean" else {}
     if types["model.type"] == "counts" and given["model.optimism"] == "none":
         given["model.strength"] = None
+    if types["model.type"] == "counts" and given["model.value_range"] is None:
+        given["model.confidence"] = None
+    if given.get("search.max_width") is not None or (types["model.type"], given.get("model.confidence")) == (
+        "counts",
+        None,
+    ):
+        given |= {"search.doubt": False} if "search.doubt" in given else {}
     is_learned = types["model.type"] in ("counts", "ensemble")
     if is_learned:
         given["search.stop_at"] = None
