@@ -4,6 +4,8 @@ import copy
 from collections.abc import Iterator
 from typing import Any, final
 
+import torch
+
 from pgts_torch.agent.explorer import Explorer
 from pgts_torch.agent.imagine import imagine
 from pgts_torch.agent.model_check import ModelCheck
@@ -11,10 +13,11 @@ from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.ranks import Draws
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.world import ModelWorld
-from pgts_torch.errors import check_count
+from pgts_torch.agent.world import ModelWorld, SimulatedWorld
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.base import LearningModel
 from pgts_torch.models.replay import ReplayBuffer
+from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.replay import UniformReplay
 
 
@@ -53,6 +56,8 @@ class Dyna:
         own = model.replay if isinstance(model, LearningModel) else None
         self._owns_replay = own is None
         self.replay = ReplayBuffer(options.capacity) if own is None else own
+        if own is None:
+            self.replay.add(state=world.export(torch.zeros(0, dtype=torch.int64, device=world.device)))
         self.num_updates = self._steps = 0
 
     @property
@@ -108,8 +113,17 @@ class Dyna:
         return self.replay.rows("state", self.replay.sample(self.options.starts, generator=draws.common))
 
     def state_dict(self) -> dict[str, Any]:
-        """What was kept and learned, as tensors on the CPU and plain values."""
+        """Return what was kept and learned, as tensors on the CPU and plain values.
+
+        Raises:
+            PgtsError: the states that were kept are snapshots of a simulator.
+        """
         model = self._model
+        if self._owns_replay and isinstance(self._world, SimulatedWorld):
+            raise PgtsError(
+                f"replay keeps snapshots of {env_name(self._world.env)}, which are objects of its simulator and cannot "
+                "be saved: train with it in Python without saving, or without replay (replay.type none)"
+            )
         return {
             "num_updates": self.num_updates,
             "replay": self.replay.state_dict() if self._owns_replay else None,

@@ -36,7 +36,7 @@ from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.trial import compare
 from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_of, wrappers_of
 from pgts_torch.seeding import SharedGenerators, numpy_stream
-from pgts_torch.tabular.mdp import check_gamma
+from pgts_torch.tabular.mdp import TabularMDP, check_gamma
 
 _WAYS_OUT = (
     "; a model can be learned from its steps: model 'ensemble' where observations are vectors, 'counts' where they are "
@@ -77,7 +77,9 @@ def make_world(
     discount = DEFAULT_GAMMA if gamma is None else gamma
     check_gamma(discount)
     if other is not None:
-        return other(env, discount)
+        _check_memories(env)
+        own = getattr(each_of(env)[0].unwrapped, "mdp", None)
+        return other(env, float(own.outcomes.discount_NAK.max()) if isinstance(own, TabularMDP) else discount)
     request = _Request(source, env, discount, observation_key, action_repeat, torch.device(device))
     with SharedGenerators(0, "models"):
         world, reasons = _first_model(request, (_table,) if plain else (_table, _dynamics, _simulator))
@@ -85,13 +87,7 @@ def make_world(
         return world
     if not plain:
         raise MissingModel("; ".join(reversed(reasons)) + _WAYS_OUT)
-    for wrapper in wrappers_of(each_of(env)[0]):
-        if isinstance(wrapper, NormalizeObservation | NormalizeReward):
-            raise PgtsError(
-                f"{env_name(env)} is wrapped in {type(wrapper).__name__}, whose running statistics are neither saved "
-                "nor used in evaluations: leave it out, and set normalize of the network or normalize_returns of the "
-                "critic"
-            )
+    _check_memories(env)
     _check_single(action_repeat, "without a model")
     return World(env, gamma=discount, observation_key=observation_key, device=device)
 
@@ -161,6 +157,17 @@ def _first_model(
         except MissingModel as missing:
             reasons.append(str(missing))
     return None, reasons
+
+
+def _check_memories(env: VectorEnv) -> None:
+    """PgtsError if a wrapper remembers something from one episode to the next."""
+    for wrapper in wrappers_of(each_of(env)[0]):
+        if isinstance(wrapper, NormalizeObservation | NormalizeReward):
+            raise PgtsError(
+                f"{env_name(env)} is wrapped in {type(wrapper).__name__}, whose running statistics are neither saved "
+                "nor used in evaluations: leave it out, and set normalize of the network or normalize_returns of the "
+                "critic"
+            )
 
 
 def _check_wrappers(request: _Request) -> None:

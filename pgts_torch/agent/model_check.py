@@ -119,7 +119,7 @@ class ModelCheck:
         if isinstance(self._world, DynamicsWorld) and not self._world.model.transforms.observations:
             self._check_observations(self._world, experience)
         if isinstance(self._model, TabularModel):
-            self._check_starts(experience.state_TB[0].cpu().numpy())
+            self._check_starts(experience.start_state_N.cpu().numpy())
             self._check_frequencies()
 
     def _check_steps(self, experience: Rollout, iteration: int) -> "_Result":

@@ -17,6 +17,8 @@ from pgts_torch.models.snapshots import env_name
 class Observations:
     """Makes tensors of the observations of an environment: numbers, vectors or images.
 
+    space: of these tensors.
+
     Args:
         env: the environments.
         key: the entry of dictionary observations that is used.
@@ -38,7 +40,10 @@ class Observations:
             raise PgtsError(f"{what} are {space}; they have no part {key!r}")
         if not isinstance(space, spaces.Discrete | spaces.Box):
             raise PgtsError(f"{what} are {space}; a policy takes numbers, vectors or images")
-        self.space, self.key, self.device = space, key, device
+        self.key, self.device, self._first = key, device, 0
+        self.space: spaces.Discrete | spaces.Box = space
+        if isinstance(space, spaces.Discrete):  # as tensors, numbers are counted from 0
+            self._first, self.space = int(space.start), spaces.Discrete(int(space.n))
 
     def part(self, observation: Any) -> Any:
         """The entry of a dictionary observation that is used; other observations are returned as they are."""
@@ -51,7 +56,7 @@ class Observations:
     def encode_part(self, part: Any) -> Tensor:
         """As `encode`, from the result of `part`."""
         if isinstance(self.space, spaces.Discrete):
-            return states_of(part, int(self.space.n)).to(self.device)
+            return states_of(part, self._first, int(self.space.n)).to(self.device)
         try:
             array = np.asarray(part)
         except ValueError as error:
@@ -64,12 +69,12 @@ class Observations:
         return torch.from_numpy(np.array(array)).to(self.device)
 
 
-def states_of(observation: Any, num_states: int) -> Int[Tensor, "..."]:
-    """Observations of a discrete space as int64 states; PgtsError unless they are integers below `num_states`."""
+def states_of(observation: Any, first: int, num_states: int) -> Int[Tensor, "..."]:
+    """Observations that are counted from `first` on as int64 states, counted from 0; PgtsError unless they are such."""
     state = np.asarray(observation)
     if not np.issubdtype(state.dtype, np.integer):
         raise PgtsError(f"observation is of {state.dtype}; states are integers")
-    off = state[(state < 0) | (state >= num_states)]
+    off = state[(state < first) | (state >= first + num_states)]
     if off.size:
-        raise PgtsError(f"state {off.flat[0]} does not exist; states are 0 to {num_states - 1}")
-    return torch.from_numpy(np.array(state, dtype=np.int64))
+        raise PgtsError(f"state {off.flat[0]} does not exist; states are {first} to {first + num_states - 1}")
+    return torch.from_numpy(np.asarray(state.astype(np.int64) - first))

@@ -61,9 +61,14 @@ class OngoingEpisodes:
             )
         self._world, self._max_length, self._seed, self._names = world, max_length, seed, names
         self._number_B = [0] * B
+        self._begin_all()
+
+    def _begin_all(self) -> None:
+        """Let the present episode of each environment begin in the next rollout."""
+        B = self._world.env.num_envs
         self._actions_B: list[list[int]] = [[] for _ in range(B)]
         self._return_B = [0.0] * B
-        self._episodes = Episodes(world.env, gamma=world.gamma, seeds=self._seeds())
+        self._episodes = Episodes(self._world.env, gamma=self._world.gamma, seeds=self._seeds())
         self._has_begun = False
 
     def _seeds(self) -> list[int]:
@@ -87,8 +92,17 @@ class OngoingEpisodes:
             environment come first. `finished` has the episodes that ended.
 
         Raises:
-            PgtsError: as `rollout`.
+            PgtsError: as `rollout`. After it the present episodes begin again in the next call.
         """
+        try:
+            return self._collected(policy, length, names, generator)
+        except BaseException:
+            self._begin_all()
+            raise
+
+    def _collected(
+        self, policy: Policy, length: int, names: tuple[str | int, ...], generator: torch.Generator
+    ) -> Rollout:
         world, episodes = self._world, self._episodes
         model = world.model if isinstance(world.model, LearningModel) else None
         rows: list[_Row] = []
@@ -98,6 +112,7 @@ class OngoingEpisodes:
                 with episodes.named("at the start"):
                     episodes.reset()
                 self._has_begun = True
+            begins_B = [not actions for actions in self._actions_B]
             observation_B, read_B = self._observe()
             for t in range(length):
                 action_B = policy.sample(observation_B, generator=generator).cpu().numpy()
@@ -120,7 +135,7 @@ class OngoingEpisodes:
                 is_news = model.is_news(rows[-1].before_B, torch.from_numpy(action_B))
                 if is_news or (model.learns_after_episodes and over_B.any()):
                     break
-        return self._cut(rows, finished)
+        return self._cut(rows, begins_B, finished)
 
     def _observe(self) -> tuple[Tensor, Tensor | None]:
         world, observation = self._world, self._episodes.observation
@@ -140,8 +155,12 @@ class OngoingEpisodes:
             self._number_B[b], self._actions_B[b], self._return_B[b] = self._number_B[b] + 1, [], 0.0
         self._episodes.restart(over_B, self._seeds())
 
-    def _cut(self, rows: list[_Row], finished: list[tuple[float, int]]) -> Rollout:
-        """Return the steps as a rollout, with a column for each episode or part of one."""
+    def _cut(self, rows: list[_Row], begins_B: list[bool], finished: list[tuple[float, int]]) -> Rollout:
+        """Return the steps as a rollout, with a column for each episode or part of one.
+
+        Args:
+            begins_B: whether an episode begins with the first step.
+        """
         over_TB = np.array([row.over_B for row in rows])
         parts = []  # one for each column: its environment, its first step and the step after its last one
         for b in range(over_TB.shape[1]):
@@ -173,7 +192,8 @@ class OngoingEpisodes:
         if isinstance(self._world, ModelWorld):
             read_UP = both("read_before_B", "read_after_B")
             state_UP = self._world.numbers(read_UP.flatten(0, 1)).view(read_UP.shape[:2])
-        return Rollout(observation_UP, **tensors, state_UB=state_UP, finished=tuple(finished))
+        begins_P = torch.tensor([start > 0 or begins_B[b] for b, start, _ in parts], device=device)
+        return Rollout(observation_UP, **tensors, state_UB=state_UP, begins_B=begins_P, finished=tuple(finished))
 
     def state_dict(self) -> dict[str, Any]:
         """Return, for each environment, the number of its episode, the actions and the return since the reset, and the
@@ -205,7 +225,7 @@ class OngoingEpisodes:
         if not self._has_begun:
             return
         self._episodes = Episodes(self._world.env, gamma=self._world.gamma, seeds=self._seeds())
-        longest = max(map(len, recorded))
+        longest, return_B = max(map(len, recorded)), [0.0] * B
         with shared_generators(self._world, self._seed, ("restored",)), self._episodes.named("when it was repeated"):
             self._episodes.reset()
             for t in range(longest):
@@ -216,12 +236,16 @@ class OngoingEpisodes:
                 begun_B = np.array([len(actions) >= longest - t for actions in recorded])
                 padded = [[0] * (longest - len(actions)) + actions for actions in recorded]
                 taken = [actions[t] for actions in padded]
-                self._episodes.step(np.array(taken), begun_B)
+                reward_B = self._episodes.step(np.array(taken), begun_B)[0]
+                return_B = [
+                    total + float(r) * begun for total, r, begun in zip(return_B, reward_B, begun_B, strict=True)
+                ]
             idle_B = np.array([not actions for actions in recorded])
             if longest and idle_B.any():
                 self._episodes.restart(idle_B, self._seeds())
         observed_B = self._observe()[0].cpu()
         differs_B = (observed_B != state["observed"]).reshape(B, -1).any(-1)
+        differs_B |= torch.from_numpy(np.array(return_B) != np.array(self._return_B))
         if bool(differs_B.any()):
             b = int(differs_B.nonzero()[0, 0])
             raise PgtsError(

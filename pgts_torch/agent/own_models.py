@@ -94,11 +94,11 @@ def learned_world(
         if action_repeat > 1:
             raise PgtsError(f"action_repeat is {action_repeat}; in a table it must be 1")
         table = CountsModel(int(space.n), world.num_actions, gamma=gamma, options=options, device=device)
-        return TabularWorld(env, None, model=table, gamma=gamma, device=device)
+        return TabularWorld(env, None, model=table, gamma=gamma, observation_key=observation_key, device=device)
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
         raise MissingModel(
             f"model is 'ensemble', which learns from vectors of numbers; observations of {env_name(env)} are {space}"
-            + (": take 'counts'" if isinstance(space, spaces.Discrete) else "")
+            + (": take 'counts'" if isinstance(space, spaces.Discrete) else ": make them vectors by a wrapper")
         )
     model = EnsembleModel(
         space.shape[0],
@@ -125,13 +125,13 @@ def world_of(
     space, name = world.observation_space, type(model).__name__
     if model.num_actions != world.num_actions:
         raise PgtsError(f"{name} has {model.num_actions} actions; {env_name(env)} has {world.num_actions}")
-    if torch.device(model.device) != device:
+    if torch.empty(0, device=model.device).device != torch.empty(0, device=device).device:
         raise PgtsError(f"{name} is on the device {model.device}; the training is on {device}")
     if isinstance(space, spaces.Discrete) and not isinstance(model, TensorModel):
         if model.num_states != space.n:
             raise PgtsError(f"{name} has {model.num_states} states; {env_name(env)} has {space.n}")
         mdp = model.mdp if isinstance(model, TabularModel) else None
-        return TabularWorld(env, mdp, model=model, gamma=gamma, device=device)
+        return TabularWorld(env, mdp, model=model, gamma=gamma, observation_key=observation_key, device=device)
     if isinstance(space, spaces.Box) and isinstance(model, TensorModel):
         if space.shape != (model.state_size,):
             raise PgtsError(

@@ -23,9 +23,9 @@ from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.updates import Update
-from pgts_torch.agent.world import ModelWorld, TabularWorld, World
+from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import Model
+from pgts_torch.models.base import LearningModel, Model
 from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.rewards import RewardRange
@@ -100,6 +100,8 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
         assert isinstance(world, ModelWorld)
         world, explorer = _with_explorer(world, policy, critic, update, options, ranks)
         dyna = Dyna(world, policy, options.replay, model_check, explorer)
+    elif isinstance(world.model, LearningModel):
+        raise PgtsError(f"{type(world.model).__name__} learns from steps, which needs replay: set replay to uniform")
     if isinstance(options.estimator, SampledAdvantages):
         estimator: Estimator = SampledEstimator(policy, critic, options.estimator.lambda_, update.state_weight)
     else:
@@ -164,7 +166,9 @@ def _with_explorer(
     search, _, depth_choice = _lookahead(world, visiting, its_critic, options, ranks, samples_starts=False)
     estimator = LookaheadEstimator(depth_choice, update.state_weight)
     explorer = Explorer(world, visiting, its_critic, its_update, search, estimator)
-    return TabularWorld(world.env, None, model=table.plain(), gamma=world.gamma, device=world.device), explorer
+    trained_in = copy.copy(world)
+    trained_in.model = table.plain()
+    return trained_in, explorer
 
 
 def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks) -> tuple[EnvSource, World]:

@@ -57,6 +57,8 @@ class Rollout:
         (geometric horizon); 0 where the episode is over.
     survival_TB: the factor from one weight to the next: weight_{t+1} = weight_t * survival_t.
     state_UB: the states of these observations, which a lookahead may start from; None where there is no model.
+    begins_B: whether an episode begins in the first row, where episodes go on from one rollout to the next; None: each
+        does.
     finished: the undiscounted return and the length of each episode that ended, where episodes go on from one rollout
         to the next; None: all begin in this one.
     """
@@ -69,6 +71,7 @@ class Rollout:
     weight_TB: Float[Tensor, "T B"]
     survival_TB: Float[Tensor, "T B"]
     state_UB: Int[Tensor, "U B"] | None = None
+    begins_B: Bool[Tensor, "B"] | None = None
     finished: tuple[tuple[float, int], ...] | None = None
 
     @property
@@ -81,6 +84,11 @@ class Rollout:
         """The states before each step. Only with a model."""
         assert self.state_UB is not None
         return self.state_UB[:-1]
+
+    @property
+    def start_state_N(self) -> Int[Tensor, "N"]:
+        """The states in which episodes begin in this rollout. Only with a model."""
+        return self.state_TB[0] if self.begins_B is None else self.state_TB[0][self.begins_B]
 
     @property
     def next_state_TB(self) -> Int[Tensor, "T B"]:

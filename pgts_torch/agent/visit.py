@@ -38,15 +38,20 @@ def visit(
         return make()
     parts = ranks.gather("episodes", lambda: _sent(world, make()))
     length = max(len(part["alive_TB"]) for part in parts)
-    columns = {name: torch.cat([_padded(part[name], length) for part in parts], 1).to(world.device) for name in COLUMNS}
+    columns: dict[str, Any] = {
+        name: torch.cat([_padded(part[name], length) for part in parts], 1).to(world.device) for name in COLUMNS
+    }
     observation_UB = torch.cat([_extended(part["observations"], length) for part in parts], 1).to(world.device)
     state_UB = None
     if isinstance(world, ModelWorld):
         world.reset_numbers()  # this rank's own numbers are replaced by those that all ranks have in common
         numbered = (world.adopt(part["states"]).view(len(part["alive_TB"]) + 1, -1) for part in parts)
         state_UB = torch.cat([_extended(part_UB, length) for part_UB in numbered], 1)
-    finished = None if episodes is None else tuple(each for part in parts for each in part["finished"])
-    return Rollout(observation_UB, **columns, state_UB=state_UB, finished=finished)
+    if episodes is None:
+        return Rollout(observation_UB, **columns, state_UB=state_UB)
+    begins_B = torch.cat([part["begins"] for part in parts]).to(world.device)
+    finished = tuple(each for part in parts for each in part["finished"])
+    return Rollout(observation_UB, **columns, state_UB=state_UB, begins_B=begins_B, finished=finished)
 
 
 def _sent(world: World, made: Rollout) -> dict[str, Any]:
@@ -54,7 +59,9 @@ def _sent(world: World, made: Rollout) -> dict[str, Any]:
     columns = {name: getattr(made, name).cpu() for name in COLUMNS}
     if isinstance(world, ModelWorld) and made.state_UB is not None:
         columns["states"] = world.export(made.state_UB.flatten())
-    return {"observations": made.observation_UB.cpu(), "finished": made.finished, **columns}
+    if made.begins_B is not None:
+        columns |= {"begins": made.begins_B.cpu(), "finished": made.finished}
+    return {"observations": made.observation_UB.cpu(), **columns}
 
 
 def _extended(x_UB: Tensor, length: int) -> Tensor:

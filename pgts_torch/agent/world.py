@@ -19,6 +19,7 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.dynamics import DynamicsModel
 from pgts_torch.models.provenance import draws_its_own
+from pgts_torch.models.replay import Column
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import each_of
@@ -129,12 +130,12 @@ class ModelWorld(World, ABC):
         """Return the observations of numbered states, as a policy takes them."""
 
     @abstractmethod
-    def export(self, state_N: Int[Tensor, "N"]) -> Any:
-        """Return a description of these states that pickles, for `adopt` in another process."""
+    def export(self, state_N: Int[Tensor, "N"]) -> Column:
+        """Return a description of each of these states that pickles, for `adopt` later or in another process."""
 
     @abstractmethod
     def adopt(self, exported: Any) -> Int[Tensor, "N"]:
-        """Return the numbers of states that another process has exported. After `reset_numbers` they are the same in
+        """Return the numbers of states that were exported. After `reset_numbers` they are the same in
         all processes that adopt the same states in the same order."""
 
     @abstractmethod
@@ -224,14 +225,14 @@ class SimulatedWorld(ModelWorld):
         """The observations that the simulator made in these states."""
         return self.observations.encode_part(self.model.observations(state_N))
 
-    def export(self, state_N: Int[Tensor, "N"]) -> tuple[list[Any], Tensor]:
-        """The snapshot and observation of each distinct state, and the index of each state among these."""
+    def export(self, state_N: Int[Tensor, "N"]) -> list[Any]:
+        """The snapshot and observation of each state; those of equal states are one object, which is pickled once."""
         distinct, index_N = state_N.unique(return_inverse=True)
-        return self.model.export(distinct), index_N.cpu()
+        exported = self.model.export(distinct)
+        return [exported[n] for n in index_N.tolist()]
 
-    def adopt(self, exported: tuple[list[Any], Tensor]) -> Int[Tensor, "N"]:
-        snapshots, index_N = exported
-        return self.model.adopt(snapshots).to(self.device)[index_N.to(self.device)]
+    def adopt(self, exported: list[Any]) -> Int[Tensor, "N"]:
+        return self.model.adopt(exported).to(self.device)
 
     def reset_numbers(self) -> None:
         """Drop all snapshots: every search adds some, and few states are met again."""

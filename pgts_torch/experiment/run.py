@@ -58,6 +58,7 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
     with joined_ranks(config.device) as ranks, StopFlag() as stop, ExitStack() as held:
         ranks.first("the run folder", lambda: check_dir(config))
         algorithm = ranks.together("the algorithm", lambda: build(config))
+        algorithm.content()  # what cannot be saved is refused now, not at the first checkpoint
         movement = Movement(copy.deepcopy(algorithm.policy))
         locks: list[RunLock] = []  # of the first process
 

@@ -68,7 +68,7 @@ class EnsembleModel(TensorModel, LearningModel):
         num_actions: A.
         gamma: discount of a step after which the episode goes on.
         options: of networks and fits.
-        capacity: the number of steps that are kept.
+        capacity: the number of steps that are kept; PgtsError unless it is above 32, and memory has room.
         seed: initial weights are from the stream (seed, "model").
         action_repeat: see `TensorModel`.
     """
@@ -89,7 +89,15 @@ class EnsembleModel(TensorModel, LearningModel):
             state_size, num_actions, merge=False, dtype=torch.float64, device=device, action_repeat=action_repeat
         )
         self.gamma, self.options = gamma, options
+        if capacity <= _BLOCK:
+            raise PgtsError(
+                f"capacity is {capacity}; an ensemble keeps more than {_BLOCK} steps, because so many in a row may be "
+                "held out (replay.capacity)"
+            )
         self.replay: ReplayBuffer = ReplayBuffer(capacity)
+        none = torch.zeros(0)
+        vectors, whole, flags = torch.zeros(0, state_size), none.long(), none.bool()
+        self.replay.add(state=vectors, action=whole, reward=none, end=none, next_state=vectors, follows=flags)
         self._warned, self._end_share = False, 0.0
         sizes = [state_size + num_actions, *options.hidden, state_size + 2]
         generator = stream(seed, "model")
@@ -163,7 +171,8 @@ class EnsembleModel(TensorModel, LearningModel):
         if bool(named_N.any()):
             raise PgtsError(
                 f"a step has the discount {float(discount_N[named_N][0])}; an ensemble learns only whether an episode "
-                f"ends, so that discounts must be 0 or gamma, and gamma is {self.gamma}"
+                f"ends, so that discounts must be 0 or gamma, and gamma is {self.gamma}: give the gamma that all steps "
+                "have, if there is one"
             )
         return observation_N.float()
 
@@ -308,7 +317,10 @@ class EnsembleModel(TensorModel, LearningModel):
         """Weights, optimiser, moments and replay."""
         return {
             "weights": [weight.detach().cpu().clone() for weight in self._weights],
-            "optimiser": copy.deepcopy(self._optimiser.state_dict()["state"]),
+            "optimiser": {
+                number: {name: value.cpu().clone() for name, value in each.items()}
+                for number, each in self._optimiser.state_dict()["state"].items()
+            },
             "moments": {name: [value.cpu() for value in pair] for name, pair in self._moments.items()},
             "replay": self.replay.state_dict(),
             "end_share": self._end_share,

@@ -1,5 +1,7 @@
 """A ring of what was seen, from which training samples."""
 
+import os
+import pickle
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -7,17 +9,25 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.errors import MemoryBudgetExceeded, PgtsError, check_count
 
 Column = Tensor | Sequence[Any]
 """One entry for each row: a tensor, or a sequence of other objects, as snapshots."""
+
+
+def _memory() -> int:
+    """The memory of the machine, in bytes; where that is not known, what a process can address."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 2**47
 
 
 @final
 class ReplayBuffer:
     """The last `capacity` rows of some columns, sampled uniformly with replacement (Lin 1992).
 
-    The columns and their types are those of the first rows. Memory for the tensors is taken with them.
+    The columns and their types are those of the first call of `add`, which may add none. Memory is taken then.
 
     num_added: the number of all rows so far.
 
@@ -40,10 +50,14 @@ class ReplayBuffer:
 
         Raises:
             PgtsError: columns of different lengths, or not those of the first rows.
+            MemoryBudgetExceeded: `capacity` rows take more memory than the machine has; nothing is added. That is known
+                with the first rows.
         """
         lengths = {name: len(column) for name, column in columns.items()}
         if len(set(lengths.values())) != 1:
             raise PgtsError(f"the columns have {lengths} rows; they must have the same number")
+        if self.num_added == 0:
+            self._check_memory(columns, next(iter(lengths.values())))
         if not self._columns:
             self._columns = {name: self._room(column) for name, column in columns.items()}
         if columns.keys() != self._columns.keys():
@@ -94,6 +108,20 @@ class ReplayBuffer:
         self.num_added = state["num_added"]
         for name, column in state["columns"].items():
             self._columns[name][:length] = column
+
+    def _check_memory(self, columns: dict[str, Column], count: int) -> None:
+        """MemoryBudgetExceeded if all rows would take more memory than there is; objects take as much as pickled."""
+        needed, most = 0, _memory()
+        for column in columns.values():
+            if isinstance(column, Tensor):
+                needed += self.capacity * column[:0].new_empty(1, *column.shape[1:]).nbytes
+            else:
+                needed += self.capacity * (8 + (len(pickle.dumps(list(column))) // count if count else 0))
+        if needed > most:
+            raise MemoryBudgetExceeded(
+                f"capacity is {self.capacity:,}; so many rows take {needed:,} bytes, and the machine has {most:,}: set "
+                "a smaller one (replay.capacity)"
+            )
 
     def _room(self, column: Column) -> Tensor | list[Any]:
         if isinstance(column, Tensor):

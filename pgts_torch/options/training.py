@@ -207,6 +207,12 @@ class Training(Part):
     @classmethod
     def _goes_on(cls, replay: Any, info: ValidationInfo) -> Any:
         rollout, model = info.data.get("rollout"), info.data.get("model")
+        if isinstance(model, LEARNED) and isinstance(replay, NoReplay):
+            raise conflict(
+                f"replay.type is none; model.type {model.type} learns from what replay keeps: it must be uniform",
+                "model.type",
+                "replay.type",
+            )
         is_none = isinstance(replay, NoReplay) or (isinstance(replay, AutoReplay) and not isinstance(model, LEARNED))
         if rollout is not None and isinstance(rollout.horizon, StepsHorizon) and is_none:
             raise conflict(
