@@ -8,8 +8,8 @@ from torch import Tensor
 
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import COLUMNS, Rollout
-from pgts_torch.agent.world import ModelWorld
-from pgts_torch.errors import MissingModel
+from pgts_torch.agent.world import ModelWorld, SimulatedWorld
+from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.seeding import sample_keys
 
@@ -32,6 +32,7 @@ def imagine(
 
     Raises:
         MissingModel: the model cannot sample outcomes.
+        PgtsError: the policy takes an action that the model does not allow.
     """
     model = world.model
     if not isinstance(model, SamplingModel):
@@ -42,10 +43,18 @@ def imagine(
     while len(rows) < length and bool(alive_B.any()):
         action_B = policy.sample(observations[-1], generator=generator)
         sampled = model.sample(state_B, action_B, key_N=sample_keys(len(state_B), generator=generator))
-        discount_B = sampled.discount_N.double()
-        rows.append((action_B, sampled.reward_N.double(), discount_B, alive_B, weight_B * alive_B, discount_B))
+        reward_B, discount_B = torch.where(alive_B, sampled.reward_N.double(), 0.0), sampled.discount_N.double()
+        if bool((off_B := reward_B == -torch.inf).any()):
+            b = int(off_B.nonzero()[0, 0])
+            raise PgtsError(
+                f"{type(model).__name__} does not allow action {int(action_B[b])} in state {int(state_B[b])}, which "
+                "the policy has taken in an imagined episode; with replay all actions must be allowed"
+            )
+        rows.append((action_B, reward_B, discount_B, alive_B, weight_B * alive_B, discount_B))
         weight_B, alive_B = weight_B * discount_B, alive_B & (discount_B > 0)
         state_B = torch.where(alive_B, sampled.next_state_N, state_B)  # what is over stays where it is
+        if isinstance(world, SimulatedWorld):
+            alive_B = alive_B & ~world.model.is_cut(state_B)
         states.append(state_B)
         observations.append(world.observe(state_B))
     columns: dict[str, Any] = dict(zip(COLUMNS, map(torch.stack, zip(*rows, strict=True)), strict=True))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
@@ -81,6 +81,10 @@ class SnapshotModel(Model):
         """The snapshot behind the number of a state."""
         self._check("state", state, self.num_states)
         return self._snapshots[state]
+
+    def is_cut(self, state_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
+        """Whether the episode was truncated in these states, so that no other step follows."""
+        return torch.tensor([self._snapshots[state].cut for state in state_N.tolist()], device=self.device)
 
     def observations(self, state_N: Int[Tensor, "N"]) -> np.ndarray:
         """What `observe` made of the observation of each state, stacked: [N, ...].

@@ -14,6 +14,7 @@ from pgts_torch.models.base import LearningModel
 from pgts_torch.models.ensemble import EnsembleModel
 from pgts_torch.models.replay import ReplayBuffer
 from pgts_torch.models.tabular import TabularModel
+from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options import MLP, Ensemble, StepsHorizon, UniformReplay
 from pgts_torch.tabular import exact
 from tests.agent.helpers import vector_env
@@ -48,6 +49,14 @@ class Drift(gymnasium.Env):
 
     def set_state(self, state):
         self.position, self.count = state
+
+
+class Truncated(Drift):
+    """Truncates its episodes itself after six steps."""
+
+    def step(self, action):
+        seen, reward, *_ = super().step(action)
+        return seen, reward, False, self.count == 6, {}
 
 
 class NoisyReward(Drift):
@@ -114,6 +123,33 @@ def test_snapshots_are_replayed_and_not_saved(tmp_path):
     )
     with pytest.raises(PgtsError, match=r"replay keeps snapshots of Drift.* cannot be saved"):
         training.save(tmp_path / "model.pt")
+
+
+def test_imagined_episodes_end_where_the_environment_truncates_them():
+    training = PGTS(Truncated, **ONGOING, policy=MLP(hidden=[16])).learn(120)
+    draws = training.ranks.draws(0, 9, training.device)
+    imagined, _ = next(training.dyna.rollouts(draws))
+    assert not training.world.model.is_cut(imagined.state_TB[imagined.alive_TB]).any()
+    last_B = imagined.alive_TB.sum(0)
+    ends = imagined.state_UB[last_B, torch.arange(imagined.num_episodes)]
+    is_cut_B = training.world.model.is_cut(ends)
+    assert is_cut_B.any()
+    assert (is_cut_B | (last_B == REPLAY.length)).all()
+    assert (imagined.discount_TB[imagined.alive_TB] == training.gamma).all()  # truncation is no end
+
+
+class Forbids(TensorModel):
+    def __init__(self):
+        super().__init__(1, 2)
+
+    def step(self, state_ND, action_N):
+        forbidden_N = torch.where(action_N == 1, -torch.inf, 0.0)
+        return forbidden_N, torch.full_like(forbidden_N, 0.9), state_ND
+
+
+def test_imagined_episodes_need_all_actions():
+    with pytest.raises(PgtsError, match="Forbids does not allow action 1 in state"):
+        PGTS(Drift, **ONGOING, model=Forbids()).iterate()
 
 
 def test_a_run_that_could_not_be_saved_does_not_begin(tmp_path):
