@@ -20,6 +20,7 @@ from pgts_torch.options.arguments import checked, described
 from pgts_torch.options.critics import (
     AutoCritic,
     ExactValues,
+    NetworkTDLambda,
     NetworkValues,
     OwnNetwork,
     RolloutValues,
@@ -52,10 +53,13 @@ _UPDATES: _Choices = {
     CMPO: CMPOUpdate,
 }
 
-_ONE_STEP: dict[str, Any] = {"num_epochs": 1, "minibatch_size": 4096, "max_grad_norm": 1.0}
-_SMALL_FITS = {**_ONE_STEP, "polyak": 0.05}
-_SMALL_STEPS = {**_ONE_STEP, "temperature": 1.0, "clip": 1.0}
-"""Options of network critics and updates that suit the many small updates of replay."""
+_PASSES: dict[str, Any] = {"minibatch_size": 256, "max_grad_norm": 1.0}
+_FITS = NetworkValues(
+    **_PASSES, num_epochs=4, learning_rate=2e-3, fresh_targets=False, method=NetworkTDLambda(lambda_=1.0)
+)
+_STEPS = CMPO(**_PASSES, num_epochs=1, temperature=1.0, clip=1.0)
+"""The critic and the update of networks that suit long imagined episodes: returns that are bootstrapped only where an
+episode was cut off, and one pass of short steps of the policy."""
 
 
 def make_device(device: torch.device | str) -> torch.device:
@@ -82,12 +86,12 @@ def chosen(options: Training, world: World) -> Training:
             network = MLP(normalize=True)
         policy = Softmax() if numbered else network
     if isinstance(critic, AutoCritic):
-        fits = NetworkValues(**_SMALL_FITS) if replayed else NetworkValues()
+        fits = _FITS if replayed else NetworkValues()
         critic = fits if isinstance(policy, Network) else TabularValues()
     if isinstance(critic, NetworkValues) and isinstance(critic.network, OwnNetwork) and isinstance(policy, Network):
         critic = critic.model_copy(update={"network": policy})
     if isinstance(update, AutoUpdate):
-        lookahead = CMPO(**_SMALL_STEPS) if replayed else CMPO()
+        lookahead = _STEPS if replayed else CMPO()
         neural = PPO() if isinstance(options.estimator, SampledAdvantages) else lookahead
         mirror = Mirror(step_size=20.0) if replayed else Mirror()
         update = neural if isinstance(policy, Network) else Projected() if isinstance(policy, Simplex) else mirror

@@ -89,6 +89,7 @@ class Dyna:
         earlier iterations have made, and at least one.
         """
         assert self.options.updates_per_step is not None
+        assert self.options.length is not None
         due = int(self.options.updates_per_step * self.replay.num_added) - self.num_updates
         for number in range(max(due, 1)):
             own = draws.update(number)

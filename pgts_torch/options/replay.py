@@ -27,16 +27,17 @@ class UniformReplay(Part):
     capacity: Count = 100_000
     """The number of visits that are kept; the oldest ones are dropped."""
 
-    updates_per_step: Positive | None = null(tables=0.2, vectors=0.5)
+    updates_per_step: Positive | None = null(tables=0.2, vectors=0.05)
     """Updates of critic and policy for each environment step."""
 
-    starts: Count | Literal["all"] | None = null(tables="all", vectors=16)
+    starts: Count | Literal["all"] | None = null(tables="all", vectors=64)
     """Imagined episodes of an update; all: one from each state seen so far, for tables only."""
 
-    length: Count = 16
-    """The largest number of steps of an imagined episode."""
+    length: Count | None = null(tables=16, vectors=128)
+    """The largest number of steps of an imagined episode. Where a critic is bootstrapped after few steps, its errors at
+    steep places of the value add up along the way to the goal."""
 
-    polyak: Share = 0.05
+    polyak: Share = 0.5
     """The step of the slow copy of a network policy toward it after each update. Imagined episodes follow the copy, and
     updates start from it; 1: there is no copy."""
 

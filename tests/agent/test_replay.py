@@ -14,7 +14,7 @@ from pgts_torch.agent.ongoing import OngoingEpisodes
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import TabularModel
-from pgts_torch.options import CMPO, MLP, Counts, Ensemble, NetworkValues, StepsHorizon, UniformReplay
+from pgts_torch.options import CMPO, MLP, Counts, Ensemble, NetworkTDLambda, NetworkValues, StepsHorizon, UniformReplay
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import deep_sea, exact
 from tests.agent.helpers import following, vector_env
@@ -225,6 +225,7 @@ def test_options_that_suit_replay_are_chosen():
     assert isinstance(options.rollout.horizon, StepsHorizon)
     assert (options.rollout.num_envs, options.policy) == (1, MLP(normalize=True))
     assert isinstance(options.critic, NetworkValues)
-    assert (options.critic.network, options.critic.num_epochs) == (options.policy, 1)
+    assert options.critic.network == options.policy
     assert isinstance(options.update, CMPO)
+    assert (options.replay.length, options.critic.method) == (128, NetworkTDLambda(lambda_=1.0))
     assert training.dyna.policy is not training.policy
