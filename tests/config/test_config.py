@@ -215,6 +215,8 @@ def configurations(draw: st.DrawFn) -> Config:
     types["estimator.type"] = "lookahead" if needs_all else types["estimator.type"]
     if types["estimator.type"] == "sampled" and types["critic.type"] in ("exact", "rollout"):
         types["critic.type"] = "network"
+    if types["model.type"] in ("counts", "ensemble") and types["replay.type"] == "none":
+        types["replay.type"] = "auto"  # they learn from what replay keeps
     for option in OPTIONS:
         if option.exists(types):
             words = st.sampled_from(_words(option))
