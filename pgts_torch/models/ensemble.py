@@ -4,15 +4,17 @@ import copy
 import itertools
 import math
 import warnings
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from pgts_torch.errors import NotFinite, PgtsError, check_count
-from pgts_torch.models.base import Experience, LearningModel, Transitions
+from pgts_torch.models.base import Experience, FallibleModel, LearningModel, Transitions
+from pgts_torch.models.prediction import Prediction
 from pgts_torch.models.replay import ReplayBuffer
+from pgts_torch.models.rewards import value_range
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options.models import Ensemble
 from pgts_torch.seeding import stream, uniform
@@ -39,16 +41,8 @@ _ENOUGH_STEPS, _UNEXPLAINED = 2000, 0.5
 """With so many steps and a larger share of the variance of changes unexplained, a warning is given."""
 
 
-class Prediction(NamedTuple):
-    """The predictions of E members for N pairs (state, action); `end_EN` is the probability that the episode ends."""
-
-    next_END: Float[Tensor, "E N D"]
-    reward_EN: Float[Tensor, "E N"]
-    end_EN: Float[Tensor, "E N"]
-
-
 @final
-class EnsembleModel(TensorModel, LearningModel):
+class EnsembleModel(TensorModel, LearningModel, FallibleModel):
     """E networks that learn from steps alone what follows a state, a vector of D numbers, and an action:
 
         change of the state      smooth L1 loss, in standard deviations of changes
@@ -274,6 +268,18 @@ class EnsembleModel(TensorModel, LearningModel):
         reward_N, discount_N, next_ND = self.step(self.states(state_N), action_N)
         goes_on_N = uniform(key_N) * self.gamma < discount_N
         return Transitions(reward_N, self.gamma * goes_on_N.double(), self.number(next_ND))
+
+    def step_error(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"] | None:
+        """An estimate, `Prediction.spread` for the values [l, u] that the rewards seen allow; None with one member,
+        repeated actions or gamma 1."""
+        if self.options.members == 1 or self.action_repeat > 1 or self.gamma == 1:
+            return None
+        action_N = torch.arange(self.num_actions, device=self.device).repeat(len(state_N))
+        said = self.members(self.states(state_N).repeat_interleave(self.num_actions, 0), action_N)
+        rewards = self.replay.rows("reward")
+        low, high = value_range((float(rewards.min()), float(rewards.max())), self.gamma)
+        spread_N = said.spread(self._moments["state"][1], self.gamma * (high - low))
+        return spread_N.double().view(-1, self.num_actions)
 
     @torch.no_grad()
     def _errors(self, held_out: Tensor) -> dict[str, float]:

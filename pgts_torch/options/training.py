@@ -21,7 +21,7 @@ from pgts_torch.options.rollouts import (
     SampledAdvantages,
     StepsHorizon,
 )
-from pgts_torch.options.search import AutoSection, SearchSection
+from pgts_torch.options.search import AutoSection, ExpectimaxSection, SearchSection
 from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient, Update
 
 
@@ -197,9 +197,17 @@ class Training(Part):
     @field_validator("model")
     @classmethod
     def _says_its_error(cls, model: Any, info: ValidationInfo) -> Any:
-        if getattr(info.data.get("search"), "doubt", False) and isinstance(model, Counts) and model.confidence is None:
+        search = info.data.get("search")
+        if not (isinstance(search, ExpectimaxSection) and search.doubt):
+            return model
+        if isinstance(model, Counts) and model.confidence is None:
             raise conflict(
                 "search.doubt is true, which needs model.confidence and model.value_range where counts are learned"
+            )
+        if isinstance(model, Ensemble) and (model.members == 1 or search.action_repeat > 1):
+            raise conflict(
+                f"search.doubt is true, which needs model.members 2 or more and search.action_repeat 1; they are "
+                f"{model.members} and {search.action_repeat}"
             )
         return model
 

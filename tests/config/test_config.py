@@ -240,11 +240,12 @@ def configurations(draw: st.DrawFn) -> Config:
         given["model.strength"] = None
     if types["model.type"] == "counts" and given["model.value_range"] is None:
         given["model.confidence"] = None
-    if given.get("search.max_width") is not None or (types["model.type"], given.get("model.confidence")) == (
-        "counts",
-        None,
-    ):
-        given |= {"search.doubt": False} if "search.doubt" in given else {}
+    silent = {
+        "counts": given.get("model.confidence") is None,
+        "ensemble": given.get("model.members") == 1 or given.get("search.action_repeat", 1) > 1,
+    }
+    if given.get("search.doubt") and (given["search.max_width"] is not None or silent.get(types["model.type"])):
+        given["search.doubt"] = False
     is_learned = types["model.type"] in ("counts", "ensemble")
     if is_learned:
         given["search.stop_at"] = None

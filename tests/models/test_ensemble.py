@@ -6,10 +6,12 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import Experience
 from pgts_torch.models.ensemble import EnsembleModel
+from pgts_torch.models.rewards import value_range
 from pgts_torch.options import Ensemble
 from pgts_torch.search import expectimax
 from pgts_torch.seeding import stream
@@ -72,6 +74,29 @@ def test_an_end_is_sampled_with_its_probability():
     assert set(sampled.discount_N.tolist()) == {0.0, GAMMA}
     again = model.sample(state_N, action_N, key_N=torch.arange(4000))
     assert again.discount_N.equal(sampled.discount_N)
+
+
+def test_members_differ_by_about_as_much_as_they_are_wrong():
+    """For values that are as steep as the estimate allows, in 20 directions."""
+    options, fresh = Ensemble(members=4, hidden=[32], first_updates=800), swing(400, seed=1)
+    model = trained(options=options)
+    rewards, deviation_D = model.replay.rows("reward"), model.replay.rows("state").std(0, correction=0)
+    low, high = value_range((float(rewards.min()), float(rewards.max())), GAMMA)
+    direction_2V = nn.functional.normalize(torch.randn(2, 20, generator=stream(0, "test")), dim=0)
+
+    def v(state_ND: torch.Tensor) -> torch.Tensor:
+        return low + (high - low) * (0.5 + state_ND.float() / deviation_D @ direction_2V / 2**0.5).clamp(0, 1).double()
+
+    reward_N, discount_N, next_ND = model.step(fresh.observation_N.float(), fresh.action_N)
+    said_NV = reward_N[:, None] + discount_N[:, None] * v(next_ND)
+    off_NV = (said_NV - fresh.reward_N[:, None] - fresh.discount_N[:, None] * v(fresh.next_observation_N)).abs()
+    error_N1 = model.step_error(model.number(fresh.observation_N.float())).gather(1, fresh.action_N[:, None])
+    assert float((off_NV <= error_N1).double().mean()) > 0.85
+    assert float((off_NV <= error_N1 / 10).double().mean()) < 0.7  # less would not do
+    near, far = (model.step_error(model.number(torch.tensor([[x, -x], [x, x]]))).mean() for x in (0.2, 8.0))
+    assert far > 10 * near
+    alone = trained(100, options=Ensemble(members=1, hidden=[8], first_updates=1))
+    assert alone.step_error(alone.number(torch.zeros(1, 2))) is None
 
 
 def test_a_lookahead_in_it_is_that_of_its_means():

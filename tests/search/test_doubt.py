@@ -219,11 +219,14 @@ def test_counts_that_state_no_confidence_say_nothing_of_their_error():
     assert stated.plain().step_error(all_states(mdp)).le(stated.step_error(all_states(mdp))).all()
 
 
+FEW = {"type": "uniform", "updates_per_step": 0.001, "starts": 4, "length": 8}
+
+
 def test_a_training_logs_its_doubt_where_it_is_asked_for():
     def doubts(**search: bool) -> list[float | None]:
         counts = Counts(value_range=[0.0, 2.0], confidence=0.9)
         search = {"type": "expectimax", **search}
-        agent = PGTS("pgts/Ladder-v0", model=counts, replay="none", depth=2, search=search, num_envs=1)
+        agent = PGTS("pgts/Ladder-v0", model=counts, replay=FEW, depth=2, search=search)
         return [metrics(agent, agent.iterate()).get("search/doubt") for _ in range(2)]
 
     assert doubts() == [None, None]
@@ -261,5 +264,7 @@ def test_a_doubt_that_cannot_be_had_is_refused():
         Counts(confidence=0.9)
     with pytest.raises(PgtsError, match=r"needs model\.confidence"):
         PGTS("FrozenLake-v1", model="counts", search={"type": "expectimax", "doubt": True})
+    with pytest.raises(PgtsError, match=r"model\.members 2 or more and action_repeat 1; they are 3 and 4"):
+        PGTS("CartPole-v1", model="ensemble", action_repeat=4, search={"type": "expectimax", "doubt": True})
     with pytest.raises(PgtsError, match=r"from a value in value_range, which is \[0\.0, 0\.1\], such a step leads out"):
         counted(random_mdp(4, 2), Counts(value_range=[0.0, 0.1], confidence=0.9), 3, 0)

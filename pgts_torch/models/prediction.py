@@ -1,0 +1,27 @@
+"""What the members of an ensemble predict, and by how much they differ."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+class Prediction(NamedTuple):
+    """The predictions of E members for N pairs (state, action); `end_EN` is the probability that the episode ends."""
+
+    next_END: Float[Tensor, "E N D"]
+    reward_EN: Float[Tensor, "E N"]
+    end_EN: Float[Tensor, "E N"]
+
+    def spread(self, deviation_D: Float[Tensor, "D"], width: float) -> Float[Tensor, "N"]:
+        """An estimate of the error of r + gamma (1 - p) v(s'), with |x| the largest x of a member less the smallest:
+
+            |r| + width min(1, |p| + root mean square of |s'| / deviation)
+
+        for values v whose range times gamma has this width, and which change by no more over one deviation of states. A
+        number of the state that has never changed, of deviation 0, does not count.
+        """
+        next_ND, reward_N, end_N = (x.amax(0) - x.amin(0) for x in self)
+        moved_ND = torch.where(deviation_D > 0, next_ND / deviation_D, 0.0)
+        return reward_N + width * (end_N + moved_ND.square().mean(-1).sqrt()).clamp(max=1)
