@@ -29,6 +29,7 @@ def benchmark(
     run: Callable[[Key], Record],
     describe: Callable[[list[Record]], str],
     draw: Callable[[list[Record]], Figure],
+    applies: Callable[[Key], bool] = lambda key: True,
 ) -> None:
     """A command line that makes the runs of some methods on some problems with some seeds, and prints what they say.
 
@@ -36,6 +37,7 @@ def benchmark(
         doc: what `--help` says first.
         problem, problems: what a problem is called, as `size`, and which there are.
         runs: where the runs are kept by default.
+        applies: whether there is such a run.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
@@ -59,6 +61,7 @@ def benchmark(
         for seed in range(given.seeds)
         for method in chosen(given.methods, methods)
         for each in chosen(given.problems, problems)
+        if applies({"method": method, problem: each})
     ]
     records = measure(keys, run, path=given.runs, jobs=given.jobs)
     if given.json:

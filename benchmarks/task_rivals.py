@@ -82,12 +82,25 @@ EXPLORATION_STEPS = {"CartPole-v1": 8_000, "Acrobot-v1": 12_000, "MountainCar-v0
 
 
 def train(
-    method: str, env_id: str, episodes: int, *, seed: int, gamma: float, budget: int, watch: Callable[..., bool]
+    method: str,
+    env_id: str,
+    episodes: int,
+    *,
+    seed: int,
+    gamma: float,
+    budget: int,
+    watch: Callable[..., bool],
+    judge: Callable[[Any], float] | None = None,
+    env_kwargs: dict[str, Any] | None = None,
 ) -> None:
-    """One training, watched by evaluations of so many episodes."""
+    """One training, watched by evaluations of so many episodes.
+
+    Args:
+        judge: the score of a model of stable-baselines3, instead of the mean return of episodes.
+    """
     num_envs = 1 if method == "dqn" else NUM_ENVS.get(env_id, 8)
-    env = _envs(env_id, num_envs, "train", seed)
-    fresh = _envs(env_id, min(50, episodes), "eval", seed + 1000)
+    env = _envs(env_id, num_envs, "train", seed, env_kwargs)
+    fresh = _envs(env_id, min(50, episodes), "eval", seed + 1000, env_kwargs)
     untuned = {"n_steps": 256, "batch_size": 256} if method == "ppo" else {}
     options = {"gamma": gamma} | TUNED.get((method, env_id), untuned)
     if method == "dqn" and env_id in EXPLORATION_STEPS:
@@ -98,6 +111,8 @@ def train(
     model = ALGORITHMS[method]("MlpPolicy", env, seed=seed, device="cpu", **options)
 
     def score() -> float:
+        if judge is not None:
+            return judge(model)
         sync_envs_normalization(env, fresh)
         return float(evaluate_policy(model, fresh, episodes, deterministic=True, warn=False)[0])
 
@@ -108,10 +123,10 @@ def train(
     model.learn(budget, callback=Watched())
 
 
-def _envs(env_id: str, count: int, use: str, seed: int) -> VecEnv:
+def _envs(env_id: str, count: int, use: str, seed: int, kwargs: dict[str, Any] | None) -> VecEnv:
     def make() -> gymnasium.Env:
         limit = gymnasium.spec(env_id).max_episode_steps or UNLIMITED[use]
-        env = gymnasium.make(env_id, max_episode_steps=limit)
+        env = gymnasium.make(env_id, max_episode_steps=limit, **(kwargs or {}))
         if env_id.startswith("MiniGrid-"):
             from minigrid.wrappers import ImgObsWrapper
 

@@ -11,7 +11,7 @@ are CPU seconds without the evaluations.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from records import Key, Record, benchmark
 
+from pgts_torch import PGTS
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.config import load
 from pgts_torch.experiment import run as experiment
@@ -26,17 +27,19 @@ from pgts_torch.experiment.sweep import bootstrap_interval, interquartile_mean
 
 ROOT = Path(__file__).resolve().parent.parent
 RUNS = Path("runs/learning/tasks.jsonl")
-METHODS = ("pgts", "ppo", "a2c", "dqn")
+METHODS = {"pgts": "PGTS", "ppo": "PPO", "a2c": "A2C", "dqn": "DQN"}
 FIRST_LOOK, GROWTH, IN_A_ROW = 500, 1.25, 3
 
 
 @dataclass(frozen=True)
 class Task:
-    """A configuration, the return that is to be reached, the budget of environment steps, episodes of an evaluation."""
+    """The return that is to be reached, the budget of environment steps, episodes of an evaluation, and the environment
+    steps before the first one."""
 
     reach: float
     budget: int
     episodes: int
+    first_look: int = FIRST_LOOK
 
 
 TASKS = {
@@ -57,7 +60,7 @@ class Watch:
         self.task = task
         self.curve: list[tuple[int, float]] = []
         self.reached: dict[str, float] | None = None
-        self._next, self._row = float(FIRST_LOOK), list[dict[str, float]]()
+        self._next, self._row = float(task.first_look), list[dict[str, float]]()
         self._started, self._evaluating = time.process_time(), 0.0
 
     def __call__(self, env_steps: int, model_calls: int, evaluate: Callable[[], float]) -> bool:
@@ -89,27 +92,32 @@ def run(key: Key) -> Record:
     task = TASKS[key["task"]]
     config = load(str(ROOT / "configs" / f"{key['task']}.yaml"), ["--seed", str(key["seed"])])
     if key["method"] == "pgts":
-        model, watch = experiment.build(config), Watch(task)
-        model.learn(
-            task.budget,
-            callback=lambda model, _: watch(
-                model.num_env_steps,
-                model.num_model_calls,
-                lambda: (
-                    evaluate(model, episodes=task.episodes, deterministic=True, seed=key["seed"]).episodic_return.mean
-                ),
-            ),
-        )
-        return watch.record()
-    from task_rivals import train
+        return train(experiment.build(config), task, lambda model: mean_return(model, task, key["seed"]))
+    import task_rivals
 
     watch, gamma = Watch(task), config.env.gamma
     assert gamma is not None, "these configurations say it"
-    train(key["method"], config.env.id, task.episodes, seed=key["seed"], gamma=gamma, watch=watch, budget=task.budget)
+    options = {"seed": key["seed"], "gamma": gamma, "watch": watch, "budget": task.budget}
+    task_rivals.train(key["method"], config.env.id, task.episodes, **options)
     return watch.record()
 
 
-def row(task: str, method: str, records: list[Record]) -> str:
+def train(model: PGTS, task: Task, score: Callable[[PGTS], float]) -> Record:
+    """A training that is evaluated by `score` now and then."""
+    watch = Watch(task)
+    model.learn(
+        task.budget,
+        callback=lambda model, _: watch(model.num_env_steps, model.num_model_calls, lambda: score(model)),
+    )
+    return watch.record()
+
+
+def mean_return(model: PGTS, task: Task, seed: int) -> float:
+    """Of greedy episodes."""
+    return evaluate(model, episodes=task.episodes, deterministic=True, seed=seed).episodic_return.mean
+
+
+def row(task: str, reach: float, method: str, records: list[Record]) -> str:
     """A row of the table: how many seeds reached the return, after how much, and where all of them ended."""
 
     def interval(values: list[float], form: str) -> str:
@@ -127,38 +135,48 @@ def row(task: str, method: str, records: list[Record]) -> str:
         for value, digits in zip(median.values(), (0, 0, 1), strict=True)
     )
     return (
-        f"| {task} | {TASKS[task].reach:g} | {method.upper()} | {len(reached)} of {len(records)} | {steps} | {calls} "
+        f"| {task} | {reach:.4g} | {method} | {len(reached)} of {len(records)} | {steps} | {calls} "
         f"| {seconds} | {interval([r['last'] for r in records], '.4g')} |"
     )
 
 
-def table(records: list[Record]) -> str:
-    """In Markdown."""
+def table(records: list[Record], tasks: Mapping[str, Task] = TASKS, methods: Mapping[str, str] = METHODS) -> str:
+    """In Markdown.
+
+    Args:
+        methods: what each is called.
+    """
     lines = [
         "| task | return | method | seeds that reached it | env steps | model calls | CPU s | return at the end |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for task in TASKS:
-        for method in METHODS:
+    for task in tasks:
+        for method, name in methods.items():
             mine = [r for r in records if r["task"] == task and r["method"] == method]
-            lines += [row(task, method, mine)] if mine else []
+            lines += [row(task, tasks[task].reach, name, mine)] if mine else []
     return "\n".join(lines)
 
 
-def picture(records: list[Record]) -> Figure:
-    """The return of greedy episodes against environment steps, for each task; a line is a median over seeds."""
+def picture(records: list[Record], *, shape: tuple[int, int] = (2, 4), methods: Mapping[str, str] = METHODS) -> Figure:
+    """The return of greedy episodes against environment steps, for each task; a line is a median over seeds.
+
+    Args:
+        shape: rows and columns of panels.
+        methods: what each is called.
+    """
+    rows, columns = shape
     tasks = [task for task in TASKS if any(r["task"] == task for r in records)]
-    figure = Figure(figsize=(12, 5.4), layout="constrained")
-    panels = figure.subplots(2, 4).flatten()
+    figure = Figure(figsize=(3 * columns, 2.7 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns).flatten()
     for axes, task in zip(panels, tasks, strict=False):
-        for method in METHODS:
+        for method, name in methods.items():
             mine = [r for r in records if r["task"] == task and r["method"] == method]
             if not mine:
                 continue
             x = np.geomspace(FIRST_LOOK, TASKS[task].budget, 100)
             # A run that has ended early stays where it was.
             y = [np.interp(x, *np.array(r["curve"], dtype=float).T) for r in mine]
-            axes.plot(x, np.median(y, axis=0), label=method.upper())
+            axes.plot(x, np.median(y, axis=0), label=name)
         axes.axhline(TASKS[task].reach, color="k", linestyle=":", linewidth=1)
         axes.set(title=task, xscale="log")
         if axes.get_ylim()[0] < -1000:  # whoever never falls off the cliff and never arrives
@@ -172,7 +190,7 @@ def picture(records: list[Record]) -> Figure:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    benchmark(__doc__, arguments, "task", tuple(TASKS), METHODS, RUNS, run, table, picture)
+    benchmark(__doc__, arguments, "task", tuple(TASKS), tuple(METHODS), RUNS, run, table, picture)
 
 
 if __name__ == "__main__":
