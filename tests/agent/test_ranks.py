@@ -15,9 +15,10 @@ from torch import distributed
 from pgts_torch import PGTS
 from pgts_torch.agent import callbacks, visit
 from pgts_torch.agent.callbacks import EvalCallback
-from pgts_torch.agent.ranks import Ranks, checksum, joined_ranks, present_ranks
+from pgts_torch.agent.ranks import Draws, Ranks, checksum, joined_ranks, present_ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import NotFinite, PgtsError, RankLost
+from pgts_torch.seeding import stream
 from tests.forks import launched, on_ranks
 from tests.models.corridors import Corridor
 
@@ -37,6 +38,7 @@ class Counted(Corridor):
 
 SMALL = {"policy": {"type": "mlp", "hidden": [8]}, "horizon": {"type": "fixed", "length": 12}}
 GRADIENT = {"type": "gradient", "learning_rate": 0.01}
+FEW = {"type": "uniform", "updates_per_step": 0.1, "starts": 4, "length": 5}
 KINDS: dict[str, Callable[..., PGTS]] = {
     "softmax table": partial(PGTS, "pgts/Ladder-v0", depth=3),
     "projected table, adaptive depth": partial(
@@ -46,6 +48,18 @@ KINDS: dict[str, Callable[..., PGTS]] = {
     "geometric horizon": partial(PGTS, "pgts/Ladder-v0", depth=2, horizon="geometric"),
     "network, torch dynamics": partial(PGTS, "CartPole-v1", depth=1, update=GRADIENT, **SMALL),
     "network, simulator": partial(PGTS, Counted, depth=1, update=GRADIENT, **SMALL),
+    "network, learned model": partial(
+        PGTS,
+        "CartPole-v1",
+        depth=1,
+        model={"type": "ensemble", "members": 2, "hidden": [8], "first_updates": 5},
+        policy=SMALL["policy"],
+        horizon={"type": "steps", "length": 5, "first": 9},
+        replay=FEW,
+    ),
+    "learned table": partial(
+        PGTS, "FrozenLake-v1", depth=8, model="counts", horizon={"type": "steps", "length": 20}, replay=FEW
+    ),
     "network, no model": partial(PGTS, "CartPole-v1", depth=0, estimator="sampled", update=GRADIENT, **SMALL),
 }
 
@@ -60,7 +74,10 @@ def tensors(state: Any) -> list[torch.Tensor]:
 def plain(experience: Rollout, model: PGTS) -> dict[str, Any]:
     """Episodes without their numbers of states: what stands for a state is what another process is told of it."""
     columns = {each.name: getattr(experience, each.name) for each in fields(experience) if each.name != "state_UB"}
-    states = None if experience.state_UB is None else model.world.export(experience.state_UB.flatten())
+    if model.dyna is not None:  # the states of a learned model are what is observed
+        states = experience.observation_UB.flatten(0, 1)
+    else:
+        states = None if experience.state_UB is None else model.world.export(experience.state_UB.flatten())
     return {"columns": columns, "states": states}
 
 
@@ -74,8 +91,14 @@ def trained(make: Callable[..., PGTS], *, num_envs: int, iterations: int = 3) ->
         "seen": seen,
         "policy": model.policy.state_dict(),
         "critic": model.critic.state_dict(),
+        "dyna": learned(model),
         "counts": counts(model),
     }
+
+
+def learned(model: PGTS) -> dict[str, Any]:
+    """A learned model, and what is replayed."""
+    return {} if model.dyna is None else model.dyna.state_dict()
 
 
 def counts(model: PGTS) -> tuple[int, int, int]:
@@ -91,6 +114,13 @@ def replayed(
     states, so they bound what is missing less tightly, and the gap falls short of it more often.
     """
     model, chooser = make(num_envs=4, seed=3), make(num_envs=4, seed=3)
+    alone = Ranks.draws
+
+    def draws(self: Ranks, seed: int, number: int, device: torch.device) -> Draws:
+        """With the random numbers that several ranks have in common."""
+        common = stream(seed, "iteration", number, "common", device=device)
+        return replace(alone(self, seed, number, device), common=common)
+
     for each in seen:
 
         def given(world: Any, *rest: Any, each=each, **options: Any) -> Rollout:
@@ -99,6 +129,9 @@ def replayed(
             return Rollout(**columns, state_UB=state_UB)
 
         monkeypatch.setattr(visit, "rollout", given)
+        if model.episodes is not None:
+            monkeypatch.setattr(model.episodes, "collect", partial(given, model.world))
+        monkeypatch.setattr(Ranks, "draws", draws)
         if chooser.depth_choice is not None and len(chooser.depth_choice.depths) > 1:
             chooser.load_state_dict(model.state_dict())
             assert chooser.iterate().depth <= each["depth"]
@@ -121,11 +154,12 @@ def test_ranks_make_the_update_of_one_process_with_the_whole_batch(kind, size, m
         assert checksum(other["policy"]) == checksum(first["policy"])
         assert other["counts"] == first["counts"]
     widths = [each["experience"]["columns"]["reward_TB"].shape[1] for each in first["seen"]]
-    assert widths == [4] * len(widths)
+    assert "learned" in kind or widths == [4] * len(widths)  # episodes that go on have a column for each part
     alone = replayed(make, first["seen"], monkeypatch, within)
     assert counts(alone)[:2] == first["counts"][:2]
-    for part in ("policy", "critic"):
-        for mine, theirs in zip(tensors(getattr(alone, part).state_dict()), tensors(first[part]), strict=True):
+    parts = {"policy": alone.policy.state_dict(), "critic": alone.critic.state_dict(), "dyna": learned(alone)}
+    for part, state in parts.items():
+        for mine, theirs in zip(tensors(state), tensors(first[part]), strict=True):
             torch.testing.assert_close(mine, theirs, rtol=within["rel"], atol=within["abs"])
     start = make(num_envs=4, seed=3)
     assert checksum(start.policy.state_dict()) != checksum(first["policy"])

@@ -2,4 +2,6 @@
 
 from pathlib import Path
 
-SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+CONFIGS = Path(__file__).parents[2] / "configs"
+SHIPPED = {"_".join(path.relative_to(CONFIGS).with_suffix("").parts): path for path in sorted(CONFIGS.rglob("*.yaml"))}
+"""By name: that of the file, after that of its folder."""

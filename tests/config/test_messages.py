@@ -334,7 +334,7 @@ def test_damaged_files_give_a_configuration_or_clear_lines_in_less_than_a_second
     count: int, tmp_path: Path
 ) -> None:
     generator = random.Random(0)
-    texts = [path.read_text().partition("\n")[2] for path in SHIPPED] + [dump(Config())]
+    texts = [path.read_text().partition("\n")[2] for path in SHIPPED.values()] + [dump(Config())]
     outcome = {"valid": 0, "refused": 0}
     slowest = 0.0
     for n in range(count):

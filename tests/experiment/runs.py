@@ -1,6 +1,5 @@
 """A small run of the command line, what it leaves, and signals to it while it trains."""
 
-import io
 import json
 import os
 from pathlib import Path
@@ -52,11 +51,13 @@ def train_with_signals(folder: Path, *numbers: int, rank: int = 0) -> int:
     return main(arguments(folder))
 
 
-def dumped(content: Any) -> bytes:
-    """Every bit of what a checkpoint holds beside its notes."""
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    return buffer.getvalue()
+def dumped(content: Any) -> Any:
+    """Every bit of what a checkpoint holds beside its notes, whichever of its objects are the same one."""
+    if isinstance(content, torch.Tensor):
+        return content.dtype, content.shape, content.contiguous().numpy().tobytes()
+    if isinstance(content, dict):
+        return {name: dumped(value) for name, value in content.items()}
+    return [dumped(value) for value in content] if isinstance(content, list | tuple) else repr(content)
 
 
 def left(folder: Path) -> dict[str, Any]:

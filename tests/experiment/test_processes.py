@@ -23,10 +23,24 @@ pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 ROOT = Path(__file__).parents[2]
 
 
-def training(folder: Path, *, kill_at: int = -1, counted: Path | None = None) -> int:
+LEARNED = [
+    *(
+        "--config",
+        str(ROOT / "configs" / "learned" / "cartpole.yaml"),
+        "--rollout.horizon",
+        "{type: steps, first: 12, length: 8}",
+    ),
+    *("--model.first_updates", "5", "--model.hidden", "[8]"),
+    *("--replay", "{type: uniform, updates_per_step: 0.1, starts: 4, length: 5}"),
+]
+"""The shipped configuration of a learned model, with less to compute."""
+
+
+def training(folder: Path, *more: str, kill_at: int = -1, counted: Path | None = None) -> int:
     """Train in a process of its own; its exit code.
 
     Args:
+        more: further arguments.
         kill_at: the call of a function, counted from the start, at which it is killed.
         counted: where it writes down how many there were.
     """
@@ -40,7 +54,7 @@ def training(folder: Path, *, kill_at: int = -1, counted: Path | None = None) ->
 
     def work() -> int:
         sys.setprofile(count if kill_at > 0 or counted is not None else None)
-        code = main(arguments(folder))
+        code = main(arguments(folder, *more))
         sys.setprofile(None)
         if counted is not None:
             counted.write_text(str(calls))
@@ -79,6 +93,17 @@ def test_after_kills_at_random_moments_every_byte_is_that_of_an_uninterrupted_ru
     assert left(folder) == expected
     if kills >= 25:
         reliability.record("kills at random moments of training", kills=killed, runs=compared, runs_with_another_bit=0)
+
+
+@pytest.mark.fault("kill at any moment")
+def test_after_kills_a_learned_model_its_replay_and_its_episodes_are_those_of_an_uninterrupted_run(tmp_path):
+    assert training(tmp_path / "whole", *LEARNED, counted=tmp_path / "calls") == 0
+    calls, folder = int((tmp_path / "calls").read_text()), tmp_path / "killed"
+    for kill_at in (calls // 2, calls // 4):
+        assert training(folder, *LEARNED, kill_at=kill_at) == -signal.SIGKILL
+    assert 0 < checkpoint.newest(folder, strict=True)[1].env_steps < 100
+    assert training(folder, *LEARNED) == 0
+    assert left(folder) == left(tmp_path / "whole")
 
 
 @pytest.mark.fault("kill while a checkpoint is written")
