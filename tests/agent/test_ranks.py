@@ -58,7 +58,7 @@ KINDS: dict[str, Callable[..., PGTS]] = {
         replay=FEW,
     ),
     "learned table": partial(
-        PGTS, "FrozenLake-v1", depth=8, model="counts", horizon={"type": "steps", "length": 20}, replay=FEW
+        PGTS, "CliffWalking-v1", depth=8, model="counts", horizon={"type": "steps", "length": 20}, replay=FEW
     ),
     "network, no model": partial(PGTS, "CartPole-v1", depth=0, estimator="sampled", update=GRADIENT, **SMALL),
 }
