@@ -33,7 +33,7 @@ from tasks import ROOT, Task, Watch, mean_return
 
 from pgts_torch.config import Config, load
 from pgts_torch.experiment import run as experiment
-from pgts_torch.options import Counts
+from pgts_torch.options import Counts, FixedHorizon
 from pgts_torch.tabular import TabularMDP, exact
 
 RUNS = Path("runs/learning/learned.jsonl")
@@ -62,7 +62,8 @@ TABLES = {
 """Environment steps at most."""
 WITH_REPLAY = 30_000
 """Environment steps at most of methods that learn from replay, where one step takes milliseconds."""
-Q_LEARNING = {"step_size": 0.1, "epsilon": 0.1}
+STEP_SIZE, EPSILON = 0.1, 0.1
+"""Of Q-learning."""
 
 
 def applies(key: Key) -> bool:
@@ -148,10 +149,11 @@ def _learn_table(name: str, method: str, config: Config, watch: Callable[..., bo
     learn = {
         "r-max": partial(planned, options=Counts(optimism="rmax")),
         "psrl": partial(planned, options=Counts(optimism="posterior")),
-        "q-learning": partial(q_learning, **Q_LEARNING, initial=optimum(name)[1]),
+        "q-learning": partial(q_learning, step_size=STEP_SIZE, epsilon=EPSILON, initial=optimum(name)[1]),
     }[method]
-    limit = config.rollout.horizon.limit
-    learn(env, watch, gamma=config.env.gamma, budget=TABLES[name], horizon=limit, seed=config.seed)
+    horizon = config.rollout.horizon
+    assert isinstance(horizon, FixedHorizon), "these configurations say it"
+    learn(env, watch, gamma=config.env.gamma, budget=TABLES[name], horizon=horizon.length, seed=config.seed)
 
 
 def table(records: list[Record]) -> str:
