@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +35,12 @@ def arguments(folder: Path, *more: str) -> list[str]:
     return ["train", *SMALL, *SHORT, *OFTEN, "--run.dir", str(folder), *more]
 
 
-def train_with_signals(folder: Path, *numbers: int, rank: int = 0) -> int:
+def train_with_signals(folder: Path, *numbers: int, rank: int = 0, more: Sequence[str] = ()) -> int:
     """Train, and get these signals in the third iteration; the exit code. Only for a process that ends after it.
 
     Args:
         rank: the one of several processes that gets them.
+        more: further arguments.
     """
     iterate = PGTS.iterate
 
@@ -48,7 +50,7 @@ def train_with_signals(folder: Path, *numbers: int, rank: int = 0) -> int:
         return iterate(self)
 
     PGTS.iterate = iterate_with_signals  # type: ignore[method-assign]
-    return main(arguments(folder))
+    return main(arguments(folder, *more))
 
 
 def dumped(content: Any) -> Any:
