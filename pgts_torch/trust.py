@@ -10,21 +10,23 @@ _NAMES_MODULE = re.compile(r"\s*([^\W\d]\w*(?:\.[^\W\d]\w*)*)\s*:\s*[^\W\d]")
 """MODULE:ID, as in ids of Gymnasium and entry points; it does not match a URL or a time."""
 
 
-def check_imports(source: object, env: Any, kwargs: Any) -> None:
-    """Refuse a saved environment whose id or arguments name a module to import.
+def check_imports(source: object, env: Any, kwargs: Any, model: Any = None) -> None:
+    """Refuse a saved environment or model whose options name a module to import.
 
     Args:
         source: the file, as named in errors.
         env, kwargs: the id and the arguments of the environment.
+        model: the options of its model.
 
     Raises:
         PgtsError: a string in them names a module.
     """
-    for text in _texts([env, kwargs]):
+    named = [("environment", each) for each in _texts([env, kwargs])] + [("model", each) for each in _texts(model)]
+    for what, text in named:
         is_id = text is env and ":" in text
         if is_id or _NAMES_MODULE.match(text):
             raise PgtsError(
-                f"{source} names {text!r} as its environment; that imports the module {text.rpartition(':')[0]}, which "
+                f"{source} names {text!r} as its {what}; that imports the module {text.rpartition(':')[0]}, which "
                 "may do anything: if you trust the file, say so by trust_imports=True, or --trust-imports"
             )
 

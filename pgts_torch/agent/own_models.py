@@ -3,6 +3,7 @@
 Their states are what is observed: numbers, or vectors.
 """
 
+import importlib
 from typing import Any, final
 
 import torch
@@ -12,14 +13,14 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from pgts_torch.agent.world import ModelWorld, TabularWorld, World
-from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.errors import MissingModel, PgtsError, failure
 from pgts_torch.models.base import Model
 from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.ensemble import EnsembleModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.tensor import TensorModel
-from pgts_torch.options.models import Counts, Ensemble
+from pgts_torch.options.models import Counts, Ensemble, OwnModel
 
 
 @final
@@ -111,6 +112,23 @@ def learned_world(
         action_repeat=action_repeat,
     )
     return VectorWorld(env, model, gamma=gamma, observation_key=observation_key, device=device)
+
+
+def own_model(options: OwnModel) -> Model:
+    """Return the model that a class or function of the caller's own makes.
+
+    Raises:
+        PgtsError: its module cannot be imported, or has no such name, or what it makes is no model.
+    """
+    assert options.make is not None
+    module, _, name = options.make.partition(":")
+    try:
+        made = getattr(importlib.import_module(module), name)()
+    except BaseException as error:
+        raise failure(f"model.make is {options.make}, which cannot be made", error) from error
+    if not isinstance(made, Model):
+        raise PgtsError(f"model.make is {options.make}, which made {made!r}; it must be a pgts_torch.models.Model")
+    return made
 
 
 def world_of(

@@ -18,7 +18,7 @@ from pgts_torch.agent.explorer import Explorer
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.model_check import ModelCheck
 from pgts_torch.agent.ongoing import OngoingEpisodes
-from pgts_torch.agent.own_models import learned_world, world_of
+from pgts_torch.agent.own_models import learned_world, own_model, world_of
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.ranks import Ranks
@@ -30,7 +30,7 @@ from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.options.arguments import read
-from pgts_torch.options.models import LEARNED
+from pgts_torch.options.models import LEARNED, OwnModel
 from pgts_torch.options.replay import UniformReplay
 from pgts_torch.options.rollouts import SampledAdvantages, StepsHorizon
 from pgts_torch.options.training import Training
@@ -180,6 +180,8 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
     other = None
     if isinstance(model, Model):
         other = partial(_with_model, model, shared)
+    elif isinstance(options.model, OwnModel):
+        other = partial(_with_model, own_model(options.model), shared)
     elif isinstance(options.model, LEARNED):
         other = partial(_with_learned, options, shared, arguments["seed"])
     with SharedGenerators(arguments["seed"], "construction"):

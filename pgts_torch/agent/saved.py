@@ -138,7 +138,7 @@ def load_training(
             else f"env is {env!r}; {path} has its own, {saved_env}"
         )
     if not trust_imports:
-        check_imports(path, saved_env, arguments.get("env_kwargs"))
+        check_imports(path, saved_env, arguments.get("env_kwargs"), arguments.get("model"))
     arguments |= {"env": saved_env if env is None else env} | ({} if device is None else {"device": str(device)})
     arguments |= {"num_envs": None} if isinstance(env, VectorEnv) else {}
     try:

@@ -75,7 +75,8 @@ def train(arguments: Arguments) -> None:
     if fixed.resume is not None and not fixed.trust_imports:
         typed = {override.removeprefix("--").partition("=")[0] for override in overrides}
         saved_id = None if typed & {"env", "env.id"} else config.env.id
-        check_imports(fixed.resume / "config.yaml", saved_id, config.env.kwargs)
+        saved_model = None if typed & {"model", "model.make"} else config.model.plain()
+        check_imports(fixed.resume / "config.yaml", saved_id, config.env.kwargs, saved_model)
     if fixed.config is None and fixed.resume is None and rank() == 0:
         print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
     from pgts_torch.experiment import run
@@ -238,7 +239,7 @@ def _add_trust(parser: Parser, when: str = "") -> None:
     parser.add_argument(
         "--trust-imports",
         action="store_true",
-        help=f"{when}import the module that the saved id of the environment names, as MODULE:ID (see SECURITY.md)",
+        help=f"{when}import the modules that the saved environment and model name, as MODULE:ID (see SECURITY.md)",
     )
 
 

@@ -25,6 +25,7 @@ from pgts_torch.experiment.ownership import (
     read_mark,
 )
 from pgts_torch.experiment.tracking import GrowingDigest, versions
+from pgts_torch.options.models import OwnModel
 
 FREE_SECTIONS = ("run", "log")
 FREE_KEYS = ("name", "eval.every", "eval.episodes", "eval.keep_best")
@@ -114,9 +115,14 @@ def find(
     return Start(path, notes, content["state"], bool(events) and not lost_events, bool(lost_best))
 
 
-def resuming(run: str | Path, world_size: int, env_id: str) -> str:
-    """The command that resumes a run in this environment with the same number of processes."""
-    trust = " --trust-imports" if ":" in env_id else ""
+def names_modules(config: Config) -> bool:
+    """Whether a configuration names modules that are imported."""
+    return ":" in config.env.id or isinstance(config.model, OwnModel)
+
+
+def resuming(run: str | Path, world_size: int, *, imports: bool) -> str:
+    """The command that resumes a run with the same number of processes; `imports`: if it imports modules."""
+    trust = " --trust-imports" if imports else ""
     command = "pgts train" if world_size == 1 else f"torchrun --nproc-per-node={world_size} train.py"
     return f"{command} --resume {shlex.quote(str(run))}{trust}"
 

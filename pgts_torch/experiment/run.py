@@ -17,7 +17,7 @@ from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.opening import check_dir, claimed, opened
 from pgts_torch.experiment.ownership import FAILURE_FILE, SUMMARY_FILE
 from pgts_torch.experiment.recorder import Recorder
-from pgts_torch.experiment.resume import Start, find, resuming
+from pgts_torch.experiment.resume import Start, find, names_modules, resuming
 from pgts_torch.experiment.signals import StopFlag
 from pgts_torch.experiment.summary import Summary
 from pgts_torch.experiment.tracking import event_writer
@@ -115,7 +115,7 @@ def _loop(config: Config, algorithm: PGTS, recorder: Recorder) -> Summary:
     recorder.save()
     if not recorder.finished:
         signals = algorithm.ranks.gather("signals", lambda: recorder.stop.signal)
-        again = resuming(recorder.path, algorithm.ranks.size, config.env.id)
+        again = resuming(recorder.path, algorithm.ranks.size, imports=names_modules(config))
         raise Stopped(
             f"stopped at step {algorithm.num_env_steps}; `{again}` goes on",
             next(each for each in signals if each is not None),

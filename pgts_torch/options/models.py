@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from pgts_torch.options.fields import Ascending, Count, NonNegative, Positive, Share, Sizes, conflict
+from pgts_torch.options.fields import Ascending, Count, Entry, NonNegative, Positive, Share, Sizes, conflict
 from pgts_torch.options.part import Part, null
 
 
@@ -88,7 +88,25 @@ class Ensemble(Part):
     """Gradient steps after the first rollouts."""
 
 
-Model = AutoModel | GivenModel | Counts | Ensemble
+class OwnModel(Part):
+    """A model of your own, whose states are observations."""
+
+    type: Literal["own"] = "own"
+
+    make: Entry | None = None
+    """A class or a function without arguments that makes it; its module is imported."""
+
+    @field_validator("make")
+    @classmethod
+    def _is_given(cls, value: Any) -> Any:
+        if value is None:
+            raise conflict(
+                "model.type is own, which needs model.make, MODULE:NAME of what makes the model", "model.make"
+            )
+        return value
+
+
+Model = AutoModel | GivenModel | Counts | Ensemble | OwnModel
 """Options of the model."""
 
 LEARNED = (Counts, Ensemble)

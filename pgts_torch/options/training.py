@@ -7,7 +7,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues, TabularValues
 from pgts_torch.options.fields import Ascending, EnvId, Key, Kwargs, UnitInterval, conflict
-from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Model
+from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Model, OwnModel
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, NETWORKS, TABLES, AutoPolicy, Biased, Network, Simplex, Softmax, Table
 from pgts_torch.options.replay import AutoReplay, NoReplay, Replay, UniformReplay
@@ -268,7 +268,7 @@ def _with_types(data: dict[str, Any]) -> dict[str, Any]:
 
     It is the first type that goes with the other values and has all these keys; if none has, the first that goes.
     """
-    data = _with_type(_with_type(data, "model", [Ensemble, Counts]), "replay", [UniformReplay])
+    data = _with_type(_with_type(data, "model", [Ensemble, Counts, OwnModel]), "replay", [UniformReplay])
     replayed = _type(data, "replay") == "uniform" or _type(data, "model") in ("ensemble", "counts")
     horizons: list[type[Part]] = [FixedHorizon, GeometricHorizon]
     if isinstance(rollout := data.get("rollout"), dict):

@@ -239,6 +239,8 @@ def configurations(draw: st.DrawFn) -> Config:
     if given["search.kind"] == "mcts":
         given |= {"search.exploration": None} if given["search.rule"] == "gumbel" else {"search.prior": "uniform"}
         given |= {"search.merge": False} if given["search.backup"] == "mean" else {}
+    if types["model.type"] == "own":
+        given["model.make"] = "models_of_mine:model"
     if types["model.type"] == "counts" and given["model.optimism"] == "none":
         given["model.strength"] = None
     if types["model.type"] == "counts" and given["model.value_range"] is None:
@@ -342,6 +344,7 @@ PARTS = [
     ["--policy.type", "mlp", "--search.depth", "0", "--estimator.type", "sampled", "--estimator.lambda", "0.9"],
     ["--rollout.horizon.type", "fixed", "--model.type", "given", "--replay.type", "none"],
     ["--model.type", "counts", "--rollout.horizon.first", "7"],
+    ["--model.type", "own", "--model.make", "models_of_mine:model"],
     ["--model.members", "2", "--replay.length", "3"],
 ]
 """Command lines that together name every type there is."""

@@ -96,3 +96,51 @@ def test_what_names_a_module_is_told_from_what_does_not(env, kwargs, refused):
             check_imports("file", env, kwargs)
     else:
         check_imports("file", env, kwargs)
+
+
+OWN = """
+from pathlib import Path
+from pgts_torch.models import TabularModel
+from pgts_torch.tabular import ladder
+Path("trace").write_text("imported")
+
+def model():
+    return TabularModel(ladder(start=0))
+
+def nothing():
+    return None
+"""
+
+
+def test_a_model_of_the_callers_own_is_named_in_a_configuration_and_imported_only_where_it_is_trusted(here, capsys):
+    (here / "models_of_mine.py").write_text(OWN)
+    own = {"type": "own", "make": "models_of_mine:model"}
+    main(["train", *SHORT, "--model.type=own", "--model.make=models_of_mine:model"])
+    assert type(PGTS("pgts/Ladder-v0", model=own, env_kwargs={"start": 0}).world.model).__name__ == "TabularModel"
+    trace = forgotten()
+    sys.modules.pop("models_of_mine", None)
+    saved = next(Path("run/checkpoints").glob("*.pt"))
+    with pytest.raises(PgtsError, match="names 'models_of_mine:model' as its model; that imports"):
+        PGTS.load(saved)
+    assert main(["train", "--resume=run", "--total_steps=20"]) == 2
+    assert "names 'models_of_mine:model' as its model" in capsys.readouterr().err
+    assert not trace.exists()
+    PGTS.load(saved, trust_imports=True)
+    assert trace.exists()
+    sys.modules.pop("models_of_mine", None)
+
+
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [
+        (None, r"needs model\.make"),
+        ("models_of_mine:nothing", r"made None; it must be a pgts_torch\.models\.Model"),
+        ("models_of_mine:missing", "cannot be made"),
+        ("no_such_module:model", "cannot be made"),
+    ],
+)
+def test_a_model_that_cannot_be_made_is_refused(here, make, why):
+    (here / "models_of_mine.py").write_text(OWN)
+    with pytest.raises(PgtsError, match=why):
+        PGTS("pgts/Ladder-v0", model={"type": "own"} | ({} if make is None else {"make": make}))
+    sys.modules.pop("models_of_mine", None)

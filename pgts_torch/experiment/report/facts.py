@@ -11,7 +11,7 @@ from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint, ownership
 from pgts_torch.experiment.report.curves import panels
-from pgts_torch.experiment.resume import flat, plain
+from pgts_torch.experiment.resume import flat, names_modules, plain
 from pgts_torch.experiment.summary import Summary, from_json, rows
 from pgts_torch.files import PARTIAL
 from pgts_torch.options.schema import schema_of
@@ -55,6 +55,7 @@ def gather(run: Path, *, trust_imports: bool = False) -> tuple[dict[str, Any], P
         "run": str(run),
         "name": config.name,
         "env": config.env.id,
+        "imports": names_modules(config),
         "seed": config.seed,
         "state": "failed" if failure else "finished" if summary else "unfinished",
         "failure": failure,

@@ -42,7 +42,7 @@ def write(run: Path, out: Path | None, *, trust_imports: bool = False) -> dict[s
     out = files.target(run / REPORT_FILE if out is None else out, lambda raw: SIGN in raw, "a page of pgts report")
     facts, algorithm = gather(run, trust_imports=trust_imports)
     policy = None if algorithm is None or algorithm.world.mdp is None else _policy(algorithm)
-    resume = resuming(facts["run"], facts["world_size"], facts["env"])
+    resume = resuming(facts["run"], facts["world_size"], imports=facts["imports"])
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pgts_torch.experiment.report", ""),
         autoescape=True,
