@@ -12,7 +12,7 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from pgts_torch.agent.world import ModelWorld, TabularWorld, World
+from pgts_torch.agent.world import ModelWorld, TabularWorld, VectorStates, World
 from pgts_torch.errors import MissingModel, PgtsError, failure
 from pgts_torch.models.base import Model
 from pgts_torch.models.counts import CountsModel
@@ -24,7 +24,7 @@ from pgts_torch.options.models import Counts, Ensemble, OwnModel
 
 
 @final
-class VectorWorld(ModelWorld):
+class VectorWorld(VectorStates):
     """Environments whose observations are vectors, which are the states of a model.
 
     Args:
@@ -43,25 +43,9 @@ class VectorWorld(ModelWorld):
         """The observations, because they are the states."""
         return encoded_B.to(self.model.state_dtype)
 
-    def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
-        """The numbers of state vectors."""
-        return self.model.number(read_N)
-
     def observe(self, state_N: Int[Tensor, "N"]) -> Shaped[Tensor, "N D"]:
         """The states, because they are the observations."""
         return self.model.states(state_N)
-
-    def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """The state vectors, on the CPU."""
-        return self.model.states(state_N).cpu()
-
-    def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
-        """The numbers of the exported vectors."""
-        return self.numbers(exported.to(self.device))
-
-    def reset_numbers(self) -> None:
-        """Drop all states, because hardly any is met again."""
-        self.model.clear()
 
 
 def learned_world(

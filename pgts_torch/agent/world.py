@@ -24,6 +24,7 @@ from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import each_of
 from pgts_torch.models.tabular import TabularModel
+from pgts_torch.models.tensor import TensorModel
 from pgts_torch.tabular.mdp import TabularMDP
 
 
@@ -239,9 +240,28 @@ class SimulatedWorld(ModelWorld):
         self.model.clear()
 
 
+class VectorStates(ModelWorld):
+    """Environments with a model whose states are vectors. A state is the number of a vector."""
+
+    model: TensorModel
+
+    def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
+        return self.model.number(read_N)
+
+    def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        return self.model.states(state_N).cpu()
+
+    def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
+        return self.numbers(exported.to(self.device))
+
+    def reset_numbers(self) -> None:
+        """Drop all states, because hardly any is met again."""
+        self.model.clear()
+
+
 @final
-class DynamicsWorld(ModelWorld):
-    """Environments whose dynamics, `model`, are written in torch. A state is the number of a vector.
+class DynamicsWorld(VectorStates):
+    """Environments whose dynamics, `model`, are written in torch.
 
     Args:
         observation_key: the entry of dictionary observations that is used, where a wrapper makes dictionaries.
@@ -255,9 +275,6 @@ class DynamicsWorld(ModelWorld):
     def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B D"]:
         return self.model.vectors(self._envs)
 
-    def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
-        return self.model.number(read_N)
-
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """The observations in these states, as the wrappers of the environment change them."""
         inner_NO = self.model.observe(self.model.states(state_N))
@@ -265,13 +282,3 @@ class DynamicsWorld(ModelWorld):
             return inner_NO
         rows = [self.observations.part(self.model.transforms.observation(row)) for row in inner_NO.cpu().numpy()]
         return self.observations.encode_part(np.array(rows, self.observations.space.dtype))
-
-    def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        return self.model.states(state_N).cpu()
-
-    def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
-        return self.numbers(exported.to(self.device))
-
-    def reset_numbers(self) -> None:
-        """Drop all states, because hardly any is met again."""
-        self.model.clear()

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.models.base import Experience, FallibleModel, LearningModel, Transitions
+from pgts_torch.models.held_out import BLOCK, held_out_rows, runs
 from pgts_torch.models.prediction import Prediction
 from pgts_torch.models.replay import ReplayBuffer
 from pgts_torch.models.rewards import value_range
@@ -30,9 +31,6 @@ _ENDS = 0.25
 
 _AHEAD = (1, 4, 16)
 """The numbers of steps ahead for which the prediction error is measured."""
-
-_BLOCK, _HELD_OUT = 32, 10
-"""Of every 10 blocks of 32 steps in a row the last one is held out."""
 
 _MOST_MEASURED = 256
 """The most starts, the latest ones, from which an error is measured."""
@@ -83,9 +81,9 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
             state_size, num_actions, merge=False, dtype=torch.float64, device=device, action_repeat=action_repeat
         )
         self.gamma, self.options = gamma, options
-        if capacity <= _BLOCK:
+        if capacity <= BLOCK:
             raise PgtsError(
-                f"capacity is {capacity}; an ensemble keeps more than {_BLOCK} steps, because so many in a row may be "
+                f"capacity is {capacity}; an ensemble keeps more than {BLOCK} steps, because so many in a row may be "
                 "held out (replay.capacity)"
             )
         self.replay: ReplayBuffer = ReplayBuffer(capacity)
@@ -145,7 +143,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
             follows=experience.follows_N,
         )
         self._measure_moments()
-        held_out = self._held_out()
+        held_out = held_out_rows(self.replay)
         trained = torch.nonzero(~held_out).flatten()
         ended = trained[self.replay.rows("end", trained) > 0]
         self._end_share = len(ended) / len(trained)
@@ -179,13 +177,6 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
                     f"the mean of {name}s is {mean.tolist()}; what a model learns must be finite", what="model"
                 )
             self._moments[name] = (mean.to(self.device), deviation.to(self.device))
-
-    def _held_out(self) -> Tensor:
-        """Which rows of the ring are held out. The number of a step decides, so that it is never trained on."""
-        buffer, at_N = self.replay, torch.arange(len(self.replay))
-        # A row holds its latest step: the number of that is the row, plus the capacity for each round before it.
-        rounds = (buffer.num_added - 1 - at_N) // buffer.capacity
-        return (at_N + rounds * buffer.capacity) // _BLOCK % _HELD_OUT == _HELD_OUT - 1
 
     def _fit(self, trained: Int[Tensor, "R"], ended: Int[Tensor, "Q"], generator: torch.Generator) -> float:
         """Take one gradient step, with a minibatch for each member. Return the loss.
@@ -286,7 +277,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         """The errors on held-out steps, by name (`learn`)."""
         errors = {}
         for steps in _AHEAD:
-            starts = self._runs(held_out, steps)[-_MOST_MEASURED:]
+            starts = runs(held_out, self.replay.rows("follows"), steps)[-_MOST_MEASURED:]
             if len(starts) == 0:
                 continue
             state_ND = self.replay.rows("state", starts).to(self.device)
@@ -310,14 +301,6 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
                 stacklevel=2,
             )
         return errors
-
-    def _runs(self, held_out: Tensor, steps: int) -> Int[Tensor, "R"]:
-        """The rows where `steps` held-out steps of one episode begin, one after another in the ring."""
-        good, follows = held_out.clone(), self.replay.rows("follows")
-        for ahead in range(1, steps):
-            good &= held_out.roll(-ahead) & follows.roll(1 - ahead)
-        good[len(good) - steps + 1 :] &= steps == 1  # those after them are at the beginning of the ring
-        return torch.nonzero(good).flatten()
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimiser, moments and replay."""
