@@ -35,6 +35,10 @@ _AHEAD = (1, 4, 16)
 _MOST_MEASURED = 256
 """The most starts, the latest ones, from which an error is measured."""
 
+_MOST_OFF = 4.0
+"""The largest squared error of a change, in variances of changes, that counts: a few large ones, as where a car hits a
+wall, do not say that the observation is not the state."""
+
 _ENOUGH_STEPS, _UNEXPLAINED = 2000, 0.5
 """With so many steps and a larger share of the variance of changes unexplained, a warning is given."""
 
@@ -123,7 +127,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         Returns:
             loss: the mean over the gradient steps. error_1, error_4, error_16: the root mean square error of the state
             predicted so many steps ahead, on held-out steps, in standard deviations of states; left out where too few
-            are held out. unexplained: the share of the variance of changes that is not predicted there.
+            are held out. unexplained: the share of the variance of changes not predicted there, but for outliers.
 
         Raises:
             PgtsError: steps with a discount other than gamma and 0; observations that are no vectors of D numbers.
@@ -289,9 +293,8 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
                 self._scaled("state", state_ND).sub(self._scaled("state", true_ND)).square().mean().sqrt()
             )
             if steps == 1:  # `_scaled` subtracts the mean change, which the difference of two states does not have
-                errors["unexplained"] = float(
-                    self._scaled("change", state_ND - true_ND + self._moments["change"][0]).square().mean()
-                )
+                off_ND = self._scaled("change", state_ND - true_ND + self._moments["change"][0])
+                errors["unexplained"] = float(off_ND.square().clamp(max=_MOST_OFF).mean())
         if errors.get("unexplained", 0.0) > _UNEXPLAINED and len(self.replay) >= _ENOUGH_STEPS and not self._warned:
             self._warned = True
             warnings.warn(

@@ -133,6 +133,16 @@ def test_observations_that_are_no_states_are_noticed():
         EnsembleModel(2, 2, gamma=GAMMA, options=SMALL).learn(swing(2500), generator=stream(0, "learn"))
 
 
+def test_rare_jumps_are_no_reason_to_doubt_the_observation():
+    """One step in 100 lands far away, which nothing in the observation tells: nearly all of the variance of changes."""
+    steps = swing(2500)
+    jumps_N = torch.arange(2500) % 100 == 99
+    moved = steps._replace(next_observation_N=steps.next_observation_N + 50.0 * jumps_N[:, None])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        EnsembleModel(2, 2, gamma=GAMMA, options=SMALL).learn(moved, generator=stream(0, "learn"))
+
+
 def test_a_constant_number_and_a_constant_reward_are_learned_exactly():
     steps = swing(200)
     constant = steps._replace(
