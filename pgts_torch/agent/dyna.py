@@ -91,10 +91,11 @@ class Dyna:
         assert self.options.updates_per_step is not None
         assert self.options.length is not None
         due = int(self.options.updates_per_step * self.replay.num_added) - self.num_updates
+        every = self.replay.rows("state").unique() if self.options.starts == "all" else None
         for number in range(max(due, 1)):
             own = draws.update(number)
             self._world.reset_numbers()
-            start_B = self._world.adopt(self._starts(own))
+            start_B = self._world.adopt(self._sampled(own) if every is None else every)
             imagined = imagine(self._world, self.policy, start_B, self.options.length, generator=own.common)
             self._steps += imagined.num_steps
             yield imagined, own
@@ -106,11 +107,9 @@ class Dyna:
                 assert isinstance(self._trained, NetworkPolicy)
                 self.policy.network.follow(self._trained.network, self.options.polyak)
 
-    def _starts(self, draws: Draws) -> Any:
-        """The states that imagined episodes start in, as the world exports them."""
-        if self.options.starts == "all":
-            return self.replay.rows("state").unique()
-        assert self.options.starts is not None
+    def _sampled(self, draws: Draws) -> Any:
+        """A sample of the visited states, as the world exports them."""
+        assert isinstance(self.options.starts, int)
         return self.replay.rows("state", self.replay.sample(self.options.starts, generator=draws.common))
 
     def state_dict(self) -> dict[str, Any]:

@@ -133,7 +133,7 @@ def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
     """Walks without a restored state in between, each from the state that some random steps have led to."""
     env, walks = setup.fresh(), list[Walk]()
     for _ in range(count):
-        # Without seeds: some emulators load their program anew for each seed.
+        # Without seeds: some emulators load their program again for each seed.
         for _ in range(int(setup.random.integers(setup.longest))):
             if step(env, setup.action()).ends:
                 reset(env)

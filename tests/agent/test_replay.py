@@ -10,11 +10,24 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pgts_torch import PGTS
 from pgts_torch.agent.evaluate import Greedy
 from pgts_torch.agent.imagine import imagine
+from pgts_torch.agent.iteration import Batch
+from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.ongoing import OngoingEpisodes
+from pgts_torch.agent.target_updates import NetworkMirrorUpdate
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import TabularModel
-from pgts_torch.options import CMPO, MLP, Counts, Ensemble, NetworkTDLambda, NetworkValues, StepsHorizon, UniformReplay
+from pgts_torch.options import (
+    CMPO,
+    MLP,
+    Counts,
+    Ensemble,
+    Mirror,
+    NetworkTDLambda,
+    NetworkValues,
+    StepsHorizon,
+    UniformReplay,
+)
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import deep_sea, exact
 from tests.agent.helpers import following, vector_env
@@ -229,3 +242,19 @@ def test_options_that_suit_replay_are_chosen():
     assert isinstance(options.update, CMPO)
     assert (options.replay.length, options.critic.method) == (128, NetworkTDLambda(lambda_=1.0))
     assert training.dyna.policy is not training.policy
+
+
+def test_an_update_starts_from_the_policy_that_the_batch_is_of():
+    """With replay that is the slow copy. Advantages that hardly count lead to it, not to the trained one."""
+    space, observation_N = spaces.Box(-1, 1, (2,), np.float32), torch.randn(64, 2, generator=stream(0, "test"))
+    trained, slow = (NetworkPolicy(space, 3, MLP(hidden=[32]), seed=seed) for seed in (0, 1))
+    slow.network.head.weight.data.mul_(200)  # else both are nearly uniform
+
+    def apart() -> float:
+        return float((trained.probs(observation_N) - slow.probs(observation_N)).abs().mean())
+
+    before = apart()
+    update = NetworkMirrorUpdate(Mirror(temperature=1e6, num_epochs=400, learning_rate=1e-2))
+    advantage_NA = torch.randn(64, 3, generator=stream(1, "test"))
+    update(trained, Batch(observation_N, advantage_NA, torch.ones(64), 0.0, slow), generator=stream(2, "test"))
+    assert apart() < 0.2 * before
