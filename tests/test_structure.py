@@ -19,6 +19,7 @@ ROOMS = [
     "errors",
     "files",
     "trust",
+    "compiled",
     "options",
     "bellman",
     "seeding",

@@ -1,0 +1,87 @@
+"""Whether loops over nodes are compiled, and how.
+
+A file of such loops, each marked with `jit`, stands beside torch code that does the same and which is its test.
+It needs numba, so it is imported inside functions, behind `can_compile`.
+
+What numba has compiled is kept on disk: in `__pycache__` beside the source, or where that is read-only in the user's
+folder for such files; NUMBA_CACHE_DIR names another place.
+"""
+
+import functools
+import importlib.util
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+import torch
+
+_Function = TypeVar("_Function", bound=Callable[..., object])
+
+SWITCH = "PGTS_COMPILED"
+"""The environment variable that is 0 where nothing is to be compiled."""
+
+_torch_only = False
+
+
+def can_compile(device: torch.device) -> bool:
+    """Whether compiled loops are used for tensors of this device: those of the CPU, where numba is installed.
+
+    That numba is missing is said once.
+    """
+    if device.type != "cpu" or _torch_only or os.environ.get(SWITCH) == "0":
+        return False
+    return _installed()
+
+
+@contextmanager
+def torch_only() -> Iterator[None]:
+    """Within it nothing compiled is used."""
+    global _torch_only
+    before, _torch_only = _torch_only, True
+    try:
+        yield
+    finally:
+        _torch_only = before
+
+
+def jit(function: _Function) -> _Function:
+    """The function, compiled by numba when it is first called: for numpy arrays and numbers, and with sums in the order
+    in which they are written.
+
+    What it calls must be marked too and stand in the same file: a function from the disk does not notice what has
+    changed in another file.
+    """
+    import numba
+
+    try:
+        machine_code: _Function = numba.njit(cache=True, nogil=True)(function)
+    except RuntimeError as error:  # no folder for it
+        _say_not_kept(str(error))
+        machine_code = numba.njit(nogil=True)(function)
+    return machine_code
+
+
+@functools.cache
+def _installed() -> bool:
+    if importlib.util.find_spec("numba") is not None:
+        return True
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    warnings.warn(
+        f"numba is not installed (Python {version}): torch alone is used, and searches on the CPU take longer",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return False
+
+
+@functools.cache
+def _say_not_kept(error: str) -> None:
+    warnings.warn(
+        f"compiled code cannot be kept on disk, each process compiles it again, which takes seconds ({error}); "
+        "set NUMBA_CACHE_DIR to a folder that may be written to",
+        RuntimeWarning,
+        stacklevel=3,
+    )

@@ -1,0 +1,88 @@
+"""Where loops are compiled, and that they are found on disk the next time."""
+
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+from pgts_torch import compiled
+
+CPU = torch.device("cpu")
+
+KERNEL = """
+from pgts_torch.compiled import jit
+
+@jit
+def total(x):
+    total = 0.0
+    for i in range(len(x)):
+        total += x[i]
+    return total
+"""
+
+CALL = """
+import sys
+import numpy as np
+sys.path.insert(0, {folder!r})
+from kernel import total
+assert total(np.array([0.1, 0.2, 0.3])) == 0.1 + 0.2 + 0.3
+print(sum(total.stats.cache_hits.values()))
+"""
+
+
+def call(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """In a new process: what it prints is how many compiled functions were found on disk."""
+    code = CALL.format(folder=str(folder))
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    pytest.importorskip("numba")
+    (tmp_path / "kernel.py").write_text(KERNEL)
+    return tmp_path
+
+
+def test_tensors_of_the_cpu_are_compiled_for_where_numba_is_installed() -> None:
+    pytest.importorskip("numba")
+    assert compiled.can_compile(CPU)
+    assert not compiled.can_compile(torch.device("cuda"))
+    with compiled.torch_only():
+        assert not compiled.can_compile(CPU)
+    assert compiled.can_compile(CPU)
+
+
+def test_the_environment_variable_turns_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(compiled.SWITCH, "0")
+    assert not compiled.can_compile(CPU)
+
+
+def test_without_numba_torch_is_used_and_that_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled.importlib.util, "find_spec", lambda name: None)
+    compiled._installed.cache_clear()
+    try:
+        with pytest.warns(RuntimeWarning, match="numba is not installed .* torch alone is used"):
+            assert not compiled.can_compile(CPU)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert not compiled.can_compile(CPU)
+    finally:
+        compiled._installed.cache_clear()
+
+
+def test_a_second_process_finds_compiled_code_on_disk(folder: Path) -> None:
+    assert [call(folder).stdout for _ in range(2)] == ["0\n", "1\n"]
+
+
+def test_where_nothing_can_be_written_it_is_compiled_all_the_same_and_said(folder: Path) -> None:
+    # A file where a folder is needed: nothing can be written there, by nobody.
+    (folder / "__pycache__").write_text("")
+    (folder / "home").write_text("")
+    done = call(folder, HOME=str(folder / "home"), XDG_CACHE_HOME=str(folder / "home"))
+    assert done.stdout == "0\n", done.stderr
+    assert "NUMBA_CACHE_DIR" in done.stderr
+    kept = [call(folder, NUMBA_CACHE_DIR=str(folder / "kept")).stdout for _ in range(2)]
+    assert kept == ["0\n", "1\n"]
