@@ -18,9 +18,10 @@ from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.search.upper import UpperBound
 
-Trust = Literal["proved", "critic", "sampled starts"]
+Trust = Literal["proved", "critic", "sampled starts", "posterior"]
 """How far a certificate can be trusted. "proved": it is a proof. "critic": up to the critic's error at start states.
-"sampled starts": up to that error, and with 95 % confidence, because start states are known from episodes only."""
+"sampled starts": up to that error, and with 95 % confidence, because start states are known from episodes only.
+"posterior": with a posterior probability, given what a learned table has counted (`PosteriorCertificate`)."""
 
 CONFIDENCE = 0.95
 """The probability that all certificates of a run hold together, where start states are sampled."""

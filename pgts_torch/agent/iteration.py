@@ -62,8 +62,11 @@ class Iteration(PolicyBatch):
     experience: the episodes of pi_k.
     losses: the critic's and the update's, by name.
     model_calls: the number of (state, action) that lookahead and critic have queried in this iteration.
+    posterior: a bound on J* - J^{pi_{k+1}} from a learned table alone (`PosteriorCertificate`), by which `is_enough` is
+        decided then; None: there is none in this iteration.
     """
 
     experience: Rollout
     losses: dict[str, float]
     model_calls: int
+    posterior: float | None = None

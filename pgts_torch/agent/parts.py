@@ -21,6 +21,7 @@ from pgts_torch.agent.ongoing import OngoingEpisodes
 from pgts_torch.agent.own_models import learned_world, own_model, world_of
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
+from pgts_torch.agent.posterior_certificate import PosteriorCertificate
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import ModelWorld, World
@@ -54,6 +55,7 @@ class Parts(NamedTuple):
     model_check: ModelCheck
     episodes: OngoingEpisodes | None
     dyna: Dyna | None
+    posterior: PosteriorCertificate | None
 
     @property
     def model_calls(self) -> int:
@@ -95,11 +97,13 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
         seed=seed,
         ranks=ranks,
     )
-    search, certificates, depth_choice, dyna = None, None, None, None
+    search, certificates, depth_choice, dyna, posterior = None, None, None, None, None
     if isinstance(options.replay, UniformReplay):
         assert isinstance(world, ModelWorld)
         world, explorer = _with_explorer(world, policy, critic, update, options, ranks)
         dyna = Dyna(world, policy, options.replay, model_check, explorer)
+        if isinstance(world.model, CountsModel) and world.model.options.certificate is not None:
+            posterior = PosteriorCertificate(world.model, policy, seed=seed)
     elif isinstance(world.model, LearningModel):
         raise PgtsError(f"{type(world.model).__name__} learns from steps, which needs replay: set replay to uniform")
     if isinstance(options.estimator, SampledAdvantages):
@@ -130,6 +134,7 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
         model_check,
         episodes,
         dyna,
+        posterior,
     )
 
 
@@ -142,7 +147,7 @@ def _lookahead(
     certificates = Certificates(
         world, search, critic, num_depths=len(depths), ranks=ranks, samples_starts=samples_starts
     )
-    if stop_at is not None:
+    if stop_at is not None and not isinstance(options.model, LEARNED):
         certificates.check(f"stop_at is {stop_at}")
     if options.search.depth == "adaptive":
         certificates.check("depth is adaptive")

@@ -1,6 +1,7 @@
 """Policy gradient with tree search, from rollouts.        [PGTS Alg. 1]"""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self, final
 
@@ -117,7 +118,7 @@ class PGTS:
         self.policy, self.critic, self.update = parts.policy, parts.critic, parts.update
         self.search, self.certificates, self.depth_choice = parts.search, parts.certificates, parts.depth_choice
         self.estimator, self.model_check = parts.estimator, parts.model_check
-        self.episodes, self.dyna = parts.episodes, parts.dyna
+        self.episodes, self.dyna, self.posterior = parts.episodes, parts.dyna, parts.posterior
         self.gamma, self.horizon = self.world.gamma, self.options.rollout.horizon
         self.num_iterations = self.num_env_steps = self.num_model_calls = 0
         self._arguments = arguments | {"env": self.source.description, "device": str(self.device)}
@@ -143,11 +144,17 @@ class PGTS:
                 batch, latest = self._improve(imagined, own_draws)
             losses |= latest
 
+        posterior = None if self.posterior is None else self.posterior.follow(experience, self.num_env_steps)
+        target = self.options.search.stop_at
+        if posterior is not None and target is not None:
+            batch = replace(batch, is_enough=posterior <= target)
         self.num_iterations += 1
         self.num_env_steps += experience.num_steps
         model_calls = self.ranks.total(self._parts.model_calls - calls_before, self.policy.state_dict)
         self.num_model_calls += model_calls
-        return Iteration(**vars(batch), experience=experience, losses=losses, model_calls=model_calls)
+        return Iteration(
+            **vars(batch), experience=experience, losses=losses, model_calls=model_calls, posterior=posterior
+        )
 
     def _improve(self, rollout: Rollout, draws: Draws) -> tuple[PolicyBatch, dict[str, float]]:
         """Estimate Q^pi from a rollout, look m steps ahead, update pi. Return the batch, and the losses by name."""

@@ -13,6 +13,7 @@ from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.dyna import Dyna
 from pgts_torch.agent.parts import Parts
 from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.posterior_certificate import PosteriorCertificate
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.states import NO_STATE, check_keys, load_checked
 from pgts_torch.agent.updates import Update
@@ -73,14 +74,10 @@ def restore(parts: Parts, ranks: Ranks, state: dict[str, Any]) -> tuple[int, int
     return state["num_iterations"], state["num_env_steps"], state["num_model_calls"]
 
 
-def _learned(parts: Parts) -> dict[str, Policy | Critic | Update | Dyna]:
+def _learned(parts: Parts) -> dict[str, Policy | Critic | Update | Dyna | PosteriorCertificate]:
     """The parts that learn, of which all ranks have the same state."""
-    learned: dict[str, Policy | Critic | Update | Dyna] = {
-        "policy": parts.policy,
-        "critic": parts.critic,
-        "update": parts.update,
-    }
-    return learned if parts.dyna is None else {**learned, "dyna": parts.dyna}
+    names = ("policy", "critic", "update", "dyna", "posterior")
+    return {name: part for name in names if (part := getattr(parts, name)) is not None}
 
 
 def _search_state(parts: Parts) -> dict[str, Any]:

@@ -35,6 +35,8 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
             "search/certificate": iteration.certificate,
             "search/proved": float(algorithm.certificates is not None and algorithm.certificates.trust == "proved"),
         }
+        if iteration.posterior is not None:
+            tags["search/certificate_posterior"] = iteration.posterior
         if iteration.look.doubt_BA is not None:
             tags["search/doubt"] = float(iteration.look.doubt_BA.max())
     return tags

@@ -73,7 +73,10 @@ class Recorder:
         seconds = time.perf_counter() - self._clock
         k, step, progress = algorithm.num_iterations, algorithm.num_env_steps, self.progress
         progress.depth = max(progress.depth, iteration.depth)
-        progress.certificate = iteration.certificate if math.isfinite(iteration.certificate) else None
+        if algorithm.posterior is None:
+            progress.certificate = iteration.certificate if math.isfinite(iteration.certificate) else None
+        elif iteration.posterior is not None:
+            progress.certificate = iteration.posterior
         self._last = iteration
         self.movement.follow(algorithm, iteration)
         if self.folder is not None and k % self.config.log.every == 0:
@@ -87,8 +90,7 @@ class Recorder:
         tags = {tag: value for kind in self._evaluations for tag, value in self._scores(kind, step)}
         if self.folder is not None and tags:
             self.folder.log(step, tags)
-        target = self.config.search.stop_at
-        if target is not None and iteration.certificate <= target:
+        if iteration.is_enough:
             progress.ended_by = "certificate"
         elif not all(go_on):
             progress.ended_by = "return"
@@ -206,19 +208,23 @@ class Recorder:
         )
 
     def _certified(self) -> dict[str, Any]:
-        """The certificate's fields of the summary. A proof is made again for the policy after its last update."""
-        certificates, bound = self.algorithm.certificates, self.progress.certificate
-        trust = None if certificates is None else certificates.trust
-        if certificates is not None and trust == "proved":
-            proof = certificates.of(self.algorithm.policy_table())
-            if self.progress.ended_by == "certificate" and bound is not None:  # its policy was kept, all ranks know it
-                proof = min(proof, bound)
-            bound = proof if math.isfinite(proof) else None
-        return {
-            "certificate": bound,
-            "certificate_is_proved": trust == "proved",
-            "certificate_confidence": CONFIDENCE if trust == "sampled starts" else 1.0,
-        }
+        """The certificate's fields of the summary. A proof, and one from counts, is made again for the policy after its
+        last update."""
+        algorithm, bound = self.algorithm, self.progress.certificate
+        certificates, posterior = algorithm.certificates, algorithm.posterior
+        was_reached = self.progress.ended_by == "certificate"  # then the policy was kept, and all ranks know the bound
+        if posterior is not None:
+            bound = bound if was_reached else posterior.now()
+            trust, confidence = "posterior", posterior.level
+        elif certificates is not None:
+            trust, confidence = certificates.trust, CONFIDENCE if certificates.trust == "sampled starts" else 1.0
+            if trust == "proved":
+                proof = certificates.of(algorithm.policy_table())
+                proof = proof if bound is None or not was_reached else min(proof, bound)
+                bound = proof if math.isfinite(proof) else None
+        if bound is None:
+            return {}
+        return {"certificate": bound, "certificate_trust": trust, "certificate_confidence": confidence}
 
 
 def _evaluations(config: EvalConfig, seed: int, run: Path) -> dict[str, EvalCallback]:

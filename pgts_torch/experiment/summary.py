@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import TypeAdapter, ValidationError
 
+from pgts_torch.agent.certificate import Trust
 from pgts_torch.agent.evaluate import Evaluation
 from pgts_torch.errors import PgtsError
 
@@ -26,12 +27,12 @@ class Summary:
     depth: m; the largest if it was adaptive.
     search: the kind of search, with a reason where it was chosen automatically.
     stationarity_gap: max over visited states of the exact g_m; None where the exact MDP is not known.
-    certificate: an upper bound on J* - J^pi; None: there is none. If it is a proof, it is for the trained policy; an
-        estimate is for the policy before the last update.
-    certificate_is_proved: whether it is a proof: the start distribution is known, the critic exact and the model the
-        environment. If not, it is right up to the critic's error at the start states.
+    certificate: an upper bound on J* - J^pi; None: there is none. If it is a proof or from counts, it is for the
+        trained policy; an estimate is for the policy before the last update.
+    certificate_trust: how far it can be trusted; None: there is none.
     certificate_confidence: 1 where all start states are known; else the probability that all certificates of the run
-        hold, over the sampled start states and up to the critic's error.
+        hold, over the sampled start states and up to the critic's error; from counts, the posterior probability that
+        this one holds. None: there is no certificate.
     ended_by: why training ended: the certificate is at most `search.stop_at`, greedy episodes return at least
         `eval.stop_at_return`, or `total_steps` are done.
     notes: advice to the user where the run learned little (`experiment.advice`).
@@ -45,8 +46,6 @@ class Summary:
     J: float | None
     J_optimal: float | None
     stationarity_gap: float | None
-    certificate: float | None
-    certificate_is_proved: bool
     ended_by: EndedBy
     iterations: int
     env_steps: int
@@ -54,7 +53,9 @@ class Summary:
     seconds: float
     deterministic: Evaluation
     sampled: Evaluation
-    certificate_confidence: float = 1.0
+    certificate: float | None = None
+    certificate_trust: Trust | None = None
+    certificate_confidence: float | None = None
     notes: tuple[str, ...] = ()
     parts: str = ""
 
@@ -97,12 +98,9 @@ def rows(summary: Summary) -> dict[str, str]:
             f"stationarity gap, depth {summary.depth}": f"{summary.stationarity_gap:.3g}",
         }
     if summary.certificate is not None:
-        confidence = summary.certificate_confidence
-        sampled = "" if confidence == 1 else f" with {confidence:.0%} over the starts,"
-        trust = "proved" if summary.certificate_is_proved else f"an estimate:{sampled} as far as the critic is right"
-        rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({trust})"
+        rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({_trust_text(summary)})"
     ended = _ENDINGS[summary.ended_by]
-    if summary.ended_by == "certificate" and not summary.certificate_is_proved:
+    if summary.ended_by == "certificate" and summary.certificate_trust != "proved":
         ended = "an estimated certificate: it is at search.stop_at"
     rows |= {
         "greedy episodes, return": _score_text(summary.deterministic),
@@ -117,6 +115,15 @@ def rows(summary: Summary) -> dict[str, str]:
         "run folder": summary.run,
     }
     return rows
+
+
+def _trust_text(summary: Summary) -> str:
+    if summary.certificate_trust == "proved":
+        return "proved"
+    if summary.certificate_trust == "posterior":
+        return f"posterior, {100 * (summary.certificate_confidence or 0):.6g} %"
+    sampled = f" with {summary.certificate_confidence:.0%} over the starts," * (summary.certificate_trust != "critic")
+    return f"an estimate:{sampled} as far as the critic is right"
 
 
 def _score_text(evaluation: Evaluation) -> str:

@@ -136,8 +136,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
     def plain(self) -> "CountsModel":
         """The same table without optimism. It goes on learning with this one, and so needs a `Topology` of its own."""
         plain = copy.copy(self)
-        kept = self.options.value_range, self.options.confidence
-        plain.options = Counts(optimism="none", value_range=kept[0], confidence=kept[1])
+        plain.options = self.options.model_copy(update={"optimism": "none", "strength": None})
         plain._columns, plain._errors = (-1, ()), (-1, torch.empty(0))
         return plain
 
@@ -315,7 +314,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         off = np.flatnonzero(~((discount_N >= 0) & (discount_N <= 1)))
         if len(off):
             raise PgtsError(f"discount_N[{off[0]}] is {discount_N[off[0]]}; it must be in [0, 1]")
-        if self.options.confidence is not None:
+        if needs_range := [name for name in ("confidence", "certificate") if getattr(self.options, name) is not None]:
             # What a step makes of the lowest and of the highest value.
             (low, high), slack = self.value_range, 1e-9 * sum(map(abs, self.value_range))
             off = np.flatnonzero(
@@ -324,8 +323,8 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
             if len(off):
                 raise PgtsError(
                     f"reward_N[{off[0]}] is {reward_N[off[0]]}, with discount {discount_N[off[0]]}: from a value in "
-                    f"value_range, which is {[low, high]}, such a step leads out of it, which confidence rules out: "
-                    "widen it"
+                    f"value_range, which is {[low, high]}, such a step leads out of it, which {needs_range[0]} rules "
+                    "out: widen it"
                 )
         pair_N = columns["observation_N"].astype(np.int64) * A + columns["action_N"]
         return pair_N, columns["next_observation_N"].astype(np.int64), discount_N, reward_N

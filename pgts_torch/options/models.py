@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from pgts_torch.options.fields import Ascending, Count, Entry, NonNegative, Positive, Share, Sizes, conflict
+from pgts_torch.options.fields import Ascending, Between, Count, Entry, NonNegative, Positive, Share, Sizes, conflict
 from pgts_torch.options.part import Part, null
 
 
@@ -43,12 +43,18 @@ class Counts(Part):
     however it was learned; null: none is stated. It needs model.value_range, and a step from any value of it to stay in
     it."""
 
-    @field_validator("confidence")
+    certificate: Between | None = None
+    """The posterior probability with which certificates hold, upper bounds on the optimality gap of the trained policy:
+    whenever a tenth more steps were taken, and at the end, it is bounded in tables that are sampled from what the
+    counts leave possible (search/certificate_posterior), which proves nothing; null: there are none. It needs
+    model.value_range, as model.confidence does."""
+
+    @field_validator("confidence", "certificate")
     @classmethod
     def _has_range(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("value_range", ...) is None:
             raise conflict(
-                f"model.confidence is {value}, which needs model.value_range: rewards seen so far prove none"
+                f"model.{info.field_name} is {value}, which needs model.value_range: rewards seen so far bound nothing"
             )
         return value
 

@@ -203,7 +203,9 @@ def is_nullable(node: Node) -> bool:
 def _bounds(node: Node) -> str:
     """Return the bounds of a number as an interval or a comparison; empty where there are none."""
     low, above = node.get("minimum"), node.get("exclusiveMinimum")
-    high = node.get("maximum")
+    high, below = node.get("maximum"), node.get("exclusiveMaximum")
+    if below is not None and above is not None:
+        return f" in ({above:g}, {below:g})"
     if high is None and low is None and above is None:
         return ""
     if high is None or high == INT64_MAX:

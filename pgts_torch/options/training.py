@@ -185,10 +185,12 @@ class Training(Part):
     @classmethod
     def _proves_nothing(cls, model: Any, info: ValidationInfo) -> Any:
         search = info.data.get("search")
-        if search is not None and search.stop_at is not None and isinstance(model, LEARNED):
+        has_bound = not isinstance(model, LEARNED) or (isinstance(model, Counts) and model.certificate is not None)
+        if search is not None and search.stop_at is not None and not has_bound:
+            way_out = "give model.certificate" if isinstance(model, Counts) else "only one of type counts has bounds"
             raise conflict(
                 f"search.stop_at is {search.stop_at}, which needs an upper bound on the optimality gap; model.type "
-                f"{model.type} is learned and bounds nothing",
+                f"{model.type} is learned and proves none: {way_out}",
                 "search.stop_at",
                 "model.type",
             )

@@ -122,7 +122,7 @@ def test_a_finished_run_shows_the_numbers_of_its_summary(finished, shown):
 def test_an_exact_critic_proves_its_certificate(tmp_path):
     assert train(tmp_path / "run", "--critic={type: exact}") == 0
     page, answer = report(tmp_path / "run")
-    assert answer["certificate"]["is_proved"]
+    assert answer["certificate"]["trust"] == "proved"
     assert "proved" in page.text
     assert answer["certificate"]["bound"] >= answer["certificate"]["missing"] - 1e-9
 

@@ -64,7 +64,6 @@ def finish(each: sweep.Run, *, J: float | None) -> None:
         J_optimal=J,
         stationarity_gap=J,
         certificate=None,
-        certificate_is_proved=False,
         ended_by="total_steps",
         iterations=3,
         env_steps=60 + each.seed,

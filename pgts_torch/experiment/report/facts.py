@@ -135,17 +135,21 @@ def _progress(last: checkpoint.Notes | None, latest: Values) -> Iterator[tuple[s
 def _certificate(summary: Summary | None, latest: Values) -> Values:
     """The certificate, and the exact optimality gap beside it.
 
-    bound: on J* - J^pi; None: there is none.   is_proved: whether it is a proof.   missing: J* - J^pi, where known.
+    bound: on J* - J^pi; None: there is none.   missing: J* - J^pi, where known.
+    trust: how far the bound can be trusted, as in the summary; "estimate" where the metrics tell no more.
     is_known: whether an iteration has reported it.
     """
     if summary is None:
         bound, missing = latest.get("search/certificate"), latest.get("exact/optimality_gap")
-        proved, known = latest.get("search/proved") == 1, "search/certificate" in latest
+        trust: str | None = "proved" if latest.get("search/proved") == 1 else "estimate"
+        known = "search/certificate" in latest
+        if (posterior := latest.get("search/certificate_posterior")) is not None:
+            bound, trust = posterior, "posterior"
     else:
-        bound, proved, known, missing = summary.certificate, summary.certificate_is_proved, True, None
+        bound, trust, known, missing = summary.certificate, summary.certificate_trust, True, None
         if summary.J is not None and summary.J_optimal is not None:
             missing = max(summary.J_optimal - summary.J, 0.0)
-    return {"bound": bound, "is_proved": proved, "missing": missing, "is_known": known}
+    return {"bound": bound, "trust": trust, "missing": missing, "is_known": known}
 
 
 def _settings(config: Config) -> Iterator[Values]:
