@@ -12,8 +12,8 @@ from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.steps import (
     check_discounts,
+    check_observation,
     check_rewards,
-    check_step,
     discount_of,
     names_discounts,
     number_of,
@@ -141,7 +141,8 @@ class Episodes:
         space = self._env.single_observation_space
         for seed, observation, reward in zip(self._seeds, self._each, self._reward_B, strict=False):
             try:
-                check_step(space, observation, float(reward))
+                check_rewards(float(reward))
+                check_observation(space, observation)
             except PgtsError as found:
                 return [seed], found
         return self._seeds, error

@@ -3,6 +3,7 @@
 An environment of your own comes first: see the head of `pgts_torch.models.snapshots`.
 """
 
+import functools
 import inspect
 import pickle
 import struct
@@ -13,7 +14,8 @@ import gymnasium
 import numpy as np
 
 from pgts_torch.errors import MissingModel
-from pgts_torch.models.adapters_extra import Ale, MiniGrid, Mujoco
+from pgts_torch.models.adapters_extra import Ale, Mujoco
+from pgts_torch.models.adapters_minigrid import MiniGrid
 from pgts_torch.models.provenance import overridden
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
 
@@ -115,6 +117,11 @@ class Blackjack(SnapshotAdapter):
         return type(env) is type(own) and (env.natural, env.sab) == (own.natural, own.sab)
 
 
+@functools.lru_cache(maxsize=64)
+def _head(dtype: str, beyond: int | None) -> bytes:
+    return f"{dtype}{beyond}:".encode()
+
+
 @final
 class ClassicControl(SnapshotAdapter):
     """CartPole, Acrobot, MountainCar and Pendulum: the vector `state`, in its dtype, and CartPole's mark of an end."""
@@ -123,16 +130,14 @@ class ClassicControl(SnapshotAdapter):
     restored = frozenset({"state", "steps_beyond_terminated", "last_u", "screen", "clock", "isopen", "surf"})
 
     def get_state(self, env: Any) -> Snapshot:
-        state = np.asarray(env.state)
-        beyond = vars(env).get("steps_beyond_terminated")
-        key = struct.pack("<cq", state.dtype.char.encode(), -1 if beyond is None else beyond) + state.tobytes()
-        return Snapshot(key, key)
+        state, beyond = np.array(env.state), vars(env).get("steps_beyond_terminated")
+        return Snapshot(_head(state.dtype.char, beyond) + state.tobytes(), (state, beyond))
 
     def set_state(self, env: Any, data: Any) -> None:
-        char, beyond = struct.unpack_from("<cq", data)
-        env.state = np.frombuffer(data, char.decode(), offset=9).copy()
+        state, beyond = data
+        env.state = state.copy()
         if "steps_beyond_terminated" in vars(env):
-            env.steps_beyond_terminated = None if beyond < 0 else beyond
+            env.steps_beyond_terminated = beyond
 
     def same_world(self, env: Any, own: Any) -> bool:
         return type(env) is type(own) and _constants(env) == _constants(own)

@@ -1,8 +1,10 @@
 """What a simulator has answered: remembered where no chance was involved, as long as it takes little memory."""
 
-import sys
+import itertools
+import math
+import pickle
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -11,56 +13,44 @@ from pgts_torch.models.snapshots import Snapshot
 _MOST_BYTES = 2**28
 """All answers are dropped once they take more memory than this, roughly."""
 
-_BYTES_OF_AN_ANSWER = 500
-"""What an answer takes beside the state that it led to and its observation."""
+_BYTES_OF_AN_ANSWER, _MEASURED = 500, 100
+"""What an answer takes beside the state that it led to and its observation; of how many answers these are measured."""
 
 Query = tuple[bytes, int, int]
 """The key of a snapshot, an action, and how often it is taken."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
+class Seen:
+    """A state, and what `observe` made of its observation: None while that is not known."""
+
+    snapshot: Snapshot
+    observation: Any = None
+
+
+@dataclass(slots=True)
 class Step:
     """What followed an action.
 
-    observation: what `observe` made of it.   random: whether something else may follow under another key.
+    random: whether something else may follow under another key; None: not known yet.
     """
 
     reward: float
     discount: float
-    child: Snapshot
-    observation: Any
-    random: bool
+    child: Seen
+    random: bool | None
 
 
-@final
-class Answers:
-    """Steps by query."""
-
-    def __init__(self) -> None:
-        self._steps: dict[Query, Step] = {}
-        self.get = self._steps.get
-        self._bytes = 0
-
-    def add(self, query: Query, step: Step) -> None:
-        """Remember a step."""
-        self._steps[query] = step
-        self._bytes += (
-            _BYTES_OF_AN_ANSWER + len(step.child.key) + sys.getsizeof(step.child.data) + _bytes_of(step.observation)
-        )
-
-    def bound(self) -> None:
-        """Drop all if they take too much memory."""
-        if self._bytes > _MOST_BYTES:
-            self.clear()
-
-    def clear(self) -> None:
-        """Drop all."""
-        self._steps.clear()
-        self._bytes = 0
+def take_much_memory(steps: dict[Query, Step]) -> bool:
+    """Whether answers should be dropped, by the mean size of some of them."""
+    some = list(itertools.islice(steps.values(), 0, None, math.ceil(len(steps) / _MEASURED) or 1))
+    return bool(some) and sum(map(_bytes_of, some)) / len(some) * len(steps) > _MOST_BYTES
 
 
 def copied(observation: Any) -> Any:
     """The same in arrays and lists of its own."""
+    if type(observation) is np.ndarray:
+        return observation.copy()
     if isinstance(observation, dict):
         return {name: copied(part) for name, part in observation.items()}
     if isinstance(observation, tuple):
@@ -68,8 +58,13 @@ def copied(observation: Any) -> Any:
     return observation.copy() if isinstance(observation, np.ndarray | list) else observation
 
 
-def _bytes_of(observation: Any) -> int:
-    """The bytes of its arrays."""
+def _bytes_of(step: Step) -> int:
+    """The memory that an answer takes."""
+    snapshot, observation = step.child.snapshot, step.child.observation
+    return _BYTES_OF_AN_ANSWER + len(snapshot.key) + len(pickle.dumps(snapshot.data)) + _bytes_of_arrays(observation)
+
+
+def _bytes_of_arrays(observation: Any) -> int:
     if isinstance(observation, dict | tuple):
-        return sum(map(_bytes_of, observation.values() if isinstance(observation, dict) else observation))
+        return sum(map(_bytes_of_arrays, observation.values() if isinstance(observation, dict) else observation))
     return np.asarray(observation).nbytes

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, check_count, failure
-from pgts_torch.models.answers import Answers, Step
+from pgts_torch.models.answers import Query, Step, take_much_memory
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.environments import Given
 from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, ExactModel, Happened, step_text
@@ -24,8 +24,8 @@ from pgts_torch.models.snapshots import SnapshotAdapter, env_name
 from pgts_torch.models.stepper import Stepper
 from pgts_torch.seeding import SharedGenerators
 
-_KEY_OF_CERTAINTY = 0
-"""The key of steps that must not use any: a step that does is random, and is not enumerated."""
+_ANY_KEY = 0
+"""The key of steps of which it matters only whether they are random."""
 
 
 @final
@@ -81,13 +81,13 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         check_count("action_repeat", action_repeat)
         if action_repeat > 1 and highest_value < math.inf:
             raise PgtsError(f"highest_value is {highest_value}; under repeated actions no bound of v* stays one")
-        self._stepper = stepper = Stepper(env, gamma=gamma, actions=actions, adapter=adapter)
+        self._stepper = stepper = Stepper(env, gamma=gamma, actions=actions, adapter=adapter, observe=self._observed)
         super().__init__(stepper.name, stepper.space, observe, device)
         self.action_repeat, self.adapter, self.actions = action_repeat, stepper.adapter, stepper.actions
         self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value
         self.env, self.dtype = stepper.env, dtype
         self._draws_its_own = draws_its_own(stepper.made)
-        self._sure = Answers()
+        self._sure: dict[Query, Step] = {}
         # The instances whose class, map and constants were compared with the model's own.
         self._compared: list[Any] = []
 
@@ -99,7 +99,8 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
         super().clear()
-        self._sure.bound()
+        if take_much_memory(self._sure):
+            self._sure.clear()
         self._compared.clear()
 
     def root(self, env: gymnasium.Env, observation: Any = None) -> int:
@@ -135,16 +136,15 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             PgtsError: the environment fails, see `sample`.
         """
         # One step for each pair, action by action, in the order of a table [N, A].
-        steps = []
+        states = self._checked("state", state_N, self.num_states)
         with self._watched():
-            for state, action in itertools.product(state_N.tolist(), range(self.num_actions)):
-                step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=self.action_repeat)
-                if step.random:
-                    raise RandomOutcomes(
-                        f"{self.name} is random in state {state} under action {action}: its outcomes cannot be "
-                        "enumerated; search it by `sampled`, or make a TabularModel of it if it has a table P"
-                    )
-                steps.append(step)
+            steps = self._certain(itertools.product(states, range(self.num_actions)))
+        if (random := next((i for i, (step, _) in enumerate(steps) if step.random), None)) is not None:
+            state, action = states[random // self.num_actions], random % self.num_actions
+            raise RandomOutcomes(
+                f"{self.name} is random in state {state} under action {action}: its outcomes cannot be "
+                "enumerated; search it by `sampled`, or make a TabularModel of it if it has a table P"
+            )
         # K = 1: the one outcome of each action has probability 1.
         answer, shape = self._answer(steps), (len(state_N), self.num_actions, 1)
         certain_NAK = torch.ones(shape, dtype=self.dtype, device=self.device)
@@ -158,16 +158,17 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             PgtsError: no such state or action; or the environment raises, or answers with a reward or an observation
                 that is not finite or does not fit its space: naming environment, state, action and key.
         """
-        queries = zip(state_N.tolist(), action_N.tolist(), key_N.tolist(), strict=True)
+        states = self._checked("state", state_N, self.num_states)
+        queries = zip(states, self._checked("action", action_N, self.num_actions), key_N.tolist(), strict=True)
         with self._watched():
-            return self._answer([self._step(*one, repeat=self.action_repeat) for one in queries])
+            return self._answer([self._step(*query, self.action_repeat, self._sure) for query in queries])
 
     def is_random(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Whether chance decides what follows each (state, action), by a step of the simulator; raises as `sample`."""
-        random = []
-        for pair in zip(state_N.tolist(), action_N.tolist(), strict=True):
+        random, states = [], self._checked("state", state_N, self.num_states)
+        for pair in zip(states, self._checked("action", action_N, self.num_actions), strict=True):
             with SharedGenerators() as shared:
-                step = self._step(*pair, _KEY_OF_CERTAINTY, repeat=self.action_repeat)
+                step, _ = self._step(*pair, _ANY_KEY, self.action_repeat, self._sure)
             if shared.used:
                 # A step that used a global generator looked certain, and may have been remembered.
                 self._sure.clear()
@@ -189,13 +190,11 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
                 "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
             )
 
-    def _answer(self, steps: Sequence[Step]) -> Transitions:
-        # By snapshot: a remembered step may be from before `clear`, when its child had another number.
-        child = [self._number[step.child.name] for step in steps]
+    def _answer(self, steps: Sequence[tuple[Step, int]]) -> Transitions:
         return Transitions(
-            torch.tensor([step.reward for step in steps], dtype=self.dtype, device=self.device),
-            torch.tensor([step.discount for step in steps], dtype=self.dtype, device=self.device),
-            torch.tensor(child, dtype=torch.int64, device=self.device),
+            torch.tensor([step.reward for step, _ in steps], dtype=self.dtype, device=self.device),
+            torch.tensor([step.discount for step, _ in steps], dtype=self.dtype, device=self.device),
+            torch.tensor([child for _, child in steps], dtype=torch.int64, device=self.device),
         )
 
     def outcome_of(self, happened: Happened, *, query_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
@@ -210,50 +209,76 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
     def _outcome_of(
         self, state: int, action: int, reward: float, discount: float, next_state: int, follows: bool, query: bool
     ) -> int:
-        step = self._sure.get((self._snapshots[state].key, action, 1))
+        step = self._sure.get((self._seen[state].snapshot.key, action, 1))
         if step is None:
             if not query:
                 return NOT_QUERIED
-            step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=1)
+            step, _ = self._step(state, action, _ANY_KEY, 1, self._sure)
             if step.random:
                 return RANDOM
+        reached = step.child.snapshot
         # Bit for bit, because the same code has made both. A truncated episode cannot have gone on.
-        if step.reward != reward or step.discount != discount or (step.child.cut and follows):
+        if step.reward != reward or step.discount != discount or (reached.cut and follows):
             return CONTRADICTED
         # After an end the next state does not matter.
-        return 0 if discount == 0 or self.adapter.same_state(step.child, self._snapshots[next_state]) else CONTRADICTED
+        return 0 if discount == 0 or self.adapter.same_state(reached, self.snapshot(next_state)) else CONTRADICTED
 
     def outcomes_text(self, state: int, action: int) -> str:
         """The one outcome of a single step."""
-        step = self._step(state, action, _KEY_OF_CERTAINTY, repeat=1)
-        then = self.state_text(self._number[step.child.name]) + step.child.cut * ", where the episode is truncated"
+        step, child = self._step(state, action, _ANY_KEY, 1, self._sure)
+        then = self.state_text(child) + step.child.snapshot.cut * ", where the episode is truncated"
         return step_text(step.reward, step.discount, then)
 
-    def _step(self, state: int, action: int, key: int, *, repeat: int) -> Step:
-        """What follows an action that is taken so many times; from memory where no chance is involved."""
-        self._check("state", state, self.num_states)
-        self._check("action", action, self.num_actions)
-        at = self._snapshots[state]
+    def _certain(self, pairs: Iterable[tuple[int, int]]) -> list[tuple[Step, int]]:
+        """`_step` for each state and action, under repeated actions. The generator is looked at once for all of them:
+        only if something was drawn are they taken again one by one, with a key, to tell which are random."""
+        found: dict[Query, Step] = {}
+        each = list(pairs)
+        self._stepper.chance.watch()
+        answers = [self._step(*pair, None, self.action_repeat, found) for pair in each]
+        if any(step.random is None for step in found.values()) and self._stepper.chance.was_drawn():
+            return [self._step(*pair, _ANY_KEY, self.action_repeat, self._sure) for pair in each]
+        for step in found.values():
+            step.random = False
+        self._sure.update(found)
+        return answers
+
+    def _step(
+        self, state: int, action: int, key: int | None, repeat: int, found: dict[Query, Step]
+    ) -> tuple[Step, int]:
+        """What follows an action that is taken so many times, and the number of the state reached; from memory where no
+        chance is involved.
+
+        Args:
+            key: None: nothing may be random, which the caller sees to.
+            found: where to remember it, if it is certain.
+        """
+        seen = self._seen[state]
+        at = seen.snapshot
         if at.cut:
             # The state leads to itself under its first action alone, see the class.
-            return Step(-math.inf if action else 0.0, 1.0, at, self._observations[state], random=False)
+            return Step(-math.inf if action else 0.0, 1.0, seen, False), state
         query = at.key, action, repeat
         if (known := self._sure.get(query)) is not None:
             # The child gets its number now, so that numbers do not depend on what is remembered.
-            self._known(known.child, known.observation)
-            return known
+            return known, self._enter(known.child)
         taken = self.actions[action]
         try:
-            total, discount, reached, random = self._stepper.follow(
-                at.data, taken, key, repeat=repeat, rewards=self.reward_range
-            )
-            child = self._known(reached, None)
-            self._observe_once(child, lambda: self._stepper.observation(total))
+            step = self._stepper.follow(at.data, taken, key, repeat, self.reward_range)
         except BaseException as error:
-            where = f"{self.name} failed in state {state} under action {action} ({taken!r}) with key {key}"
-            raise failure(where, error) from error
-        # The snapshot and observation by which the state is known, so that equal ones are kept in memory once.
-        step = Step(total, discount, self._snapshots[child], self._observations[child], random)
-        if not random:
-            self._sure.add(query, step)
-        return step
+            where = f"{self.name} failed in state {state} under action {action} ({taken!r})"
+            raise failure(where if key is None else f"{where} with key {key}", error) from error
+        child = self._enter(step.child)
+        # The record by which the state is known, so that equal ones are kept in memory once.
+        step.child = self._seen[child]
+        if not step.random:
+            found[query] = step
+        return step, child
+
+    def _late(self, state: int) -> Any:
+        if not self._stepper.observes_late:
+            return None
+        try:
+            return self._stepper.observation(self._seen[state].snapshot.data)
+        except BaseException as error:
+            raise failure(f"{self.name} failed to observe state {state}", error) from error

@@ -1,6 +1,7 @@
 """Models whose states are snapshots, numbered as they are met, equal ones with the same number."""
 
-from collections.abc import Callable, Iterable
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.answers import copied
+from pgts_torch.models.answers import Seen, copied
 from pgts_torch.models.base import Model
 from pgts_torch.models.snapshots import Snapshot
 
@@ -31,60 +32,56 @@ class SnapshotModel(Model):
         self.name, self._space, self._observe = name, space, observe
         self.device = torch.empty(0, device=device).device
         self.num_states = 0
-        # By number: the snapshot of a state, and what `observe` made of its observation, None where that is unknown.
-        self._snapshots: list[Snapshot] = []
-        self._observations: list[Any] = []
-        # By snapshot: the number.
-        self._number: dict[tuple[bytes, bool], int] = {}
+        # By number: the state. By the name of a snapshot: the number.
+        self._seen: list[Seen] = []
+        self._number: dict[bytes | tuple[bytes, bool], int] = {}
 
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
         self.generation += 1
         self.num_states = 0
-        for kept in (self._snapshots, self._observations, self._number):
-            kept.clear()
+        self._seen.clear()
+        self._number.clear()
 
     def number(self, snapshot: Snapshot, observation: Any = None) -> int:
         """The number of a state: a new one if no equal state was met before."""
-        number = self._known(snapshot, None)
-        if observation is not None:
-            self._observe_once(number, lambda: observation)
+        number = self._enter(Seen(snapshot))
+        if observation is not None and self._seen[number].observation is None:
+            self._seen[number].observation = self._observed(observation)
         return number
 
-    def _observe_once(self, number: int, observation: Callable[[], Any]) -> None:
-        """Remember the observation of a state, if none is known."""
-        if self._observations[number] is None:
-            made = observation()
-            # Copied, because an environment may write into the arrays that it has returned.
-            self._observations[number] = copied(self._observe(made) if self._observe else made)
+    def _observed(self, observation: Any) -> Any:
+        """What is remembered of an observation: copied, as an environment may write into its arrays."""
+        return copied(self._observe(observation) if self._observe else observation)
 
-    def _known(self, snapshot: Snapshot, seen: Any) -> int:
-        """The number of a state with this observation (as `observe` has made it, or None)."""
-        number = self._number.setdefault(snapshot.name, self.num_states)
+    def _enter(self, seen: Seen) -> int:
+        """The number of a state. What is known of its observation here or there is then known in both."""
+        number = self._number.setdefault(seen.snapshot.name, self.num_states)
         if number == self.num_states:
             self.num_states += 1
-            self._snapshots.append(snapshot)
-            self._observations.append(seen)
-        elif self._observations[number] is None:
-            self._observations[number] = seen
+            self._seen.append(seen)
+        elif (known := self._seen[number]).observation is None:
+            known.observation = seen.observation
+        else:
+            seen.observation = known.observation
         return number
 
     def export(self, state_N: Int[Tensor, "N"]) -> list[tuple[Snapshot, Any]]:
         """The snapshot of each state and what `observe` made of its observation, for `adopt` in another process."""
-        return [(self.snapshot(state), self._observations[state]) for state in state_N.tolist()]
+        return [(self.snapshot(state), self._seen[state].observation) for state in state_N.tolist()]
 
     def adopt(self, exported: Iterable[tuple[Snapshot, Any]]) -> Int[Tensor, "N"]:
         """The numbers of states that another model of the same environment has exported."""
-        return torch.tensor([self._known(*one) for one in exported], dtype=torch.int64, device=self.device)
+        return torch.tensor([self._enter(Seen(*one)) for one in exported], dtype=torch.int64, device=self.device)
 
     def snapshot(self, state: int) -> Snapshot:
         """The snapshot behind the number of a state."""
         self._check("state", state, self.num_states)
-        return self._snapshots[state]
+        return self._seen[state].snapshot
 
     def is_cut(self, state_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Whether the episode was truncated in these states, so that no other step follows."""
-        return torch.tensor([self._snapshots[state].cut for state in state_N.tolist()], device=self.device)
+        return torch.tensor([self._seen[state].snapshot.cut for state in state_N.tolist()], device=self.device)
 
     def observations(self, state_N: Int[Tensor, "N"]) -> np.ndarray:
         """What `observe` made of the observation of each state, stacked: [N, ...].
@@ -105,15 +102,30 @@ class SnapshotModel(Model):
 
     def _observation(self, state: int) -> Any:
         self._check("state", state, self.num_states)
-        if (seen := self._observations[state]) is None:
+        seen = self._seen[state]
+        if seen.observation is None:
+            seen.observation = self._late(state)
+        if seen.observation is None:
             raise PgtsError(f"{self.name}: the observation of state {state} was not given, or `observe` made it None")
-        return seen
+        return seen.observation
+
+    @abstractmethod
+    def _late(self, state: int) -> Any:
+        """What is remembered of the observation of a state that was not observed; None where it cannot be made."""
 
     def state_text(self, state: int) -> str:
         """With its observation, or else its snapshot."""
-        seen = self._observations[state]
-        what = repr(self._snapshots[state].key) if seen is None else np.array2string(np.asarray(seen), threshold=20)
+        snapshot, seen = self._seen[state].snapshot, self._seen[state].observation
+        what = repr(snapshot.key) if seen is None else np.array2string(np.asarray(seen), threshold=20)
         return f"state {state} ({what})"
+
+    def _checked(self, what: str, number_N: Int[Tensor, "N"], count: int) -> Sequence[int]:
+        """These numbers, each of them below a count; PgtsError if one is not."""
+        numbers = number_N.tolist()
+        if numbers:
+            self._check(what, min(numbers), count)
+            self._check(what, max(numbers), count)
+        return numbers
 
     def _check(self, what: str, number: int, count: int) -> None:
         if not 0 <= number < count:

@@ -19,8 +19,7 @@ merge surest.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -30,8 +29,7 @@ _MASK = 2**64 - 1
 _ODD = 0x9E3779B97F4A7C15
 
 
-@dataclass(frozen=True, slots=True)
-class Snapshot:
+class Snapshot(NamedTuple):
     """A state of a simulator.
 
     key: equal for equal states.   data: what `SnapshotAdapter.set_state` takes; often the key itself.
@@ -43,9 +41,9 @@ class Snapshot:
     cut: bool = False
 
     @property
-    def name(self) -> tuple[bytes, bool]:
+    def name(self) -> bytes | tuple[bytes, bool]:
         """What tells states apart: one in which an episode was cut off is not the one in which it would go on."""
-        return self.key, self.cut
+        return (self.key, True) if self.cut else self.key
 
 
 class SnapshotAdapter(ABC):

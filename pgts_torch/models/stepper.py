@@ -1,7 +1,6 @@
 """The simulator behind a `SimulatorModel`: one instance of an environment, put into states and stepped."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -10,10 +9,12 @@ from gymnasium import spaces
 from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.actions import all_actions
 from pgts_torch.models.adapters import adapter_for
+from pgts_torch.models.answers import Seen, Step
+from pgts_torch.models.chance import Chance
 from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.rewards import RewardRange
-from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name, generator_state
-from pgts_torch.models.steps import check_step, discount_of, names_discounts, number_of
+from pgts_torch.models.snapshots import SnapshotAdapter, env_name
+from pgts_torch.models.steps import check_observation, check_rewards, discount_of, names_discounts, number_of
 from pgts_torch.models.wrappers import transforms_of
 
 
@@ -23,20 +24,28 @@ class Stepper:
 
     name: of the environment.   env: the instance.   space: of observations, outside of the wrappers.
     actions: as the instance takes them, in the order of their numbers.
-    steps: how often it was stepped.
+    steps: how often it was stepped.   chance: its generator, watched.
 
     Args:
         env, gamma, actions, adapter: as in `SimulatorModel`, which says what is raised.
+        observe: what is kept of an observation.
     """
 
     def __init__(
-        self, env: Given, *, gamma: float, actions: Sequence[Any] | None, adapter: SnapshotAdapter | None
+        self,
+        env: Given,
+        *,
+        gamma: float,
+        actions: Sequence[Any] | None,
+        adapter: SnapshotAdapter | None,
+        observe: Callable[[Any], Any],
     ) -> None:
         self.made = EnvSource.of(env).make_one()
         self.name = env_name(self.made)
         self.env: Any = self.made.unwrapped
         self.adapter = adapter or adapter_for(self.made)
         self.transforms, self.space = transforms_of(self.made), self.made.observation_space
+        self._pays, self._observe = bool(self.transforms.rewards), observe
         # Actions as the outermost wrapper takes them, and as the bare instance does.
         outer = all_actions(self.made.action_space) if actions is None else actions
         self.actions = [self.transforms.action(action) for action in outer]
@@ -50,60 +59,79 @@ class Stepper:
         # What makes the observation of the present state, where steps do not.
         self._show = self.adapter.skip_observations(self.env)
         self._names_discounts, self._gamma = names_discounts(self.env), gamma
-        self._observation: Any = None
+        self._inner_space = self.env.observation_space
+        self.chance = Chance(self.env, self.adapter)
         self.steps = 0
 
-    def follow(
-        self, data: Any, taken: Any, key: int, *, repeat: int, rewards: RewardRange | None
-    ) -> tuple[float, float, Snapshot, bool]:
-        """Take an action so many times, or until the episode ends.
+    @property
+    def observes_late(self) -> bool:
+        """Whether steps make no observation, so that one is made only of a state that is asked for."""
+        return self._show is not None
+
+    def follow(self, data: Any, taken: Any, key: int | None, repeat: int, rewards: RewardRange | None) -> Step:
+        """Take an action so many times, or until the episode ends: the discounted sum of rewards, the product of
+        discounts, and the state reached.
 
         Args:
             data: of the snapshot of the state in which it begins.
             taken: one of `actions`.
-            key: decides what is random.
+            key: decides what is random; None: nothing may be. `Step.random` is None then, where only the generator
+                knows: `chance` can be looked at afterwards, of several steps at once.
             rewards: between which numbers the reward of each step must be.
-
-        Returns:
-            The discounted sum of rewards, the product of discounts, the state reached, and whether chance was involved.
         """
         # total, discount: sum_i gamma_0 ... gamma_{i-1} r_i and gamma_0 ... gamma_{k-1} of the k steps made so far.
-        self.adapter.set_state(self.env, data)
-        total, discount, random = 0.0, 1.0, False
+        env, adapter, shown = self.env, self.adapter, self._show is None
+        adapter.set_state(env, data)
+        total, discount = 0.0, 1.0
+        random: bool | None = False
         for _ in range(repeat):
             # Where the adapter cannot tell whether chance decides, the generator does: it moves if it is drawn from.
             # The key seeds it for the first draw only; later draws of the same outcome go on from there.
-            known = self.adapter.is_random(self.env, taken)
-            if known is not False and not random:
-                self.adapter.seed(self.env, key)
-            before = generator_state(self.env) if known is None else None
-            self._observation, reward, terminated, truncated, info = self.env.step(taken)
+            known = adapter.is_random(env, taken)
+            if known or (known is None and key is not None and not random):
+                self.chance.seed(key or 0)
+            observation, reward, terminated, truncated, info = env.step(taken)
             self.steps += 1
-            random |= generator_state(self.env) != before if known is None else known
+            if known is None and key is not None:
+                known = self.chance.was_drawn()
+            if known or random is False:
+                random = known
             # What is not finite or does not fit its space is found before it is transformed.
-            if self._show is None:
-                self._checked(self._observation, number_of("reward", reward))
-            reward = number_of("reward", self.transforms.reward(reward))
+            reward = number_of("reward", reward)
+            check_rewards(reward)
+            if shown:
+                check_observation(self._inner_space, observation)
+            if self._pays:
+                reward = number_of("reward", self.transforms.reward(reward))
             if rewards is not None:
                 rewards.check(reward)
             total += discount * reward
-            discount *= 0.0 if terminated else discount_of(info, self._gamma, named=self._names_discounts)
+            if terminated:
+                discount = 0.0
+            elif self._names_discounts:
+                discount *= discount_of(info, self._gamma, named=True)
+            else:
+                discount *= self._gamma
             if discount == 0 or truncated:
                 break
         # Truncation is part of the state, unless the episode has also ended: then nothing follows anyway.
-        reached = self.adapter.get_state(self.env)
-        return total, discount, replace(reached, cut=True) if truncated and discount else reached, random
+        reached = adapter.get_state(env)
+        if truncated and discount:
+            reached = reached._replace(cut=True)
+        return Step(total, discount, Seen(reached, self._kept(observation) if shown else None), random)
 
-    def observation(self, reward: float) -> Any:
-        """The observation of the state that `follow` has reached, outside of the wrappers and in the dtype that their
-        space declares. It is checked beside a reward where steps make none."""
-        inner = self._observation if self._show is None else self._checked(self._show(), reward)
-        if not self.transforms.observations:
-            return inner
-        outside = self.transforms.observation(inner)
-        return np.asarray(outside, self.space.dtype) if isinstance(self.space, spaces.Box) else outside
+    def observation(self, data: Any) -> Any:
+        """The observation of a state by the data of its snapshot, where steps make none."""
+        assert self._show is not None
+        self.adapter.set_state(self.env, data)
+        inner = self._show()
+        check_observation(self._inner_space, inner)
+        return self._kept(inner)
 
-    def _checked(self, observation: Any, reward: float) -> Any:
-        """The observation; PgtsError unless it and the reward are what the environment declares."""
-        check_step(self.env.observation_space, observation, reward)
-        return observation
+    def _kept(self, observation: Any) -> Any:
+        """What is kept of an observation outside of the wrappers, in the dtype that their space declares."""
+        if self.transforms.observations:
+            observation = self.transforms.observation(observation)
+            if isinstance(self.space, spaces.Box):
+                observation = np.asarray(observation, self.space.dtype)
+        return self._observe(observation)

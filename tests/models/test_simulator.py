@@ -12,8 +12,8 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError
-from pgts_torch.models import SimulatorModel, TabularModel
+from pgts_torch.errors import PgtsError, RandomOutcomes
+from pgts_torch.models import SimulatorModel, TabularModel, chance, snapshots, stepper
 from pgts_torch.models.actions import all_actions, grid_actions, sampled_actions
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.snapshots import generator_state
@@ -244,6 +244,10 @@ def test_only_distinct_states_are_observed_and_an_observation_that_a_subclass_ma
         model = SimulatorModel(lambda make=make: make(size=5), gamma=0.9, observe=lambda seen: seen["image"])
         observed.clear()
         look = expectimax(model, torch.tensor([model.root(env, observation)]), depth=2, v_leaf=zeros)
+        # Late, where nothing but the environment itself makes them: only those that somebody asks for.
+        assert len(observed) == (0 if make is doorkey else look.model_calls)
+        for _ in range(2):
+            model.observations(torch.arange(model.num_states))
         assert len(observed) == (model.num_states - 1 if make is doorkey else look.model_calls)
         images.append(model.observations(torch.tensor([1]))[0])
     assert look.model_calls > 2 * model.num_states
@@ -319,6 +323,55 @@ def test_a_search_leaves_the_environment_it_starts_from_bit_identical(id, monkey
         (seen, *rest), (expected, *other) = env.step(action), twin.step(action)
         assert np.array_equal(seen, expected)
         assert rest[:3] == other[:3]
+
+
+# Work for a call
+
+
+def counting(monkeypatch: pytest.MonkeyPatch, place: Any, name: str) -> list[None]:
+    """One entry for each call of a function from here on."""
+    calls, real = [], getattr(place, name)
+    monkeypatch.setattr(place, name, lambda *args, **kwargs: calls.append(None) or real(*args, **kwargs))
+    return calls
+
+
+@pytest.mark.parametrize("count", [1, 40])
+def test_a_batch_of_calls_reads_no_generator_and_makes_as_many_tensors_as_one(count, monkeypatch):
+    model = SimulatorModel("CartPole-v1", gamma=0.9)
+    root_B = model.roots([reset(gymnasium.make("CartPole-v1"), seed) for seed in range(count + 1)])
+    model.outcomes(root_B[:1])
+    states, seeds = counting(monkeypatch, chance, "generator_state"), counting(monkeypatch, snapshots, "reseed")
+    checks, tensors = counting(monkeypatch, stepper, "check_observation"), counting(monkeypatch, torch, "tensor")
+    model.outcomes(root_B[1:])
+    assert (len(states), len(seeds), len(checks), len(tensors)) == (0, 0, 2 * count, 3)
+
+
+class Gusty(Corridor):
+    """A corridor in which steps to the right draw by a method that was taken from the generator before the first
+    step, so that nothing of the environment is read as they draw."""
+
+    def reset(self, **kwargs):
+        answer = super().reset(**kwargs)
+        self.gust = self.np_random.random
+        return answer
+
+    def step(self, action):
+        if action == 6:
+            self.gust()
+        return super().step(action)
+
+
+def test_a_draw_is_noticed_however_it_is_made_and_only_where_it_is_made():
+    model = SimulatorModel(lambda: Gusty(slip=0.0), gamma=0.9)
+    root_B = torch.tensor([model.root(reset(Gusty(slip=0.0), 0))])
+    assert model.is_random(root_B.repeat(2), torch.tensor([0, 1])).tolist() == [False, True]
+    for _ in range(2):
+        with pytest.raises(RandomOutcomes, match="is random in state 0 under action 1"):
+            model.outcomes(root_B)
+    # What was certain in such a batch is remembered, and nothing else.
+    steps = model.simulator_steps
+    model.sample(root_B.repeat(2), torch.tensor([0, 1]), key_N=keys(2))
+    assert model.simulator_steps == steps + 1
 
 
 # Observations, clearing, devices

@@ -13,7 +13,10 @@ from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from pgts_torch.errors import MissingModel
 from pgts_torch.models.actions import all_actions, sampled_actions
 from pgts_torch.models.adapters import OwnState, ToyText, adapter_for
+from pgts_torch.models.adapters_minigrid import NO_STATE
 from pgts_torch.models.environments import EnvSource
+from pgts_torch.models.minigrid_pickles import text_of
+from pgts_torch.models.minigrid_templates import Template
 from pgts_torch.models.snapshots import SnapshotAdapter, generator_state, reseed
 from pgts_torch.seeding import numpy_stream
 from tests.models.corridors import Bare, Corridor, Forgetful, InBytes
@@ -165,6 +168,59 @@ def test_two_ways_to_a_state_give_equal_snapshots(id):
     assert (ends[0] == start.key) == (id == "CliffWalking-v1")  # MiniGrid counts its steps
     walk(env, [0])
     assert adapter.get_state(env).key != ends[0]
+
+
+def whole_text(env: Any) -> bytes:
+    """All values of a state of MiniGrid by the slow way, which pickles them."""
+    return text_of({name: value for name, value in vars(env).items() if name not in NO_STATE}, env)
+
+
+@pytest.mark.parametrize(
+    "id", ["MiniGrid-DoorKey-5x5-v0", "MiniGrid-ObstructedMaze-1Dlhb-v0", "MiniGrid-Fetch-5x5-N2-v0", "BabyAI-Open-v0"]
+)
+def test_templates_tell_the_states_of_minigrid_apart_as_pickles_do(id):
+    env, random = made(id).unwrapped, numpy_stream(0, "templates", id)
+    adapter, texts, keys = adapter_for(env), dict[bytes, bytes](), dict[bytes, bytes]()
+    for seed in (0, 1, 2, 0):
+        env.reset(seed=seed)
+        for _ in range(60):
+            snapshot, text = adapter.get_state(env), whole_text(env)
+            assert texts.setdefault(snapshot.key, text) == text
+            assert keys.setdefault(text, snapshot.key) == snapshot.key
+            adapter.set_state(env, snapshot.data)
+            assert (whole_text(env), adapter.get_state(env).key) == (text, snapshot.key)
+            # Picking up, dropping and toggling change what lies in the grid.
+            env.step(int(random.choice([0, 1, 2, 2, 2, 3, 4, 5])))
+    assert len(texts) > 100
+
+
+def test_only_what_a_step_has_changed_is_read_again(monkeypatch):
+    env = made("MiniGrid-DoorKey-5x5-v0").unwrapped
+    env.reset(seed=0)
+    adapter, read, real = adapter_for(env), list[str](), Template.__init__
+    snapshot = adapter.get_state(env)
+    monkeypatch.setattr(Template, "__init__", lambda *args: read.append(args[1].type) or real(*args))
+    adapter.set_state(env, snapshot.data)
+    adapter.get_state(env)
+    assert read == []
+    (door,) = (cell for cell in env.grid.grid if cell is not None and cell.type == "door")
+    door.is_locked = False
+    changed = adapter.get_state(env)
+    assert read == ["door"]
+    assert changed.key != snapshot.key
+    adapter.set_state(env, snapshot.data)
+    assert adapter.get_state(env).key == snapshot.key
+
+
+def test_an_object_that_lies_in_two_cells_is_one_object_when_it_is_restored():
+    env = made("MiniGrid-DoorKey-5x5-v0").unwrapped
+    env.reset(seed=0)
+    (key,) = (cell for cell in env.grid.grid if cell is not None and cell.type == "key")
+    env.grid.grid[env.grid.grid.index(None)] = key
+    adapter = adapter_for(env)
+    adapter.set_state(env, adapter.get_state(env).data)
+    first, second = (cell for cell in env.grid.grid if cell is not None and cell.type == "key")
+    assert first is second
 
 
 @pytest.mark.parametrize("id", [*CORE, "MiniGrid-Dynamic-Obstacles-5x5-v0", "Ant-v5"])
