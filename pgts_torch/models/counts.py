@@ -52,18 +52,21 @@ class _Memory:
 class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel):
     """A table of S numbered states, which are also the observations, learned by counting.
 
-        P(s', d | s, a) = (1 - u) n(s, a, s', d) / n(s, a),        r(s, a) = (1 - u) mean reward + u worth
+        P(s', d | s, a) = (1 - u) (n(s, a, s', d) + 1) / (n(s, a) + k),        r(s, a) = sum P r(s, a, s', d) + u worth
 
-    for each outcome (next state s', discount d) that was seen. With probability u (`Counts.optimism`) there is an
+    for each of the k outcomes (next state s', discount d) that the pair has had: the mean of the posterior, if all
+    their probabilities are equally likely at first (Laplace). With probability u (`Counts.optimism`) there is an
     unknown outcome, which has discount 0: it pays what it is worth, and nothing follows. So optimism (Brafman and
     Tennenholtz 2002; Strehl and Littman 2008; Osband, Russo and Van Roy 2013) is in the outcomes alone.
 
-    Without `value_range` the unknown is worth what the rewards seen so far allow,
+    Without `value_range` values are at most what the rewards seen so far allow,
 
         max(0, largest reward at an end, largest other reward / (1 - gamma)),
 
     and where that is 0 although some reward was 0, max |r| / (1 - gamma), or 1 where all rewards were 0: until
-    something is better than nothing, the unknown is. The lower end of the range is the min of the same three.
+    something is better than nothing, the unknown is. The lower end of the range is the min of the same three. The
+    unknown is worth the upper end, and at least twice what the largest reward that ends nothing is worth for ever: else
+    it would never be worth leaving the place that pays it.
 
     A learned table proves nothing: it is not exact, has no highest value, and is never certain. Memory grows with the
     distinct outcomes seen.
@@ -131,7 +134,13 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
     @property
     def unknown_worth(self) -> float:
         """What an unknown outcome is worth."""
-        return self.value_range[self.options.optimism != "none"]
+        low, high = self.value_range
+        if self.options.optimism == "none":
+            return low
+        if self.options.value_range is None:
+            going_on_C = self.counts.reward_C[self.counts.discount_C > 0]
+            high = max(high, 2 * float(going_on_C.max(initial=0)) / (1 - self.gamma))
+        return high
 
     def plain(self) -> "CountsModel":
         """The same table without optimism. It goes on learning with this one, and so needs a `Topology` of its own."""
@@ -160,7 +169,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
             e(s, a) = (u - l) min(1, sqrt( ln(2^{S+1} S A n (n + 1) / (1 - c)) / 2n ) + TV)
 
         bounds the error for all v in [l, u]^S, all pairs and all n, so whatever the visits were chosen by; n is the
-        number of visits, TV the distance in total variation from what was seen, 0 without optimism (docs/theory.md,
+        number of visits, TV the distance in total variation from the shares that were seen (docs/theory.md,
         Sec. 8; Hoeffding's inequality over the corners of the cube, as in Weissman et al. 2003).
         """
         confidence = self.options.confidence
@@ -194,7 +203,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         last `learn` as before it, unless no pair has had two outcomes so far.
         """
         memory, news = self._memory, False
-        least = 1 + self._extra(memory.counts) if self.options.optimism == "rmax" else 1
+        least = 1 + math.floor(self._extra(memory.counts)) if self.options.optimism == "rmax" else 1
         for pair in (observation_B * self.num_actions + action_B).tolist():
             memory.since[pair] += 1
             before = memory.counts.visits(pair)
@@ -267,7 +276,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
 
     def _extra(self, counts: OutcomeCounts) -> float:
         """c of `Counts.optimism`."""
-        return self.options.strength * (counts.most - 1)
+        return self.options.strength * (counts.most - 1 or 1 / (1 + counts.num_repeated))
 
     def _probabilities(self, counts: OutcomeCounts) -> Probabilities:
         optimism, visits_C = self.options.optimism, counts.summed(counts.count_C)
@@ -277,18 +286,19 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         if optimism == "none":
             unknown_C = np.zeros(len(visits_C))
         elif optimism == "rmax":
-            unknown_C = (visits_C < 1 + self._extra(counts)).astype(np.float64)
+            unknown_C = (visits_C <= self._extra(counts)).astype(np.float64)
         elif optimism == "bonus":
             unknown_C = np.minimum(1, self._extra(counts) / np.sqrt(visits_C))
         else:
             unknown_C = self._extra(counts) / (visits_C + self._extra(counts))
-        return (1 - unknown_C) * (counts.count_C / visits_C), unknown_C
+        sizes_C = np.repeat(counts.size_P, counts.size_P)
+        return (1 - unknown_C) * ((counts.count_C + 1) / (visits_C + sizes_C)), unknown_C
 
     def _sampled(self, counts: OutcomeCounts, generator: torch.Generator) -> Probabilities:
-        """From the Dirichlet distribution with a count for each outcome of a pair, and c for the unknown one."""
+        """From the Dirichlet distribution with a count and 1 for each outcome of a pair, and c for the unknown one."""
         seed = torch.randint(2**62, (1,), generator=generator, device=generator.device)
         random = np.random.default_rng(int(seed))
-        gamma_C = random.standard_gamma(counts.count_C)
+        gamma_C = random.standard_gamma(counts.count_C + 1)
         unknown_C = np.repeat(random.standard_gamma(self._extra(counts), len(counts.size_P)), counts.size_P)
         total_C = counts.summed(gamma_C) + unknown_C
         return gamma_C / total_C, unknown_C / total_C

@@ -49,6 +49,12 @@ class OutcomeCounts:
         """The largest number of outcomes that a pair has had; 1 where nothing was seen."""
         return int(self.size_P.max(initial=1))
 
+    @cached_property
+    def num_repeated(self) -> int:
+        """How many pairs were visited more than once."""
+        first_P = np.cumsum(self.size_P) - self.size_P
+        return int((np.add.reduceat(self.count_C, first_P) > 1).sum()) if len(first_P) else 0
+
     def summed(self, column_C: np.ndarray) -> np.ndarray:
         """Of each outcome, the sum of a column over all outcomes of its pair."""
         if not len(column_C):

@@ -26,14 +26,16 @@ class Counts(Part):
 
     type: Literal["counts"] = "counts"
 
-    optimism: Literal["rmax", "bonus", "prior", "posterior", "none"] = "posterior"
+    optimism: Literal["rmax", "bonus", "prior", "posterior", "none"] = "prior"
     """The probability u of an unknown outcome after n visits to a state and action: 1 for n = 0, and then, with c =
-    strength (K - 1) and K the largest number of outcomes that any of them has had, rmax: 1 below 1 + c visits, else 0;
-    bonus: c / sqrt(n), at most 1; prior: c / (n + c); posterior: sampled, with that mean, as the probabilities of all
-    outcomes are; none: 0. An unknown outcome is worth the upper end of the value range; with none, the lower end."""
+    strength (K - 1) and K the largest number of outcomes that any of them has had, rmax: 1 up to c visits, else 0;
+    bonus: c / sqrt(n), at most 1; prior: c / (n + c); posterior: sampled, as the probabilities of all outcomes are,
+    from a Dirichlet distribution with c for the unknown; none: 0. An unknown outcome is worth the upper end of the
+    value range, or somewhat more where that follows from rewards; with none, the lower end."""
 
-    strength: Positive | None = null(rmax=4.0, bonus=0.1, prior=0.2, posterior=0.2)
-    """How many more visits each further outcome asks for. Where nothing has had two outcomes, one visit is enough."""
+    strength: Positive | None = null(rmax=4.0, bonus=0.3, prior=1.0, posterior=1.0)
+    """How many more visits each further outcome asks for. Where nothing has had two outcomes, it is divided by 1 + the
+    number of states and actions that were visited more than once: the more of them were certain, the more are."""
 
     value_range: Ascending | None = None
     """The lowest and the highest value of a state, in reward units; null: what the rewards seen so far allow."""

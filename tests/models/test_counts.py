@@ -13,6 +13,7 @@ from pgts_torch.options import Counts
 from pgts_torch.search import Topology, expectimax
 from pgts_torch.seeding import mix, numpy_stream, stream
 from pgts_torch.tabular import TabularMDP, exact
+from pgts_torch.tabular.zoo import river_swim
 from tests.support import random_policy, zoo
 
 CERTAIN = ["ladder", "tightrope", "combination_lock", "CliffWalking", "Taxi"]
@@ -99,8 +100,13 @@ def test_one_call_learns_what_many_calls_do():
         assert column.equal(many.state_dict()[name])
     other = learned(mdp, Experience(*(column[1:] for column in experience)))
     assert not one.outcomes(torch.arange(30)).reward_NA.equal(other.outcomes(torch.arange(30)).reward_NA)
-    mean_NA = torch.zeros(90, dtype=torch.float64).index_add(0, pair_N, experience.reward_N) / pair_N.bincount()
-    torch.testing.assert_close(one.outcomes(torch.arange(30)).reward_NA.flatten(), mean_NA)
+    # Each outcome counts once more than it was seen, with the mean of its rewards.
+    seen = list(zip(pair_N.tolist(), experience.next_observation_N.tolist(), strict=True))
+    of = {key: [r for k, r in zip(seen, experience.reward_N.tolist(), strict=True) if k == key] for key in set(seen)}
+    for pair in range(90):
+        mean = [(len(rewards) + 1, sum(rewards) / len(rewards)) for key, rewards in of.items() if key[0] == pair]
+        expected = sum(n * r for n, r in mean) / sum(n for n, _ in mean)
+        assert float(one.outcomes(torch.tensor([pair // 3])).reward_NA[0, pair % 3]) == pytest.approx(expected)
 
 
 def test_a_next_state_with_an_end_and_without_one_are_two_outcomes():
@@ -108,10 +114,10 @@ def test_a_next_state_with_an_end_and_without_one_are_two_outcomes():
     for discount, reward in [(0.9, 1.0), (0.0, 4.0), (0.9, 3.0), (0.9, 5.0)]:
         model.learn(step(0, 1, reward, 2, discount), generator=stream(0, "learn"))
     outcomes = model.outcomes(torch.tensor([0]))
-    assert outcomes.prob_NAK[0].tolist() == [[0.0, 0.0, 1.0], [0.25, 0.75, 0.0]]
+    assert outcomes.prob_NAK[0].tolist() == [[0.0, 0.0, 1.0], [2 / 6, 4 / 6, 0.0]]
     assert outcomes.discount_NAK[0, 1].tolist() == [0.0, 0.9, 0.0]
     assert outcomes.child_NAK[0].tolist() == [[0, 0, 0], [2, 2, 0]]
-    assert outcomes.reward_NA[0].tolist() == [0.0, 3.25]
+    assert outcomes.reward_NA[0].tolist() == [0.0, pytest.approx(4.0 * 2 / 6 + 3.0 * 4 / 6)]
 
 
 def test_sampled_outcomes_have_the_probabilities_of_those_that_are_enumerated():
@@ -158,10 +164,9 @@ def test_the_unknown_becomes_less_probable_with_each_visit_where_outcomes_differ
     for model in visited.values():
         assert unknown(model, 0, 0) == 1
         model.learn(step(0, 0, 0.0, 1), generator=stream(0, "learn"))
-        assert unknown(model, 0, 0) == 0  # nothing has had two outcomes so far
         model.learn(step(0, 0, 0.0, 2), generator=stream(0, "learn"))
     for n in range(2, 12):
-        expected = {"rmax": float(n < 4.5), "bonus": min(1, 2 / math.sqrt(n)), "prior": 2 / (n + 2), "none": 0.0}
+        expected = {"rmax": float(n <= 3.5), "bonus": min(1, 2 / math.sqrt(n)), "prior": 2 / (n + 2), "none": 0.0}
         assert {name: unknown(visited[name], 0, 0) for name in expected} == pytest.approx(expected)
         assert unknown(visited["rmax"], 1, 0) == 1
         for model in visited.values():
@@ -169,6 +174,20 @@ def test_the_unknown_becomes_less_probable_with_each_visit_where_outcomes_differ
 
 
 LESS = [("rmax", 3.5), ("bonus", 2.0), ("prior", 2.0), ("none", None)]
+
+
+def test_the_more_pairs_were_certain_the_less_is_unknown_of_one_that_was_visited_once():
+    models = {name: CountsModel(9, 1, gamma=0.9, options=Counts(optimism=name)) for name in ("rmax", "prior", "bonus")}
+    for model in models.values():
+        model.learn(step(8, 0, 0.0, 1), generator=stream(0, "learn"))
+    for repeated in range(8):  # states 0 to 7, visited twice, always with the same outcome
+        shares = {name: unknown(model, 8, 0) for name, model in models.items()}
+        c = 1 / (1 + repeated)
+        assert shares == pytest.approx({"rmax": float(repeated < 4), "prior": c / (1 + c), "bonus": 0.3 * c})
+        assert unknown(models["rmax"].plain(), 8, 0) == 0
+        for model in models.values():
+            for _ in range(2):
+                model.learn(step(repeated, 0, 0.0, 1), generator=stream(0, "learn"))
 
 
 def test_sampled_probabilities_have_the_mean_of_the_prior_and_change_with_each_call():
@@ -179,10 +198,9 @@ def test_sampled_probabilities_have_the_mean_of_the_prior_and_change_with_each_c
     for n in range(4, 1004):
         model.learn(step(1, 0, 0.0, 1 + n % 2), generator=generator)
         samples.append(unknown(model, 0, 0))
-    # Dirichlet(3, 2): mean 0.4, standard deviation 0.2; before the first two there is nothing unknown
-    assert samples[0] == 0 < samples[1]
-    assert np.mean(samples[1:]) == pytest.approx(0.4, abs=5 * 0.2 / math.sqrt(1000))
-    assert np.std(samples[1:]) == pytest.approx(0.2, rel=0.15)
+    # Dirichlet(3 + 1, 2): mean 1/3, standard deviation 0.178
+    assert np.mean(samples[1:]) == pytest.approx(1 / 3, abs=5 * 0.178 / math.sqrt(1000))
+    assert np.std(samples[1:]) == pytest.approx(0.178, rel=0.15)
     assert len(set(samples[1:])) == 999
 
 
@@ -206,8 +224,31 @@ def test_the_unknown_is_worth_what_the_rewards_seen_allow(paid, expected, scale)
         model.learn(step(state, 0, scale * reward, 1, 0.9 * goes_on), generator=stream(0, "learn"))
     scale = scale if any(reward for reward, _ in paid) else 1.0
     assert model.value_range == pytest.approx((scale * expected[0], scale * expected[1]))
-    assert model.unknown_worth == model.value_range[1]
+    lasting = max((2 * scale * reward / (1 - 0.9) for reward, goes_on in paid if goes_on), default=0)
+    assert model.unknown_worth == pytest.approx(max(model.value_range[1], lasting))
     assert model.plain().unknown_worth == model.value_range[0]
+
+
+def test_a_small_reward_that_can_be_had_for_ever_is_left_for_what_is_unknown():
+    mdp = river_swim(6)
+
+    def farthest(options: Counts) -> int:
+        """The last state that is visited in 600 steps which are optimal in the table so far."""
+        model, state, last = learned(mdp, None, options, gamma=0.99), 0, 0
+        q_SA = torch.zeros(mdp.num_states, mdp.num_actions, dtype=torch.float64)
+        best_S = looked(model, q_SA, 200).argmax(-1)
+        for number in range(600):
+            pair_1 = torch.tensor([state * mdp.num_actions + int(best_S[state])])
+            made = steps(mdp, pair_1, seed=number)
+            model.learn(made, generator=stream(number, "learn"))
+            if model.is_news(made.observation_N, made.action_N) or number % 20 == 0:
+                best_S = looked(model, q_SA, 200).argmax(-1)
+            state = int(made.next_observation_N)
+            last = max(last, state)
+        return last
+
+    assert farthest(Counts(optimism="prior")) == mdp.num_states - 1
+    assert farthest(Counts(optimism="prior", value_range=[0.0, 0.5])) <= 1  # what staying is worth
 
 
 @pytest.mark.parametrize("optimism", ["rmax", "bonus", "prior", "posterior", "none"])
@@ -270,7 +311,7 @@ def test_a_plain_table_learns_with_the_optimistic_one_and_a_search_notices():
     assert (q(model), q(plain)) == ([7.0, 7.0, 7.0], [-5.0, -5.0, -5.0])
     expectimax(plain, torch.tensor([0]), depth=0, v_leaf=lambda state_N: state_N.double(), topology=topology)
     model.learn(step(0, 0, 2.0, 1), generator=stream(0, "learn"))
-    assert (q(model), q(plain)) == ([2.0, 7.0, 7.0], [2.0, -5.0, -5.0])
+    assert (q(model), q(plain)) == ([(2.0 + 7.0) / 2, 7.0, 7.0], [2.0, -5.0, -5.0])
     with pytest.raises(PgtsError, match="new topology"):
         expectimax(plain, torch.tensor([0]), depth=0, v_leaf=lambda state_N: state_N.double(), topology=topology)
     before = model.generation
