@@ -2,6 +2,7 @@
 
 A tabular MDP is a table of outcomes for all its states. A level of a lookahead is a table of outcomes for its frontier.
 Both are `Outcomes` and both are backed up by `backup`, so exact values and searches cannot differ in what they compute.
+On the CPU the loops of `bellman_kernels` do what the torch code says.
 """
 
 import warnings
@@ -9,15 +10,21 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
-import scipy.sparse
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.compiled import can_compile
+
 _INT32_LIMIT = 2**31
 
-LARGE = 2**23
-"""From so many outcomes on, `Outcomes.expected` uses scipy."""
+_LARGE = 2**20
+"""From so many outcomes on torch divides a product among its threads; compiled loops take one."""
+
+COMPILED_FROM = 256
+"""From so many outcomes on, backups are compiled where they can be. For fewer, loading what is compiled takes longer
+than it saves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,36 +73,31 @@ class Outcomes:
     def weight(self) -> Tensor:
         """Sparse CSR matrix of p_k gamma_k, shape [N * A, num_children]; its indices are int32 where they fit,
         which makes its product with a vector two to four times faster than int64 does."""
-        N, A, K = self.child_NAK.shape
         # Row n A + a holds exactly the K outcomes of (n, a), padding and repeated children included: so the arrays are
         # those of this table, and nothing is sorted or added up.
-        index = torch.int32 if max(N * A * K, self.num_children) < _INT32_LIMIT else torch.int64
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
-            return torch.sparse_csr_tensor(
-                torch.arange(N * A + 1, dtype=index, device=self.device) * K,
-                self.child_NAK.reshape(-1).to(index),
-                (self.prob_NAK * self.discount_NAK).reshape(-1),
-                size=(N * A, self.num_children),
-                check_invariants=False,
-            )
+        narrow = max(self.child_NAK.numel(), self.num_children) < _INT32_LIMIT
+        child = self.child_NAK.reshape(-1).to(torch.int32 if narrow else torch.int64)
+        return _rows((self.prob_NAK * self.discount_NAK).reshape(-1), child, self.num_outcomes, self.num_children)
 
-    @cached_property
-    def _scipy_weight(self) -> scipy.sparse.csr_array:
-        """`weight` as scipy sees it, in the same memory."""
-        arrays = (self.weight.values(), self.weight.col_indices(), self.weight.crow_indices())
-        return scipy.sparse.csr_array(
-            tuple(array.numpy() for array in arrays), shape=(self.weight.shape[0], self.num_children), copy=False
-        )
+    @property
+    def is_compiled(self) -> bool:
+        """Whether `backup` and `sweep` are compiled."""
+        size = self.child_NAK.numel()
+        if size < COMPILED_FROM or self.dtype not in (torch.float64, torch.float32):
+            return False
+        return (size < _LARGE or torch.get_num_threads() == 1) and can_compile(self.device)
+
+    def taken(self, action_N: Int[Tensor, "N"]) -> tuple[Float[Tensor, "N"], Tensor]:
+        """The rewards and the rows of `weight` of one action of each state."""
+        N, A, K = self.child_NAK.shape
+        row_N = torch.arange(0, N * A, A, device=self.device) + action_N
+        columns = (self.weight.values(), self.weight.col_indices())
+        values, child = (x.view(N * A, K).index_select(0, row_N).view(-1) for x in columns)
+        return self.reward_NA.reshape(-1).index_select(0, row_N), _rows(values, child, K, self.num_children)
 
     def expected(self, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
         """sum_k p_k gamma_k v(s'_k)."""
-        # Where memory is the limit scipy's product is up to a third faster than torch's; before that it is slower.
-        if self.device.type == "cpu" and self.child_NAK.numel() >= LARGE:
-            product = torch.from_numpy(self._scipy_weight @ v_C.numpy())
-        else:
-            product = torch.mv(self.weight, v_C)
-        return product.view(self.reward_NA.shape)
+        return torch.mv(self.weight, v_C).view(self.reward_NA.shape)
 
     def rows(self, row_N: Int[Tensor, "N"]) -> Self:
         """The outcomes of some of the states, in the given order."""
@@ -147,24 +149,87 @@ def backup(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
     Returns:
         q, in the dtype of `outcomes`; it carries no gradient.
     """
+    _check_values(outcomes, v_C)
     with torch.no_grad():
+        if outcomes.is_compiled:
+            q_NA = torch.empty(outcomes.reward_NA.shape, dtype=outcomes.dtype)
+            _compiled(outcomes.reward_NA, outcomes.weight, v_C, 1, q_NA)
+            return q_NA
         # In place: a second table of N * A fresh numbers would cost as much as the product itself.
         return outcomes.expected(v_C.detach()).add_(outcomes.reward_NA)
 
 
-def sweep(outcomes: Outcomes, v_S: Float[Tensor, "S"], times: int) -> Float[Tensor, "S"]:
+def sweep(
+    outcomes: Outcomes, v_S: Float[Tensor, "S"], times: int, action_S: Int[Tensor, "S"] | None = None
+) -> Float[Tensor, "S"]:
     """The values after `times` sweeps of value iteration, for outcomes whose children are these same states.
 
-        v(s) <- max_a q(s, a),   q = `backup` of v
+        v(s) <- max_a q(s, a),   or  q(s, action(s)) where actions are given,   q = `backup` of v
 
     The sweeps share two buffers: that takes half the time of separate backups where states are few and the calls cost
     most, and no fresh memory where they are many.
     """
+    _check_values(outcomes, v_S)
     with torch.no_grad():
-        reward = outcomes.reward_NA.reshape(-1)
+        reward_NA, weight = outcomes.reward_NA, outcomes.weight
+        if action_S is not None:
+            reward_N, weight = outcomes.taken(action_S)
+            reward_NA = reward_N.unsqueeze(1)
+        if outcomes.is_compiled and times:
+            return _compiled(reward_NA, weight, v_S, times)
+        reward = reward_NA.reshape(-1)
         q, v_S = torch.empty_like(reward), v_S.clone()
-        q_NA = q.view(outcomes.reward_NA.shape)
+        q_NA = q.view(reward_NA.shape)
         for _ in range(times):
-            torch.addmv(reward, outcomes.weight, v_S, out=q)
+            torch.addmv(reward, weight, v_S, out=q)
             torch.amax(q_NA, -1, out=v_S)
         return v_S
+
+
+def _rows(values: Tensor, child: Tensor, K: int, num_children: int) -> Tensor:
+    """The sparse matrix whose rows have K entries each."""
+    index = child.dtype
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(
+            torch.arange(len(child) // K + 1, dtype=index, device=child.device) * K,
+            child,
+            values,
+            size=(len(child) // K, num_children),
+            check_invariants=False,
+        )
+
+
+def _check_values(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> None:
+    # Compiled loops read v without looking at its length, and torch makes room of its own for what does not fit.
+    if len(v_C) != outcomes.num_children or v_C.dtype != outcomes.dtype:
+        raise RuntimeError(
+            f"v has size {len(v_C)} and dtype {v_C.dtype}; "
+            f"the outcomes have {outcomes.num_children} children and dtype {outcomes.dtype}"
+        )
+
+
+def _compiled(
+    reward_NA: Float[Tensor, "N A"],
+    weight: Tensor,
+    v_C: Float[Tensor, "C"],
+    times: int,
+    q_NA: Float[Tensor, "N A"] | None = None,
+) -> Float[Tensor, "N"]:
+    """The values after `times` >= 1 sweeps, compiled; q of the last one is written to `q_NA`."""
+    from pgts_torch import bellman_kernels
+
+    child, A = weight.col_indices().numpy(), reward_NA.shape[1]
+    v = v_C.detach().contiguous().numpy()
+    return torch.from_numpy(
+        bellman_kernels.back_up(
+            reward_NA.detach().reshape(-1).numpy(),
+            weight.values().numpy(),
+            child.view(np.uint32 if child.dtype == np.int32 else np.uint64),
+            A,
+            len(child) // (len(reward_NA) * A),
+            v,
+            times,
+            v[:0] if q_NA is None else q_NA.view(-1).numpy(),
+        )
+    )

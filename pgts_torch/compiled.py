@@ -9,6 +9,7 @@ folder for such files; NUMBA_CACHE_DIR names another place.
 
 import functools
 import importlib.util
+import inspect
 import os
 import sys
 import warnings
@@ -56,6 +57,7 @@ def jit(function: _Function) -> _Function:
     """
     import numba
 
+    function = inspect.unwrap(function)  # without the shape checks of tests, which numba cannot read
     try:
         machine_code: _Function = numba.njit(cache=True, nogil=True)(function)
     except RuntimeError as error:  # no folder for it

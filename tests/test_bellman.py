@@ -1,6 +1,7 @@
 """Outcomes and the one Bellman kernel."""
 
 import itertools
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -9,7 +10,8 @@ from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 from torch import Tensor
 
-from pgts_torch.bellman import Outcomes, backup, policy_mean
+from pgts_torch import compiled
+from pgts_torch.bellman import Outcomes, backup, policy_mean, sweep
 from pgts_torch.seeding import stream
 from tests.support import ZOO, mdps, weights, zoo
 
@@ -39,13 +41,102 @@ def test_backup_is_reward_plus_the_discounted_mean_of_the_children(mdp, seed):
     torch.testing.assert_close(backup(mdp.outcomes, v_S), backup_by_loop(mdp.outcomes, v_S), rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", ["grid", "Taxi"])
-def test_the_product_for_large_tables_is_the_same(name, monkeypatch):
-    outcomes = zoo(name).outcomes
-    v_S = torch.randn(outcomes.num_states, dtype=torch.float64, generator=stream(0, "v"))
-    small = backup(outcomes, v_S)
-    monkeypatch.setattr("pgts_torch.bellman.LARGE", 1)
-    torch.testing.assert_close(backup(outcomes, v_S), small, rtol=1e-13, atol=1e-13)
+# Compiled and in torch: one contract
+
+
+FORMS = ["compiled", "torch"]
+
+
+@pytest.fixture(params=FORMS)
+def form(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Every backup compiled, however small; or none."""
+    if request.param == "torch":
+        with compiled.torch_only():
+            yield request.param
+    else:
+        pytest.importorskip("numba")
+        monkeypatch.setattr("pgts_torch.bellman.COMPILED_FROM", 1)
+        yield request.param
+
+
+def some_outcomes(N: int, A: int, K: int, dtype: torch.dtype = torch.float64, unit: float = 1.0) -> Outcomes:
+    """Some actions are not allowed, and some outcomes end."""
+    generator = stream(N * A * K, "some_outcomes")
+    prob_NAK = torch.rand(N, A, K, dtype=torch.float64, generator=generator)
+    reward_NA = unit * torch.randn(N, A, dtype=torch.float64, generator=generator)
+    reward_NA[::3, 0] = -torch.inf
+    discount_NAK = torch.where(torch.rand(N, A, K, generator=generator) < 0.2, 0.0, 0.9).double()
+    child_NAK = torch.randint(N, (N, A, K), generator=generator)
+    prob_NAK = prob_NAK / prob_NAK.sum(-1, keepdim=True)
+    return Outcomes(reward_NA, prob_NAK, discount_NAK, child_NAK, N).to(dtype=dtype)
+
+
+SHAPES = [(1, 2, 1), (9, 4, 1), (7, 2, 2), (50, 3, 3), (20, 4, 4), (30, 4, 5), (11, 2, 7), (10, 3, 8), (13, 2, 13)]
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, (90_000, 3, 2)])
+@pytest.mark.parametrize("times", [0, 1, 2, 5])
+def test_sweeps_are_repeated_backups_by_hand(shape, times, form):
+    outcomes = some_outcomes(*shape)
+    assert outcomes.is_compiled == (form == "compiled")
+    given_S = v_S = torch.randn(shape[0], dtype=torch.float64, generator=stream(0, "v"))
+    before_S = given_S.clone()
+    for _ in range(times):
+        weight_NAK = outcomes.prob_NAK * outcomes.discount_NAK
+        q_NA = outcomes.reward_NA + (weight_NAK * v_S[outcomes.child_NAK]).sum(-1)
+        torch.testing.assert_close(backup(outcomes, v_S), q_NA, rtol=1e-12, atol=1e-12)
+        v_S = q_NA.amax(-1)
+    swept_S = sweep(outcomes, given_S, times)
+    torch.testing.assert_close(swept_S, v_S, rtol=1e-12, atol=1e-12)
+    assert torch.equal(given_S, before_S)
+    assert swept_S.data_ptr() != given_S.data_ptr()
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_compiled_backups_are_those_of_torch(shape, unit, dtype, monkeypatch):
+    pytest.importorskip("numba")
+    outcomes = some_outcomes(*shape, dtype=dtype, unit=unit)
+    v_S = unit * torch.randn(shape[0], dtype=dtype, generator=stream(0, "v"))
+    with compiled.torch_only():
+        expected = backup(outcomes, v_S), sweep(outcomes, v_S, 6)
+    monkeypatch.setattr("pgts_torch.bellman.COMPILED_FROM", 1)
+    tolerance = 1e-12 if dtype == torch.float64 else 1e-5
+    for got, wanted in zip((backup(outcomes, v_S), sweep(outcomes, v_S, 6)), expected, strict=True):
+        torch.testing.assert_close(got, wanted, rtol=tolerance, atol=tolerance * unit)
+        # Up to three outcomes torch sums them one after another on every processor.
+        assert shape[2] > 3 or torch.equal(got, wanted)
+
+
+def test_what_is_not_a_number_comes_out_as_that(form):
+    outcomes = some_outcomes(20, 3, 2)
+    v_S = torch.zeros(20, dtype=torch.float64)
+    v_S[4] = torch.nan
+    meets_S = (outcomes.child_NAK == 4).any(-1).any(-1)
+    assert torch.equal(sweep(outcomes, v_S, 1).isnan(), meets_S)
+    assert 0 < int(meets_S.sum()) < 20
+
+
+def test_small_tables_stay_with_torch():
+    assert not zoo("ladder").outcomes.is_compiled
+
+
+@pytest.mark.parametrize("v_S", [torch.ones(6, dtype=torch.float64), torch.ones(5), torch.ones(0).double()])
+def test_backup_refuses_values_of_another_length_or_dtype(v_S, form):
+    for values in (backup, lambda outcomes, v_S: sweep(outcomes, v_S, 2)):
+        with pytest.raises(RuntimeError, match=r"v has size \d and dtype"):
+            values(zoo("ladder").outcomes, v_S)
+
+
+def test_sweeps_of_given_actions_are_backups_of_these_actions(form):
+    outcomes, v_S = zoo("garnet").outcomes, torch.arange(30, dtype=torch.float64)
+    action_S = torch.arange(30) % 3
+    taken_S, best_S = (sweep(outcomes, v_S, 2, actions) for actions in (action_S, None))
+    for _ in range(2):
+        v_S = backup(outcomes, v_S)[torch.arange(30), action_S]
+    assert torch.equal(taken_S, v_S)
+    assert not torch.equal(best_S, v_S)
 
 
 def test_backup_of_a_hand_made_row_is_the_sum_on_paper():
@@ -65,11 +156,6 @@ def test_backup_leaves_the_rewards_as_they_are():
 def test_backup_carries_no_gradient():
     v_S = torch.ones(5, dtype=torch.float64, requires_grad=True)
     assert not backup(zoo("ladder").outcomes, v_S).requires_grad
-
-
-def test_backup_refuses_values_of_another_length():
-    with pytest.raises(RuntimeError, match="size"):
-        backup(zoo("ladder").outcomes, torch.ones(6, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

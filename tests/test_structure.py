@@ -21,6 +21,7 @@ ROOMS = [
     "trust",
     "compiled",
     "options",
+    "bellman_kernels",
     "bellman",
     "seeding",
     "tabular",

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes, backup
 from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.tabular.improvement import improve, total_weights
 from pgts_torch.tabular.mdp import TabularMDP
 
 Matrix = scipy.sparse.csr_array | scipy.sparse.csc_array
@@ -65,10 +66,16 @@ def evaluate(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Evaluation:
     return Evaluation(v_S, backup(mdp.outcomes, v_S), occupancy(mdp, pi_SA), float(mdp.start_S @ v_S))
 
 
-def policy_values(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S"]:
-    """v^pi = (I - gamma P^pi)^-1 R^pi.        [PGTS Sec. 2]"""
+def policy_values(
+    mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], *, near_S: Float[Tensor, "S"] | None = None
+) -> Float[Tensor, "S"]:
+    """v^pi = (I - gamma P^pi)^-1 R^pi.        [PGTS Sec. 2]
+
+    Args:
+        near_S: values near them, from which an iterative solve starts. Default: 0.
+    """
     pi_SA = check_policy(mdp, pi_SA)
-    return _solve(mdp, pi_SA, (pi_SA * mdp.outcomes.reward_NA).sum(-1), transpose=False)
+    return _solve(mdp, pi_SA, (pi_SA * mdp.outcomes.reward_NA).sum(-1), transpose=False, near_S=near_S)
 
 
 def occupancy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S"]:
@@ -103,19 +110,34 @@ def lookahead(mdp: TabularMDP, q_SA: Float[Tensor, "S A"], depth: int) -> Float[
     return q_SA
 
 
-def optimal(mdp: TabularMDP) -> Optimum:
+def optimal(mdp: TabularMDP, tolerance: float | None = None) -> Optimum:
     """v*, Q*, J* by policy iteration: v^{pi_0} <= v^{pi_1} <= ... ends at v* = T v*  (Howard, 1960).
 
     The policy changes only where an action is better by more than rounding, so it ends after finitely many steps.
-    Where gamma is 1, the policies that end the episode compete.
+    Where gamma is 1, the policies that end the episode compete. Large MDPs start with the actions that modified policy
+    iteration finds.
+
+    With a tolerance modified policy iteration is all, until its bounds prove that v_S and J are within the tolerance of
+    v* and J*; so is q_SA of Q*, and pi_SA loses at most twice as much in any state (`improvement.improve`).
+
+    Args:
+        mdp: the MDP.
+        tolerance: in reward units. Default: none, and errors are those of rounding.
 
     Raises:
-        PgtsError: no finite value: from some state nothing ends, or the return grows without limit.
+        PgtsError: no finite value: from some state nothing ends, or the return grows without limit. A tolerance where
+            an action does not discount, or one that float64 cannot prove.
     """
-    action_S = _ending_actions(mdp.outcomes, mdp.outcomes.reward_NA.argmax(-1))
+    if tolerance is not None:
+        return _optimal_within(mdp, tolerance)
+    action_S, v_S = mdp.outcomes.reward_NA.argmax(-1), torch.zeros(mdp.num_states, dtype=torch.float64)
+    if mdp.num_states > DENSE_LIMIT and total_weights(mdp.outcomes)[1] < UNDISCOUNTED:
+        found = improve(mdp.outcomes, error=torch.inf)
+        action_S, v_S = found.action_S, found.v_S
+    action_S = _ending_actions(mdp.outcomes, action_S)
     while True:
         pi_SA = torch.nn.functional.one_hot(action_S, mdp.num_actions).double()
-        v_S = policy_values(mdp, pi_SA)
+        v_S = policy_values(mdp, pi_SA, near_S=v_S)
         q_SA = backup(mdp.outcomes, v_S)
         rounding = 1e-11 * max(float(q_SA.abs().max()), float(mdp.outcomes.reward_NA.abs().max()))
         kept_S = q_SA.gather(1, action_S[:, None]).squeeze(1)
@@ -123,6 +145,19 @@ def optimal(mdp: TabularMDP) -> Optimum:
         if not better_S.any():
             return Optimum(v_S, q_SA, pi_SA, float(mdp.start_S @ v_S))
         action_S = torch.where(better_S, q_SA.argmax(-1), action_S)
+
+
+def _optimal_within(mdp: TabularMDP, tolerance: float) -> Optimum:
+    if total_weights(mdp.outcomes)[1] >= UNDISCOUNTED:
+        raise PgtsError("a tolerance is proved only where every action discounts: leave it out")
+    found = improve(mdp.outcomes, error=tolerance)
+    if not found.error <= tolerance:
+        raise PgtsError(
+            f"tolerance is {tolerance}; what float64 proves for this MDP is {found.error:.1e}: choose a larger one, or "
+            "leave it out"
+        )
+    pi_SA = torch.nn.functional.one_hot(found.action_S, mdp.num_actions).double()
+    return Optimum(found.v_S, backup(mdp.outcomes, found.v_S), pi_SA, float(mdp.start_S @ found.v_S))
 
 
 def check_policy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S A"]:
@@ -150,12 +185,16 @@ def _policy_matrix(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> scipy.sparse
     return scipy.sparse.csr_array((values[kept], children[kept.reshape(-1)], rows), shape=(S, S), copy=False)
 
 
-def _solve(mdp: TabularMDP, pi_SA: Tensor, b_S: Float[Tensor, "S"], *, transpose: bool) -> Float[Tensor, "S"]:
+def _solve(
+    mdp: TabularMDP, pi_SA: Tensor, b_S: Float[Tensor, "S"], *, transpose: bool, near_S: Tensor | None = None
+) -> Float[Tensor, "S"]:
     """x with (I - gamma P^pi) x = b, or with the transposed matrix."""
-    matrix = _policy_matrix(mdp, pi_SA)
-    _check_ends(mdp.outcomes, pi_SA, matrix)
-    solve = _solve_dense if mdp.num_states <= DENSE_LIMIT else _solve_iterative
-    return torch.from_numpy(solve(matrix.T if transpose else matrix, b_S.numpy()))
+    forward = _policy_matrix(mdp, pi_SA)
+    _check_ends(mdp.outcomes, pi_SA, forward)
+    matrix, b = forward.T if transpose else forward, b_S.numpy()
+    if mdp.num_states <= DENSE_LIMIT:
+        return torch.from_numpy(_solve_dense(matrix, b))
+    return torch.from_numpy(_solve_iterative(matrix, b, np.zeros_like(b) if near_S is None else near_S.numpy()))
 
 
 def ends(outcomes: Outcomes) -> Bool[Tensor, "S A"]:
@@ -204,15 +243,14 @@ def _solve_dense(matrix: Matrix, b: np.ndarray) -> np.ndarray:
     return torch.linalg.solve(identity - torch.from_numpy(matrix.toarray()), torch.from_numpy(b)).numpy()
 
 
-def _solve_iterative(matrix: Matrix, b: np.ndarray) -> np.ndarray:
-    """BiCGSTAB, restarted until the residual b - (I - M) x is within SOLVE_TOLERANCE of b."""
+def _solve_iterative(matrix: Matrix, b: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """BiCGSTAB from x on, restarted until the residual b - (I - M) x is within SOLVE_TOLERANCE of b."""
 
     def identity_minus(x: np.ndarray) -> np.ndarray:
         return x - matrix @ x
 
     operator = scipy.sparse.linalg.LinearOperator(matrix.shape, matvec=identity_minus, dtype=b.dtype)
     scale = max(float(np.abs(b).max()), np.finfo(float).tiny)
-    x = np.zeros_like(b)
     for _ in range(20):
         residual = b - identity_minus(x)
         if np.abs(residual).max() <= SOLVE_TOLERANCE * scale:

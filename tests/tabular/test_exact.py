@@ -1,6 +1,9 @@
 """The exact theory: closed forms, second routes, theorems."""
 
 import itertools
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from torch import Tensor
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.seeding import numpy_stream, stream
-from pgts_torch.tabular import TabularMDP, deep_sea, exact, ladder, random_mdp, tightrope
+from pgts_torch.tabular import TabularMDP, deep_sea, exact, improvement, ladder, random_mdp, tightrope
 from tests.support import (
     ZOO,
     always,
@@ -222,6 +225,79 @@ def test_the_optimum_is_the_fixed_point_of_t_and_its_policy_attains_it(name):
     assert attained.J == pytest.approx(optimum.J)
     assert exact.evaluate(mdp, random_policy(mdp)).J < optimum.J
     assert optimum.pi_SA.sum(-1).tolist() == [1] * mdp.num_states
+
+
+WAYS = {"compiled": 1, "torch": 10**12}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("share", [1e-2, 1e-5, 1e-9])
+@pytest.mark.parametrize("name", ["ladder", "tightrope", "garnet", "grid", "deep_sea", "random, dense"])
+def test_within_a_tolerance_values_are_so_near_to_the_optimum_and_the_policy_loses_at_most_twice_as_much(
+    name, share, unit, way, monkeypatch
+):
+    monkeypatch.setattr("pgts_torch.bellman.COMPILED_FROM", WAYS[way])
+    mdp = rewarded(zoo(name), factor=unit)
+    truth = exact.optimal(mdp)
+    tolerance = share * float(truth.v_S.abs().max())
+    near = exact.optimal(mdp, tolerance)
+    slack = 1e-11 * float(truth.q_SA.abs().max())  # of the truth
+    assert (near.v_S - truth.v_S).abs().max() <= tolerance + slack
+    assert (near.q_SA - truth.q_SA).abs().max() <= tolerance + slack
+    assert abs(near.J - truth.J) <= tolerance + slack
+    assert (truth.v_S - exact.policy_values(mdp, near.pi_SA)).max() <= 2 * tolerance + slack
+
+
+@given(mdps(), st.floats(1e-6, 1.0), st.floats(-5, 5))
+def test_the_tolerance_holds_with_ends_many_discounts_and_rewards_of_any_sign(mdp, tolerance, constant):
+    mdp = rewarded(mdp, constant=constant)
+    if improvement.total_weights(mdp.outcomes)[1] >= 0.999:
+        return
+    truth, near = exact.optimal(mdp), exact.optimal(mdp, tolerance)
+    assert (near.v_S - truth.v_S).abs().max() <= tolerance + 1e-9
+    assert (truth.v_S - exact.policy_values(mdp, near.pi_SA)).max() <= 2 * tolerance + 1e-9
+
+
+def test_the_error_that_is_proved_is_not_far_above_the_true_one_and_less_sweeping_would_miss_it():
+    mdp = random_mdp(40, 3, branching=2, seed=3, gamma=0.99)
+    truth = exact.optimal(mdp).v_S
+    found = [improvement.improve(mdp.outcomes, error=error) for error in (1.0, 1e-3, 1e-6)]
+    off = [float((each.v_S - truth).abs().max()) for each in found]
+    assert all(true <= each.error for true, each in zip(off, found, strict=True))
+    assert off[0] > 1e-6  # what the loosest has not reached
+
+
+def test_a_tolerance_that_float64_cannot_prove_is_refused_with_one_that_it_can():
+    mdp = zoo("garnet")
+    with pytest.raises(PgtsError, match=r"tolerance is 1e-16; what float64 proves for this MDP is \d\.\de-1\d: choose"):
+        exact.optimal(mdp, 1e-16)
+    assert exact.optimal(mdp, 1e-11).J == pytest.approx(exact.optimal(mdp).J, abs=1e-11)
+    for bad in (0.0, -1.0, float("nan")):
+        with pytest.raises(PgtsError, match="tolerance is"):
+            exact.optimal(mdp, bad)
+
+
+def test_a_tolerance_is_refused_where_an_action_does_not_discount():
+    with pytest.raises(PgtsError, match="a tolerance is proved only where every action discounts"):
+        exact.optimal(deep_sea(4, gamma=1.0), 1e-3)
+
+
+def test_a_large_mdp_is_solved_to_rounding_from_what_modified_policy_iteration_finds():
+    mdp = random_mdp(exact.DENSE_LIMIT + 500, 3, branching=4, seed=2, gamma=0.97)
+    optimum = exact.optimal(mdp)
+    assert_close(exact.bellman(mdp, optimum.q_SA), optimum.q_SA, 1e-10)
+    solves = Counter()
+    patched = partial(solved, solves, exact._solve_iterative)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exact, "_solve_iterative", patched)
+        exact.optimal(mdp)
+    assert solves["solves"] == 1  # policy iteration from the best rewards takes several
+
+
+def solved(solves: Counter, solve: Callable, *arguments: object) -> np.ndarray:
+    solves["solves"] += 1
+    return solve(*arguments)
 
 
 # Lookahead
