@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, final
 
 from pgts_torch.agent import saving
-from pgts_torch.agent.evaluate import Evaluation, Score, evaluate
+from pgts_torch.agent.evaluate import Evaluation, Evaluator, Score
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError, check_count
@@ -39,6 +39,8 @@ class EvalCallback:
         seed: of the episodes, the same in all evaluations, so that they differ by the policy alone.
         best_path: where the model is saved whenever the mean return is the highest so far; None: nowhere.
         stop_at_return: training ends once the mean return is at least this; None: it does not.
+        evaluator: what evaluates, with a number of episodes of its own, where several share the environments. They stay
+            open until it is closed. Default: one for this callback.
 
     Raises:
         PgtsError: an option out of range, or a file at `best_path` that is no saved model.
@@ -57,14 +59,15 @@ class EvalCallback:
         seed: int = 0,
         best_path: str | Path | None = None,
         stop_at_return: float | None = None,
+        evaluator: Evaluator | None = None,
     ) -> None:
         check_count("every", every)
-        check_count("episodes", episodes)
         if stop_at_return is not None and not math.isfinite(stop_at_return):
             raise PgtsError(f"stop_at_return is {stop_at_return}; it must be finite")
         if best_path is not None:
             saving.target(best_path)
-        self.every, self.episodes, self.deterministic, self.seed = every, episodes, deterministic, seed
+        self.every, self.deterministic, self.seed = every, deterministic, seed
+        self.evaluator = evaluator or Evaluator(episodes)
         self.best_path, self.stop_at_return = best_path, stop_at_return
         self.history: list[Evaluated] = []
         self.best: Evaluated | None = None
@@ -76,7 +79,7 @@ class EvalCallback:
             return True
         evaluation = algorithm.ranks.first(
             "an evaluation",
-            lambda: evaluate(algorithm, episodes=self.episodes, deterministic=self.deterministic, seed=self.seed),
+            lambda: self.evaluator(algorithm, deterministic=self.deterministic, seed=self.seed),
         )
         latest = Evaluated(now, evaluation)
         self.history.append(latest)

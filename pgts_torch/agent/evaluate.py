@@ -6,6 +6,7 @@ from typing import Any, Self, final
 
 import scipy.special
 import torch
+from gymnasium.vector import VectorEnv
 from jaxtyping import Float
 from torch import Tensor
 
@@ -13,7 +14,7 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import FixedHorizon, rollout
 from pgts_torch.errors import check_count
-from pgts_torch.models.environments import close_environments
+from pgts_torch.models.environments import EnvSource, close_environments
 from pgts_torch.seeding import SharedGenerators, stream
 
 UNLIMITED_LENGTH = 1000
@@ -50,40 +51,78 @@ class Evaluation:
     episodic_length: Score
 
 
-def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed: int = 0) -> Evaluation:
-    """Run the policy in new environments of its kind, side by side. Training is not affected.
+@final
+class Evaluator:
+    """Evaluates a policy again and again in the same environments, which are made for the first evaluation.
+
+    A context that closes them, with a UserWarning where one raises an error in `close`.
 
     Args:
-        episodes: how many, at least 1.
-        deterministic: take the most probable action; else sample from pi.
-        seed: of these episodes alone.
+        episodes: of one evaluation, at least 1; they run side by side.
 
     Raises:
-        PgtsError: episodes is below 1; no more environments of this kind can be made (`EnvSource.make`); or the
-            environment failed, naming step and seeds.
-
-    Warns:
-        UserWarning: an environment raised an error in `close`.
+        PgtsError: episodes is below 1.
     """
-    check_count("episodes", episodes)
-    names = ("evaluate", "deterministic" if deterministic else "sampled")
-    with SharedGenerators(seed, *names, "construction"):
-        env, limit = algorithm.source.make(episodes), algorithm.source.time_limit
-    made = rollout(
-        algorithm.world.of(env),
-        Greedy(algorithm.policy) if deterministic else algorithm.policy,
-        FixedHorizon(length=limit or UNLIMITED_LENGTH),
-        seed=seed,
-        names=names,
-        generator=stream(seed, *names, device=algorithm.device),
-    )
-    close_environments(env)
-    return Evaluation(
-        episodes,
-        Score.of((made.reward_TB * made.alive_TB).sum(0)),
-        Score.of(made.returns()),
-        Score.of(made.alive_TB.double().sum(0)),
-    )
+
+    def __init__(self, episodes: int) -> None:
+        check_count("episodes", episodes)
+        self.episodes = episodes
+        self._env: VectorEnv | None = None
+        self._source: EnvSource | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __call__(self, algorithm: PGTS, *, deterministic: bool = True, seed: int = 0) -> Evaluation:
+        """The scores of new episodes. Training is not affected.
+
+        Args:
+            deterministic: take the most probable action; else sample from pi.
+            seed: of these episodes alone.
+
+        Raises:
+            PgtsError: no more environments of this kind can be made (`EnvSource.make`); or the environment failed,
+                naming step and seeds.
+        """
+        names = ("evaluate", "deterministic" if deterministic else "sampled")
+        made = rollout(
+            algorithm.world.of(self._environments(algorithm.source, seed)),
+            Greedy(algorithm.policy) if deterministic else algorithm.policy,
+            FixedHorizon(length=algorithm.source.time_limit or UNLIMITED_LENGTH),
+            seed=seed,
+            names=names,
+            generator=stream(seed, *names, device=algorithm.device),
+        )
+        return Evaluation(
+            self.episodes,
+            Score.of((made.reward_TB * made.alive_TB).sum(0)),
+            Score.of(made.returns()),
+            Score.of(made.alive_TB.double().sum(0)),
+        )
+
+    def close(self) -> None:
+        """Close the environments; another evaluation makes new ones."""
+        if self._env is not None:
+            close_environments(self._env)
+            self._env = None
+
+    def _environments(self, source: EnvSource, seed: int) -> VectorEnv:
+        if source is not self._source:
+            self.close()
+            self._source = source
+        if self._env is None:
+            with SharedGenerators(seed, "evaluate", "construction"):
+                self._env = source.make(self.episodes)
+        return self._env
+
+
+def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed: int = 0) -> Evaluation:
+    """One evaluation by an `Evaluator`, which says what is raised."""
+    with Evaluator(episodes) as evaluator:
+        return evaluator(algorithm, deterministic=deterministic, seed=seed)
 
 
 @final

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from pgts_torch.agent.evaluate import Evaluation, evaluate
+from pgts_torch.agent.evaluate import Evaluation, Evaluator
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.checkpoint import newest
@@ -18,10 +18,8 @@ def evaluate_run(run: str | Path, *, episodes: int, seed: int, trust_imports: bo
     """Evaluate the last checkpoint of a run, with greedy and with sampled actions."""
     torch.set_num_threads(1)
     algorithm = PGTS.load(last_checkpoint(Path(run)), trust_imports=trust_imports)
-    return {
-        kind: evaluate(algorithm, episodes=episodes, deterministic=deterministic, seed=seed)
-        for kind, deterministic in KINDS.items()
-    }
+    with Evaluator(episodes) as evaluator:
+        return {kind: evaluator(algorithm, deterministic=greedy, seed=seed) for kind, greedy in KINDS.items()}
 
 
 def last_checkpoint(run: Path) -> Path:

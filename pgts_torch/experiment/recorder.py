@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.certificate import CONFIDENCE
-from pgts_torch.agent.evaluate import Score, evaluate
+from pgts_torch.agent.evaluate import Evaluator, Score
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.states import load_checked
@@ -61,7 +61,8 @@ class Recorder:
         self._started = self._saved_clock = self._clock
         self._saved_at = -1
         self._pi_SA = self._table()
-        self._evaluations = _evaluations(config.eval, config.seed, path)
+        self._evaluator = Evaluator(config.eval.episodes)
+        self._evaluations = _evaluations(config.eval, config.seed, path, self._evaluator)
 
     @property
     def finished(self) -> bool:
@@ -81,7 +82,7 @@ class Recorder:
         self.movement.follow(algorithm, iteration)
         if self.folder is not None and k % self.config.log.every == 0:
             tags = diagnostics.metrics(algorithm, iteration)
-            if self.truth is not None and self._pi_SA is not None:
+            if self.truth is not None and self._pi_SA is not None and self._is_truth_due(step, iteration):
                 tags |= self.truth.metrics(self._pi_SA, iteration)
             tags["charts/SPS"] = iteration.experience.num_steps / seconds
             self.folder.log(step, tags)
@@ -103,6 +104,14 @@ class Recorder:
         self._pi_SA = self._table()
         self._clock = time.perf_counter()
         return not self.finished and self.stop.signal is None
+
+    def _is_truth_due(self, step: int, iteration: Iteration) -> bool:
+        """Whether this line of metrics is the first one, the last one or the first after one of `log.exact_points`."""
+        log, total, steps = self.config.log, self.config.total_steps, iteration.experience.num_steps
+        every, before = max(1, total // log.exact_points), step - log.every * steps
+        # No other line follows if the training ends before as many iterations are made again.
+        is_last = step + (log.every - 1) * steps >= total
+        return before <= 0 or is_last or step // every > before // every
 
     def _is_checkpoint_due(self) -> bool:
         """Whether the last checkpoint is more than `MOST_SECONDS` old."""
@@ -178,9 +187,9 @@ class Recorder:
             span = float(span_of(self.truth.optimum.q_SA.reshape(1, -1)))
             missing, stationary_gap = ((J_optimal - J) / span, gap / span) if span > 0 else (0.0, 0.0)
         deterministic, sampled = (
-            evaluate(algorithm, episodes=config.eval.episodes, deterministic=kind, seed=config.seed)
-            for kind in KINDS.values()
+            self._evaluator(algorithm, deterministic=kind, seed=config.seed) for kind in KINDS.values()
         )
+        self._evaluator.close()
         advice = [
             learned_little(
                 self.movement, algorithm.update, depth=depth, missing_share=missing, stationary_share=stationary_gap
@@ -227,11 +236,11 @@ class Recorder:
         return {"certificate": bound, "certificate_trust": trust, "certificate_confidence": confidence}
 
 
-def _evaluations(config: EvalConfig, seed: int, run: Path) -> dict[str, EvalCallback]:
+def _evaluations(config: EvalConfig, seed: int, run: Path, evaluator: Evaluator) -> dict[str, EvalCallback]:
     """The evaluations during training; the deterministic one picks the best model and may end the training."""
     if config.every is None:
         return {}
-    shared: dict[str, Any] = {"every": config.every, "episodes": config.episodes, "seed": seed}
+    shared: dict[str, Any] = {"every": config.every, "seed": seed, "evaluator": evaluator}
     best_path = run / BEST_FILE if config.keep_best else None
     greedy = EvalCallback(**shared, best_path=best_path, stop_at_return=config.stop_at_return)
     return {"deterministic": greedy, "sampled": EvalCallback(**shared, deterministic=False)}

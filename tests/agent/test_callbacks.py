@@ -8,8 +8,9 @@ import torch
 
 from pgts_torch import PGTS
 from pgts_torch.agent.callbacks import EvalCallback
-from pgts_torch.agent.evaluate import Score, evaluate
+from pgts_torch.agent.evaluate import Evaluator, Score, evaluate
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.environments import EnvSource
 from tests.agent.helpers import same_bits, vector_env
 from tests.agent.test_world import same_weights
 from tests.support import right_with
@@ -131,6 +132,24 @@ def test_an_evaluation_is_the_mean_of_its_episodes_with_the_interval_of_student(
     assert drawn.episodic_length.half_width > 0
     score = Score.of(torch.tensor([1.0, 2.0, 6.0]))  # deviation sqrt(7); t is 4.302653 with 2 degrees of freedom
     assert (score.mean, score.half_width) == (3.0, pytest.approx(4.302653 * math.sqrt(7 / 3), abs=1e-5))
+
+
+def test_evaluations_in_the_same_environments_are_those_in_new_ones_and_make_them_once(monkeypatch):
+    made, real = [], EnvSource.make
+    monkeypatch.setattr(EnvSource, "make", lambda source, count: made.append(count) or real(source, count))
+    model = PGTS("CartPole-v1", depth=0, policy="mlp", num_envs=2, seed=0)
+    made.clear()
+    with Evaluator(3) as evaluator:
+        greedy, drawn, again = (evaluator(model, deterministic=kind, seed=1) for kind in (True, False, True))
+        callbacks = [EvalCallback(every=1, evaluator=evaluator, deterministic=kind) for kind in (True, False)]
+        model.learn(1, callback=callbacks)
+    assert made == [3]
+    assert [len(callback.history) for callback in callbacks] == [1, 1]
+    assert greedy == again != drawn
+    fresh = PGTS("CartPole-v1", depth=0, policy="mlp", num_envs=2, seed=0)
+    assert greedy == evaluate(fresh, episodes=3, seed=1)
+    assert drawn == evaluate(fresh, episodes=3, deterministic=False, seed=1)
+    assert made == [3, 2, 3, 3]
 
 
 @pytest.mark.fault("no time limit and no horizon")

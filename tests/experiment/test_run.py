@@ -113,6 +113,21 @@ def test_with_the_exact_critic_the_lookahead_has_no_error_and_the_direction_is_n
     assert 0.99 < tags["exact/gradient_cosine"] <= 1 + 1e-12
 
 
+@pytest.mark.parametrize(("points", "every", "lines"), [(1000, 1, 10), (5, 1, 6), (2, 1, 3), (2, 3, 3)])
+def test_a_policy_is_compared_with_the_truth_at_so_many_points_and_in_the_first_and_last_line(
+    points, every, lines, tmp_path
+):
+    # Ladder pays until the horizon: ten iterations of 60 steps each.
+    given = ["--total_steps", "600", "--log.exact_points", str(points), "--log.every", str(every)]
+    run.train(few_iterations(tmp_path, *given, "--eval.episodes", "1"))
+    metrics = read_metrics(tmp_path / "run")
+    assert len(metrics) == 10 // every
+    compared = ["exact/J" in line for line in metrics]
+    assert sum(compared) == lines
+    assert compared[0]
+    assert compared[-1]
+
+
 def test_a_direction_of_zero_has_no_cosine():
     left = {"type": "softmax", "init": {"type": "biased", "action": 0, "probability": 0.9999}}
     algorithm = PGTS("pgts/Ladder-v0", depth=0, policy=left, num_envs=2, seed=0)
