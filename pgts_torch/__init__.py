@@ -44,7 +44,8 @@ def __dir__() -> list[str]:
 
 
 def _register_environments() -> None:
-    """Every environment in two forms, one and many; DeepSea ends by itself and has no time limit."""
+    """Every environment of the zoo in two forms, one and many, and those seen as images. DeepSea and those end by
+    themselves and have no time limit."""
     for name, entry_point, max_episode_steps in [
         ("Ladder", "ladder", 100),
         ("Tightrope", "tightrope", 100),
@@ -63,6 +64,9 @@ def _register_environments() -> None:
                 vector_entry_point=f"pgts_torch.envs.entry_points:{entry_point}_vector",
                 max_episode_steps=max_episode_steps,
             )
+    for name in ("Catch", "minigrid"):
+        if (id := f"images/{name.title()}-v0") not in gymnasium.registry:
+            gymnasium.register(id, entry_point=f"pgts_torch.envs.images:{name}")
 
 
 _register_environments()

@@ -9,6 +9,7 @@ from pgts_torch.agent.critics import Critic, ExactCritic, RolloutCritic, Tabular
 from pgts_torch.agent.networks import default_network
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate, PPOUpdate
+from pgts_torch.agent.own_models import LatentWorld
 from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy, TabularPolicy
 from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate, Update
@@ -80,9 +81,10 @@ def chosen(options: Training, world: World) -> Training:
     """
     policy, critic, update, replay = options.policy, options.critic, options.update, options.replay
     numbered, replayed = isinstance(world, TabularWorld), isinstance(options.replay, UniformReplay)
+    latent = isinstance(world, LatentWorld)
     if isinstance(policy, AutoPolicy):
-        network = default_network(world.observation_space)
-        if isinstance(network, MLP) and replayed:
+        network = default_network(world.perceived_space)
+        if isinstance(network, MLP) and replayed and not latent:
             network = MLP(normalize=True)
         policy = Softmax() if numbered else network
     if isinstance(critic, AutoCritic):
@@ -98,7 +100,7 @@ def chosen(options: Training, world: World) -> Training:
     if isinstance(replay, UniformReplay):
         if replay.starts == "all" and not numbered:
             raise PgtsError("replay.starts is 'all', which is for tables; observations here are no numbered states")
-        replay = replay.filled("tables" if numbered else "vectors")
+        replay = replay.filled("tables" if numbered else "images" if latent else "vectors")
     return checked(dict(options) | {"policy": policy, "critic": critic, "update": update, "replay": replay})
 
 
@@ -112,7 +114,7 @@ def make_search(options: Kind, world: World) -> Search:
 def make_policy(options: Any, world: World, *, seed: int) -> Policy:
     """Make a policy, a table or a network."""
     if isinstance(options, Network):
-        return NetworkPolicy(world.observation_space, world.num_actions, options, seed=seed, device=world.device)
+        return NetworkPolicy(world.perceived_space, world.num_actions, options, seed=seed, device=world.device)
     S, A = _tabular(world, f"the policy {options.type!r}").mdp_shape
     return _made(_TABLES, options)(S, A, options, seed=seed, device=world.device)
 
@@ -140,7 +142,7 @@ def make_critic(
                 raise PgtsError(f"critic.network is 'shared'; a {type(policy).__name__} has no network to share")
             trunk = policy.network.trunk
         return NetworkCritic(
-            world.observation_space,
+            world.perceived_space,
             world.num_actions,
             options.filled(estimator.type),
             trunk=trunk,

@@ -39,8 +39,8 @@ from pgts_torch.seeding import SharedGenerators, numpy_stream
 from pgts_torch.tabular.mdp import TabularMDP, check_gamma
 
 _WAYS_OUT = (
-    "; a model can be learned from its steps: model 'ensemble' where observations are vectors, 'counts' where they are "
-    "numbers; or take depth 0 and the estimator 'sampled', which need no model"
+    "; a model can be learned from its steps: model 'ensemble' where observations are vectors, 'latent' where they are "
+    "images, 'counts' where they are numbers; or take depth 0 and the estimator 'sampled', which need no model"
 )
 
 DEFAULT_GAMMA = 0.99

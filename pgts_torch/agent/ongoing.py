@@ -115,7 +115,7 @@ class OngoingEpisodes:
             begins_B = [not actions for actions in self._actions_B]
             observation_B, read_B = self._observe()
             for t in range(length):
-                action_B = policy.sample(observation_B, generator=generator).cpu().numpy()
+                action_B = policy.sample(world.perceive(observation_B), generator=generator).cpu().numpy()
                 with episodes.named(f"in step {t}"):
                     reward_B, discount_B, truncated_B = self._step(action_B)
                     if world.reward_range is not None:

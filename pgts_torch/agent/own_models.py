@@ -1,6 +1,6 @@
 """Worlds whose model was not written for the environment: one that is learned from its steps, or the caller's own.
 
-Their states are what is observed: numbers, or vectors.
+Their states are what is observed: numbers or vectors; those of images are vectors that represent them.
 """
 
 import importlib
@@ -12,6 +12,7 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
+from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.world import ModelWorld, TabularWorld, VectorStates, World
 from pgts_torch.errors import MissingModel, PgtsError, failure
 from pgts_torch.models.base import Model
@@ -20,7 +21,7 @@ from pgts_torch.models.ensemble import EnsembleModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.tensor import TensorModel
-from pgts_torch.options.models import Counts, Ensemble, OwnModel
+from pgts_torch.options.models import Counts, Ensemble, Latent, OwnModel
 
 
 @final
@@ -48,9 +49,51 @@ class VectorWorld(VectorStates):
         return self.model.states(state_N)
 
 
+@final
+class LatentWorld(ModelWorld):
+    """Environments whose observations are images, which a model represents as vectors: its states, which policies and
+    critics take.
+
+    Args:
+        env: the environments.
+        model: represents and steps.
+        observation_key: the entry of dictionary observations that is used.
+    """
+
+    def __init__(
+        self, env: VectorEnv, model: LatentModel, *, gamma: float, observation_key: str | None, device: torch.device
+    ) -> None:
+        super().__init__(env, gamma=gamma, observation_key=observation_key, device=device)
+        self.model: LatentModel = model
+        self.perceive, self.perceived_space = model.represent, spaces.Box(-torch.inf, torch.inf, (model.state_size,))
+
+    def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B D"]:
+        """The vectors that represent the images."""
+        return self.model.represent(encoded_B)
+
+    def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
+        return self.model.number(read_N)
+
+    def observe(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N D"]:
+        """The states, because policies and critics take these."""
+        return self.model.states(state_N)
+
+    def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
+        return self.model.states(state_N).cpu()
+
+    def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
+        """The numbers of vectors, or of images that a replay has kept."""
+        vectors_ND = exported.to(self.device) if exported.ndim == 2 else self.model.represent(exported)
+        return self.model.number(vectors_ND)
+
+    def reset_numbers(self) -> None:
+        """Drop all states, because hardly any is met again."""
+        self.model.clear()
+
+
 def learned_world(
     env: VectorEnv,
-    options: Counts | Ensemble,
+    options: Counts | Ensemble | Latent,
     *,
     gamma: float,
     observation_key: str | None,
@@ -74,28 +117,32 @@ def learned_world(
         if not isinstance(space, spaces.Discrete):
             raise MissingModel(
                 f"model is 'counts', which needs numbered states; observations of {env_name(env)} are {space}: take "
-                "'ensemble' if they are vectors"
+                "'ensemble' if they are vectors, 'latent' if they are images"
             )
         if action_repeat > 1:
             raise PgtsError(f"action_repeat is {action_repeat}; in a table it must be 1")
         table = CountsModel(int(space.n), world.num_actions, gamma=gamma, options=options, device=device)
         return TabularWorld(env, None, model=table, gamma=gamma, observation_key=observation_key, device=device)
-    if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+    given: dict[str, Any] = {
+        "gamma": gamma,
+        "options": options,
+        "capacity": capacity,
+        "seed": seed,
+        "device": device,
+        "action_repeat": action_repeat,
+    }
+    shared: dict[str, Any] = {"gamma": gamma, "observation_key": observation_key, "device": device}
+    axes = len(space.shape) if isinstance(space, spaces.Box) else 0
+    if axes != (needed := 3 if isinstance(options, Latent) else 1):
+        kind = {1: "vectors of numbers", 3: "images (height, width, channels)"}[needed]
+        other = {0: "take 'counts'", 1: "take 'ensemble'", 3: "take 'latent'"}.get(axes, "make them such by a wrapper")
         raise MissingModel(
-            f"model is 'ensemble', which learns from vectors of numbers; observations of {env_name(env)} are {space}"
-            + (": take 'counts'" if isinstance(space, spaces.Discrete) else ": make them vectors by a wrapper")
+            f"model is {options.type!r}, which learns from {kind}; observations of {env_name(env)} are {space}: {other}"
         )
-    model = EnsembleModel(
-        space.shape[0],
-        world.num_actions,
-        gamma=gamma,
-        options=options,
-        capacity=capacity,
-        seed=seed,
-        device=device,
-        action_repeat=action_repeat,
-    )
-    return VectorWorld(env, model, gamma=gamma, observation_key=observation_key, device=device)
+    assert isinstance(space, spaces.Box)
+    if isinstance(options, Latent):
+        return LatentWorld(env, LatentModel(space, world.num_actions, **given), **shared)
+    return VectorWorld(env, EnsembleModel(space.shape[0], world.num_actions, **given), **shared)
 
 
 def own_model(options: OwnModel) -> Model:

@@ -15,6 +15,7 @@ from pgts_torch.agent.depth import DepthChoice
 from pgts_torch.agent.dyna import Dyna
 from pgts_torch.agent.estimators import Estimator, LookaheadEstimator, SampledEstimator
 from pgts_torch.agent.explorer import Explorer
+from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.model_check import ModelCheck
 from pgts_torch.agent.ongoing import OngoingEpisodes
@@ -90,6 +91,8 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
         critic = make_critic(options.critic, world, policy, options.estimator, seed=seed)
     if not isinstance(update, Update):
         update = make_update(options.update, policy)
+    if isinstance(world.model, LatentModel):
+        world.model.serve(critic, policy)
     model_check = ModelCheck(
         world,
         mode=options.search.model_check,

@@ -57,8 +57,8 @@ class PGTS:
         policy, critic, update: options of these parts (`pgts_torch.options`), their names, or the parts themselves.
             Default: tables where observations are numbered states, else networks.
         model: what the lookahead queries. "auto": that of the environment, as above; "ensemble" (observations are
-            vectors) or "counts" (numbered states): one that is learned from the steps; or a `Model` whose states are
-            the observations.
+            vectors), "latent" (images) or "counts" (numbered states): one that is learned from the steps; or a `Model`
+            whose states are the observations.
         replay: "uniform": many updates an iteration, from episodes imagined in the model, which start in states
             visited so far; "none": one update, from the episodes of the iteration; "auto": uniform if the model learns.
         horizon: when the episodes of an iteration end (`options.rollouts`); "auto" depends on the replay.
@@ -231,7 +231,7 @@ class PGTS:
         """
         observation_N = self.world.encode(observation)
         shape = observation_N.shape[: observation_N.ndim - len(self.world.observation_space.shape or ())]
-        observation_N = observation_N.reshape(-1, *observation_N.shape[len(shape) :])
+        observation_N = self.world.perceive(observation_N.reshape(-1, *observation_N.shape[len(shape) :]))
         if deterministic:
             action_N = self.policy.probs(observation_N).argmax(-1)
         else:

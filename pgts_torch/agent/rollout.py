@@ -240,7 +240,7 @@ def _episodes(world: World, policy: Policy, horizon: Horizon, seeds: list[int], 
     alive_B, weight_B = np.ones(num_envs, dtype=bool), np.ones(num_envs)
     rows: list[tuple[np.ndarray, ...]] = []
     while len(rows) < horizon.limit and alive_B.any():
-        action_B = policy.sample(observations[-1], generator=generator).cpu().numpy()
+        action_B = policy.sample(world.perceive(observations[-1]), generator=generator).cpu().numpy()
         with episodes.named(f"in step {len(rows)}"):
             reward_B, discount_B, truncated_B = episodes.step(action_B, alive_B)
             if world.reward_range is not None:

@@ -4,11 +4,13 @@ Searches take states, which are integers; policies and critics take observations
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, final
 
 import numpy as np
 import torch
+from gymnasium.spaces import Space
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import iterate
 from jaxtyping import Float, Int, Shaped
@@ -28,11 +30,17 @@ from pgts_torch.models.tensor import TensorModel
 from pgts_torch.tabular.mdp import TabularMDP
 
 
+def _as_it_is(encoded_N: Tensor) -> Tensor:
+    return encoded_N
+
+
 class World:
     """Environments and their observations as tensors: all that is needed for rollouts without a lookahead.
 
     num_actions: A.
     observation_space: of what `encode` returns.
+    perceive: makes what policies and critics take of what `encode` returns, in `perceived_space`: the same, unless a
+        model represents observations as vectors.
     warned: whether the warning was given that the environments use the random generators of the whole process.
     model: what a lookahead may query; None: there is no model.
     mdp: the exact MDP, where it is known.
@@ -46,6 +54,8 @@ class World:
         device: where observations and states are.
     """
 
+    perceive: Callable[[Tensor], Tensor]
+    perceived_space: Space[Any]
     warned: bool = False
     model: Model | None = None
     mdp: TabularMDP | None = None
@@ -63,7 +73,8 @@ class World:
         self.env, self.gamma, self.device = env, gamma, torch.device(device)
         self.num_actions = int(env.single_action_space.n)  # type: ignore[attr-defined]  # checked before
         self.observations = Observations(env, observation_key, self.device)
-        self.observation_space = self.observations.space
+        self.observation_space = self.perceived_space = self.observations.space
+        self.perceive = _as_it_is
 
     def encode(self, observation: Any) -> Tensor:
         """Return one observation of an environment, or rows of them, as the tensor that a policy takes; PgtsError
@@ -73,7 +84,7 @@ class World:
     def of(self, env: VectorEnv) -> "World":
         """A world without a model for other environments of the same kind; warnings are not repeated in it."""
         world = World(env, gamma=self.gamma, observation_key=self.observations.key, device=self.device)
-        world.warned = True
+        world.warned, world.perceive, world.perceived_space = True, self.perceive, self.perceived_space
         return world
 
     def promise(self, reward_range: RewardRange) -> None:

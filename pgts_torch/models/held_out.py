@@ -25,3 +25,19 @@ def runs(held_out_R: Bool[Tensor, "R"], follows_R: Bool[Tensor, "R"], steps: int
         good_R &= held_out_R.roll(-ahead) & follows_R.roll(1 - ahead)
     good_R[len(good_R) - steps + 1 :] &= steps == 1  # those after them are at the beginning of the ring
     return torch.nonzero(good_R).flatten()
+
+
+def sequences(
+    buffer: ReplayBuffer, held_out_R: Bool[Tensor, "R"], start_N: Int[Tensor, "N"], steps: int
+) -> tuple[Int[Tensor, "K N"], Bool[Tensor, "K N"]]:
+    """The rows of `steps` steps in a row from each start, and which of them count: those of the same episode, as long
+    as none is held out. The starts are not."""
+    at_N, counts_N, follows_R = start_N, torch.ones_like(start_N, dtype=torch.bool), buffer.rows("follows")
+    rows, counts = [at_N], [counts_N]
+    for _ in range(steps - 1):
+        next_N = (at_N + 1) % len(buffer)
+        counts_N = counts_N & follows_R[at_N] & ~held_out_R[next_N]
+        at_N = next_N
+        rows.append(at_N)
+        counts.append(counts_N)
+    return torch.stack(rows), torch.stack(counts)

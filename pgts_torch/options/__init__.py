@@ -17,7 +17,7 @@ from pgts_torch.options.critics import (
     TabularValues,
     TDLambda,
 )
-from pgts_torch.options.models import AutoModel, Counts, Ensemble, GivenModel, OwnModel
+from pgts_torch.options.models import AutoModel, Counts, Ensemble, GivenModel, Latent, OwnModel
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, Random, Simplex, Softmax, Uniform
 from pgts_torch.options.replay import AutoReplay, NoReplay, UniformReplay
@@ -54,6 +54,7 @@ __all__ = [
     "GeometricHorizon",
     "GivenModel",
     "Gradient",
+    "Latent",
     "LookaheadAdvantages",
     "Mirror",
     "MonteCarlo",

@@ -6,6 +6,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from pgts_torch.options.fields import Ascending, Between, Count, Entry, NonNegative, Positive, Share, Sizes, conflict
 from pgts_torch.options.part import Part, null
+from pgts_torch.options.policies import CNN
 
 
 class AutoModel(Part):
@@ -96,6 +97,37 @@ class Ensemble(Part):
     """Gradient steps after the first rollouts."""
 
 
+class Latent(Part):
+    """Networks that learn from the steps of the environment alone to represent an image as a vector, and what follows a
+    vector and an action: the next vector, the reward, and whether the episode ends (Schrittwieser et al. 2020)."""
+
+    type: Literal["latent"] = "latent"
+
+    network: CNN | None = None
+    """The network that represents images; null: a cnn, with strides where images are large."""
+
+    size: Count = 64
+    """Numbers of a vector."""
+
+    hidden: Sizes = Field(default=[128, 128])
+    """Sizes of the hidden layers of the network that steps vectors."""
+
+    unroll: Count = 5
+    """Steps that are predicted one after another in each gradient step."""
+
+    learning_rate: Positive = 1e-3
+    """Step size of Adam."""
+
+    minibatch_size: Count = 64
+    """Sequences of steps of the environment in each gradient step."""
+
+    updates_per_step: Positive = 0.5
+    """Gradient steps for each environment step."""
+
+    first_updates: Count = 600
+    """Gradient steps after the first rollouts."""
+
+
 class OwnModel(Part):
     """A model of your own, whose states are observations."""
 
@@ -114,8 +146,8 @@ class OwnModel(Part):
         return value
 
 
-Model = AutoModel | GivenModel | Counts | Ensemble | OwnModel
+Model = AutoModel | GivenModel | Counts | Ensemble | Latent | OwnModel
 """Options of the model."""
 
-LEARNED = (Counts, Ensemble)
+LEARNED = (Counts, Ensemble, Latent)
 """Those that learn from the steps of the environment."""

@@ -7,7 +7,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues, TabularValues
 from pgts_torch.options.fields import Ascending, EnvId, Key, Kwargs, UnitInterval, conflict
-from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Model, OwnModel
+from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Latent, Model, OwnModel
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, NETWORKS, TABLES, AutoPolicy, Biased, Network, Simplex, Softmax, Table
 from pgts_torch.options.replay import AutoReplay, NoReplay, Replay, UniformReplay
@@ -198,6 +198,20 @@ class Training(Part):
 
     @field_validator("model")
     @classmethod
+    def _represents_images(cls, model: Any, info: ValidationInfo) -> Any:
+        parts = {"policy": info.data.get("policy"), "critic.network": getattr(info.data.get("critic"), "network", None)}
+        for name, part in parts.items():
+            if isinstance(model, Latent) and isinstance(part, CNN):
+                raise conflict(
+                    f"{name}.type is cnn; with model.type latent it takes vectors that represent images: it must be "
+                    "mlp, and the cnn be model.network",
+                    f"{name}.type",
+                    "model.type",
+                )
+        return model
+
+    @field_validator("model")
+    @classmethod
     def _says_its_error(cls, model: Any, info: ValidationInfo) -> Any:
         search = info.data.get("search")
         if not (isinstance(search, ExpectimaxSection) and search.doubt):
@@ -206,6 +220,8 @@ class Training(Part):
             raise conflict(
                 "search.doubt is true, which needs model.confidence and model.value_range where counts are learned"
             )
+        if isinstance(model, Latent):
+            raise conflict("search.doubt is true, and model.type is latent, which does not know its error")
         if isinstance(model, Ensemble) and (model.members == 1 or search.action_repeat > 1):
             raise conflict(
                 f"search.doubt is true, which needs model.members 2 or more and search.action_repeat 1; they are "
@@ -270,8 +286,8 @@ def _with_types(data: dict[str, Any]) -> dict[str, Any]:
 
     It is the first type that goes with the other values and has all these keys; if none has, the first that goes.
     """
-    data = _with_type(_with_type(data, "model", [Ensemble, Counts, OwnModel]), "replay", [UniformReplay])
-    replayed = _type(data, "replay") == "uniform" or _type(data, "model") in ("ensemble", "counts")
+    data = _with_type(_with_type(data, "model", [Ensemble, Counts, Latent, OwnModel]), "replay", [UniformReplay])
+    replayed = _type(data, "replay") == "uniform" or _type(data, "model") in ("ensemble", "counts", "latent")
     horizons: list[type[Part]] = [FixedHorizon, GeometricHorizon]
     if isinstance(rollout := data.get("rollout"), dict):
         data = data | {"rollout": _with_type(rollout, "horizon", [StepsHorizon] * replayed + horizons)}

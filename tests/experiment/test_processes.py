@@ -23,17 +23,16 @@ pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 ROOT = Path(__file__).parents[2]
 
 
-LEARNED = [
-    *(
-        "--config",
-        str(ROOT / "configs" / "learned" / "cartpole.yaml"),
-        "--rollout.horizon",
-        "{type: steps, first: 12, length: 8}",
-    ),
-    *("--model.first_updates", "5", "--model.hidden", "[8]"),
-    *("--replay", "{type: uniform, updates_per_step: 0.1, starts: 4, length: 5}"),
-]
-"""The shipped configuration of a learned model, with less to compute."""
+LEARNED = {
+    name: [
+        *("--config", str(ROOT / "configs" / "learned" / f"{name}.yaml"), "--env.id", env),
+        *("--rollout.horizon", "{type: steps, first: 12, length: 8}"),
+        *("--model.first_updates", "5", "--model.hidden", "[8]"),
+        *("--replay", "{type: uniform, updates_per_step: 0.1, starts: 4, length: 5}"),
+    ]
+    for name, env in {"cartpole": "CartPole-v1", "catch": "images/Catch-v0"}.items()
+}
+"""Shipped configurations of learned models, of vectors and of images, with less to compute."""
 
 
 def training(folder: Path, *more: str, kill_at: int = -1, counted: Path | None = None) -> int:
@@ -96,12 +95,13 @@ def test_after_kills_at_random_moments_every_byte_is_that_of_an_uninterrupted_ru
 
 
 @pytest.mark.fault("kill at any moment")
-def test_after_a_kill_a_learned_model_its_replay_and_its_episodes_are_those_of_an_uninterrupted_run(tmp_path):
-    assert training(tmp_path / "whole", *LEARNED) == 0
+@pytest.mark.parametrize("learned", LEARNED.values(), ids=LEARNED)
+def test_after_a_kill_a_learned_model_its_replay_and_its_episodes_are_those_of_an_uninterrupted_run(learned, tmp_path):
+    assert training(tmp_path / "whole", *learned) == 0
     folder = tmp_path / "killed"
-    assert in_child(lambda: train_with_signals(folder, signal.SIGKILL, more=LEARNED)) == -signal.SIGKILL
+    assert in_child(lambda: train_with_signals(folder, signal.SIGKILL, more=learned)) == -signal.SIGKILL
     assert checkpoint.newest(folder, strict=True)[1].iterations == 2
-    assert training(folder, *LEARNED) == 0
+    assert training(folder, *learned) == 0
     assert left(folder) == left(tmp_path / "whole")
 
 

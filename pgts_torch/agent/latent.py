@@ -1,0 +1,306 @@
+"""A model of images, learned from the steps of an environment: it represents them as vectors, and steps these."""
+
+import math
+from typing import Any, final
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor, nn
+
+from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.latent_losses import Unrolled, consistency_loss, equivalence_losses, outcome_losses
+from pgts_torch.agent.networks import Network, default_network, make_trunk
+from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.optimisers import Optimiser
+from pgts_torch.agent.policies import Policy
+from pgts_torch.errors import NotFinite, PgtsError, check_count
+from pgts_torch.models.base import Experience, LearningModel, Transitions
+from pgts_torch.models.held_out import BLOCK, held_out_rows, runs, sequences
+from pgts_torch.models.replay import ReplayBuffer
+from pgts_torch.models.state_index import hash_rows
+from pgts_torch.models.tensor import TensorModel
+from pgts_torch.options.models import Latent
+from pgts_torch.options.policies import MLP
+from pgts_torch.seeding import stream, uniform
+
+_SELDOM = 0.02
+"""Smaller probabilities of an end count as 0: a classifier never returns 0, and over many steps small ones add up."""
+
+_ENDS = 0.25
+"""How many steps that ended an episode are added to a minibatch, as a share of its other steps."""
+
+_MOST_ADDED = math.log(20)
+"""The most that is taken off the log odds of an end for its oversampling: what has happened once in thousands of steps
+is believed, or a single success would for long be worth nothing. Where chance decides, a rarer end is then taken for
+more certain than it is where it can happen."""
+
+_AHEAD = (1, 4)
+"""The numbers of steps ahead for which the prediction error is measured."""
+
+_MOST_MEASURED = 256
+"""The most starts, the latest ones, from which an error is measured."""
+
+
+@final
+class LatentModel(TensorModel, LearningModel):
+    """Networks that represent an image as a latent vector z of D numbers, with mean 0 and variance 1, and step it:
+
+        z = norm(h(image)),    (change, r_0, r_1, logit) = g(z, a),    z' = norm(z + change)
+
+        reward = (1 - p) r_0 + p r_1,    discount = gamma (1 - p),    p = the probability of an end
+
+    so r_0 is the reward of a step after which the episode goes on, r_1 that of a step that ends it. Nothing is decoded:
+    a vector has to tell only what follows (MuZero, Schrittwieser et al. 2020). Over K steps from an image, with the
+    actions that were taken, these are added:
+
+        reward          squared error, in standard deviations of rewards
+        end             cross-entropy; ends are oversampled, and the predicted odds corrected for that
+        consistency     of the predicted vector and that of the image seen: the mean squared difference, and
+                        cross-entropy of the image among those of the minibatch (van den Oord et al. 2018), without
+                        which all images may become the same vector as long as no reward has been seen
+        value, policy   squared difference of v and KL divergence of pi, of critic and policy in training, between the
+                        two vectors (value equivalence, Grimm et al. 2020)
+
+    `step` is deterministic, `sample` samples the end. A tenth of the steps is held out to measure errors.
+
+    replay: the steps seen; its columns "state" and "next_state" have the images, as they came.
+
+    Args:
+        space: of images, (height, width, channels).
+        num_actions: A.
+        gamma: discount of a step after which the episode goes on.
+        options: of networks and fits.
+        capacity: the number of steps that are kept; PgtsError unless it is above 32, and memory has room.
+        seed: initial weights are from the stream (seed, "model").
+        action_repeat: see `TensorModel`.
+    """
+
+    def __init__(
+        self,
+        space: spaces.Box,
+        num_actions: int,
+        *,
+        gamma: float,
+        options: Latent = Latent(),  # noqa: B008 - frozen
+        capacity: int = 100_000,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        action_repeat: int = 1,
+    ) -> None:
+        super().__init__(
+            options.size, num_actions, merge=False, dtype=torch.float64, device=device, action_repeat=action_repeat
+        )
+        if capacity <= BLOCK:
+            raise PgtsError(
+                f"capacity is {capacity}; a latent model keeps more than {BLOCK} steps, because so many in a row may "
+                "be held out (replay.capacity)"
+            )
+        self.gamma, self.options = gamma, options
+        self.replay: ReplayBuffer = ReplayBuffer(capacity)
+        none, images = torch.zeros(0), torch.from_numpy(np.zeros((0, *space.shape), space.dtype))
+        self.replay.add(state=images, action=none.long(), reward=none, end=none, next_state=images, follows=none.bool())
+        generator, inputs = stream(seed, "model"), spaces.Box(-np.inf, np.inf, (options.size + num_actions,))
+        image_trunk = make_trunk(options.network or default_network(space), space, generator=generator)
+        step_trunk = make_trunk(MLP(hidden=options.hidden, activation="relu"), inputs, generator=generator)
+        self._representation = Network(image_trunk, options.size, gain=1.0, generator=generator).to(device)
+        # a small gain: at first nothing changes
+        self._dynamics = Network(step_trunk, options.size + 3, gain=0.1, generator=generator).to(device)
+        self._optimiser = Optimiser(learning_rate=options.learning_rate, max_grad_norm=None)
+        self._reward_mean = self._reward_scale = self._log_odds_added = 0.0
+
+    def serve(self, critic: Critic, policy: Policy) -> None:
+        """Learn vectors for these, which take them in place of images; to be called before `learn`.
+
+        Raises:
+            PgtsError: they are no networks.
+        """
+        if not isinstance(critic, NetworkCritic) or not isinstance(policy, NetworkPolicy):
+            raise PgtsError(
+                f"model is 'latent', which needs networks; the critic is a {type(critic).__name__} and the policy a "
+                f"{type(policy).__name__}"
+            )
+        self._values, self._logits = critic.network, policy.network
+
+    def represent(self, image_N: Shaped[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
+        """The vectors of images, without gradient."""
+        return _norm(self._representation.outputs(image_N.to(self.device)))
+
+    @torch.inference_mode(False)
+    @torch.enable_grad()
+    def learn(self, experience: Experience, *, generator: torch.Generator) -> dict[str, float]:
+        """Keep the steps, and fit the networks to all that are kept.
+
+        Returns:
+            reward, end, consistency, value, policy: the losses, means over the gradient steps. error_1, error_4: the
+            root mean square error of the vector predicted so many steps ahead, on held-out steps, in standard
+            deviations of vectors; left out where too few are held out.
+
+        Raises:
+            PgtsError: steps with a discount other than gamma and 0.
+            NotFinite: a reward, a loss or a gradient is not finite.
+        """
+        discount_N, is_first = experience.discount_N, self.replay.num_added == 0
+        named_N = (discount_N != 0) & (discount_N != self.gamma)
+        if bool(named_N.any()):
+            raise PgtsError(
+                f"a step has the discount {float(discount_N[named_N][0])}; a latent model learns only whether an "
+                f"episode ends, so that discounts must be 0 or gamma, and gamma is {self.gamma}"
+            )
+        self.replay.add(
+            state=experience.observation_N,
+            action=experience.action_N,
+            reward=experience.reward_N.float(),
+            end=(discount_N == 0).float(),
+            next_state=experience.next_observation_N,
+            follows=experience.follows_N,
+        )
+        self._representation.trunk.encoder.absorb(experience.observation_N.to(self.device))
+        self._measure_rewards()
+        held_out = held_out_rows(self.replay)
+        count = self.options.updates_per_step * len(discount_N)
+        losses = self._fit(held_out, self.options.first_updates if is_first else round(count), generator)
+        self.generation += 1
+        return {**losses, **self._errors(held_out)}
+
+    def _measure_rewards(self) -> None:
+        rewards = self.replay.rows("reward")
+        mean, scale = float(rewards.mean()), float(rewards.std(correction=0))
+        if not mean + scale < float("inf"):
+            raise NotFinite(f"the mean of rewards is {mean}; what a model learns must be finite", what="model")
+        self._reward_mean, self._reward_scale = mean, scale
+
+    def _fit(self, held_out: Bool[Tensor, "R"], count: int, generator: torch.Generator) -> dict[str, float]:
+        """Take so many gradient steps. Return the means of the losses, by name."""
+        trained = torch.nonzero(~held_out).flatten()
+        ended = trained[self.replay.rows("end", trained) > 0]
+        weights, num_counted = self._representation.weights + self._dynamics.weights, 0
+        totals: dict[str, float] = {}
+
+        def sampled(rows: Tensor, number: int) -> Tensor:
+            return rows[torch.randint(len(rows), (number,), generator=generator, device=generator.device).cpu()]
+
+        extra = round(_ENDS * self.options.minibatch_size * self.options.unroll) if len(ended) else 0
+        for _ in range(count):
+            at_KN, counts_KN = sequences(
+                self.replay, held_out, sampled(trained, self.options.minibatch_size), self.options.unroll
+            )
+            steps, output_C3 = self._unrolled(at_KN, counts_KN)
+            at_C, num_counted = at_KN[counts_KN], num_counted + int(counts_KN.sum())
+            if extra:
+                more = sampled(ended, extra)
+                last_N3 = self._advanced(self._represented(self._rows("state", more)), self._rows("action", more))[1]
+                at_C, output_C3 = torch.cat([at_C, more]), torch.cat([output_C3, last_N3])
+            reward_C, end_C = self._rows("reward", at_C) - self._reward_mean, self._rows("end", at_C)
+            losses = outcome_losses(output_C3, reward_C / (self._reward_scale or 1.0), end_C)
+            losses["consistency"] = consistency_loss(steps)
+            losses |= equivalence_losses(steps, self._values, self._logits)
+            self._optimiser.step(weights, torch.stack(list(losses.values())).sum(), "model")
+            for name, value in losses.items():
+                totals[name] = totals.get(name, 0.0) + float(value.detach()) / count
+        if extra and count:
+            # By how much the log odds of an end are larger than among all steps (King and Zeng 2001).
+            share = len(ended) / len(trained)
+            self._log_odds_added = min(_MOST_ADDED, math.log1p(extra * count / (num_counted * share)))
+        return totals
+
+    def _rows(self, name: str, at_N: Int[Tensor, "N"]) -> Tensor:
+        rows: Tensor = self.replay.rows(name, at_N)
+        return rows.to(self.device)
+
+    def _represented(self, image_N: Shaped[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
+        """The vectors of images, with gradient."""
+        return _norm(self._representation(self._representation.encode(image_N)))
+
+    def _advanced(
+        self, latent_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
+    ) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N 3"]]:
+        """The next vectors; and (r_0, r_1, logit), with rewards in standard deviations from their mean."""
+        action_NA = nn.functional.one_hot(action_N, self.num_actions).float()
+        output_NO = self._dynamics(torch.cat([latent_ND, action_NA], -1))
+        return _norm(latent_ND + output_NO[:, :-3]), output_NO[:, -3:]
+
+    def _unrolled(
+        self, at_KN: Int[Tensor, "K N"], counts_KN: Bool[Tensor, "K N"]
+    ) -> tuple[Unrolled, Float[Tensor, "C 3"]]:
+        """Step along sequences of rows. Return their vectors, and what `_advanced` says of the steps that count."""
+        K, N = at_KN.shape
+        image_M = self._rows("next_state", at_KN.flatten())
+        latent_MD = self._represented(torch.cat([self._rows("state", at_KN[0]), image_M]))
+        latent_ND, predicted, outputs = latent_MD[:N], [], []
+        for action_N in self._rows("action", at_KN.flatten()).view(K, N):
+            latent_ND, output_N3 = self._advanced(latent_ND, action_N)
+            predicted.append(latent_ND)
+            outputs.append(output_N3)
+        goes_on_KN = counts_KN & (self.replay.rows("end", at_KN.flatten()).view(K, N) == 0)
+        hash_KN = hash_rows(image_M.flatten(1).double().view(torch.int64)).view(K, N)
+        steps = Unrolled(torch.stack(predicted), latent_MD[N:].view(K, N, -1), hash_KN, goes_on_KN.to(self.device))
+        return steps, torch.stack(outputs)[counts_KN.to(self.device)]
+
+    @torch.no_grad()
+    def step(
+        self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
+        """The expected reward, the discount gamma (1 - p), and the next vector."""
+        next_ND, output_N3 = self._advanced(state_ND, action_N)
+        end_N = (output_N3[:, 2].double() - self._log_odds_added).sigmoid()
+        end_N = torch.where(end_N < _SELDOM, 0.0, end_N)
+        reward_N2 = self._reward_mean + self._reward_scale * output_N3[:, :2].double()
+        return reward_N2[:, 0].lerp(reward_N2[:, 1], end_N), self.gamma * (1 - end_N), next_ND
+
+    def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
+        """As `step`; the episode ends with probability p, and the discount is then 0, else gamma. With repeated actions
+        no end is sampled, and the discount is the mean one, as that of `step`."""
+        if self.action_repeat > 1:
+            return super().sample(state_N, action_N, key_N=key_N)
+        self.simulator_steps += len(state_N)
+        reward_N, discount_N, next_ND = self.step(self.states(state_N), action_N)
+        goes_on_N = uniform(key_N) * self.gamma < discount_N
+        return Transitions(reward_N, self.gamma * goes_on_N.double(), self.number(next_ND))
+
+    @torch.no_grad()
+    def _errors(self, held_out: Bool[Tensor, "R"]) -> dict[str, float]:
+        """The errors on held-out steps after which the episode goes on, by name (`learn`)."""
+        errors = {}
+        for steps in _AHEAD:
+            starts = runs(held_out, self.replay.rows("follows"), steps)
+            last = (starts + steps - 1) % self.replay.capacity
+            starts = starts[self.replay.rows("end", last) == 0][-_MOST_MEASURED:]
+            if len(starts) < 2:
+                continue
+            latent_ND = self.represent(self.replay.rows("state", starts))
+            for ahead in range(steps):
+                at_N = (starts + ahead) % self.replay.capacity
+                latent_ND = self._advanced(latent_ND, self._rows("action", at_N))[0]
+            true_ND = self.represent(self.replay.rows("next_state", at_N))
+            spread = float(true_ND.var(0, correction=0).mean())
+            errors[f"error_{steps}"] = float((latent_ND - true_ND).square().mean() / max(spread, 1e-12)) ** 0.5
+        return errors
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights, optimiser, moments of rewards, and replay."""
+        return {
+            "representation": self._representation.plain_state(),
+            "dynamics": self._dynamics.plain_state(),
+            "optimiser": self._optimiser.state_dict(),
+            "rewards": [self._reward_mean, self._reward_scale],
+            "log_odds_added": self._log_odds_added,
+            "replay": self.replay.state_dict(),
+            "generation": self.generation,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        check_count("generation", state["generation"], least=0)
+        self._representation.load_plain_state(state["representation"])
+        self._dynamics.load_plain_state(state["dynamics"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._optimiser.check_fits(self._representation.weights + self._dynamics.weights)
+        self.replay.load_state_dict(state["replay"])
+        self._reward_mean, self._reward_scale = map(float, state["rewards"])
+        self._log_odds_added, self.generation = float(state["log_odds_added"]), state["generation"]
+
+
+def _norm(x_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N D"]:
+    """Rows of mean 0 and variance 1."""
+    return nn.functional.layer_norm(x_ND, x_ND.shape[-1:])
