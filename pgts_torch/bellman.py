@@ -27,6 +27,10 @@ COMPILED_FROM = 256
 than it saves."""
 
 
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, int, int]
+"""Rewards, weights and children, flat; numbers of actions and of outcomes."""
+
+
 @dataclass(frozen=True, eq=False)
 class Outcomes:
     """What may follow each of N states under each of A actions: at most K weighted children.
@@ -82,10 +86,20 @@ class Outcomes:
     @property
     def is_compiled(self) -> bool:
         """Whether `backup` and `sweep` are compiled."""
-        size = self.child_NAK.numel()
-        if size < COMPILED_FROM or self.dtype not in (torch.float64, torch.float32):
+        size, device = self._size_and_device
+        if size < COMPILED_FROM or (size >= _LARGE and torch.get_num_threads() > 1):
             return False
-        return (size < _LARGE or torch.get_num_threads() == 1) and can_compile(self.device)
+        return can_compile(device)
+
+    @cached_property
+    def _size_and_device(self) -> tuple[int, torch.device]:
+        """How many outcomes there are, none if no loop is compiled for their dtype."""
+        return self.child_NAK.numel() * (self.dtype in (torch.float64, torch.float32)), self.device
+
+    @cached_property
+    def arrays(self) -> "Arrays":
+        """What compiled backups take, in the same memory."""
+        return _arrays(self.reward_NA, self.weight, self.num_outcomes)
 
     def taken(self, action_N: Int[Tensor, "N"]) -> tuple[Float[Tensor, "N"], Tensor]:
         """The rewards and the rows of `weight` of one action of each state."""
@@ -149,14 +163,21 @@ def backup(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
     Returns:
         q, in the dtype of `outcomes`; it carries no gradient.
     """
+    return swept_backup(outcomes, v_C, 0)
+
+
+def swept_backup(outcomes: Outcomes, v_C: Float[Tensor, "C"], sweeps: int) -> Float[Tensor, "N A"]:
+    """`backup` of the values after some sweeps; in one call where it is compiled, and what a call costs counts."""
     _check_values(outcomes, v_C)
+    if outcomes.is_compiled:
+        arrays = outcomes.arrays
+        q_NA = np.empty((arrays[0].shape[0] // arrays[3], arrays[3]), arrays[0].dtype)
+        _compiled(arrays, v_C, sweeps + 1, q_NA.reshape(-1))
+        return torch.from_numpy(q_NA)
     with torch.no_grad():
-        if outcomes.is_compiled:
-            q_NA = torch.empty(outcomes.reward_NA.shape, dtype=outcomes.dtype)
-            _compiled(outcomes.reward_NA, outcomes.weight, v_C, 1, q_NA)
-            return q_NA
+        v_C = sweep(outcomes, v_C, sweeps) if sweeps else v_C.detach()
         # In place: a second table of N * A fresh numbers would cost as much as the product itself.
-        return outcomes.expected(v_C.detach()).add_(outcomes.reward_NA)
+        return outcomes.expected(v_C).add_(outcomes.reward_NA)
 
 
 def sweep(
@@ -176,7 +197,8 @@ def sweep(
             reward_N, weight = outcomes.taken(action_S)
             reward_NA = reward_N.unsqueeze(1)
         if outcomes.is_compiled and times:
-            return _compiled(reward_NA, weight, v_S, times)
+            arrays = outcomes.arrays if action_S is None else _arrays(reward_NA, weight, outcomes.num_outcomes)
+            return torch.from_numpy(_compiled(arrays, v_S, times, None))
         reward = reward_NA.reshape(-1)
         q, v_S = torch.empty_like(reward), v_S.clone()
         q_NA = q.view(reward_NA.shape)
@@ -202,34 +224,29 @@ def _rows(values: Tensor, child: Tensor, K: int, num_children: int) -> Tensor:
 
 def _check_values(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> None:
     # Compiled loops read v without looking at its length, and torch makes room of its own for what does not fit.
-    if len(v_C) != outcomes.num_children or v_C.dtype != outcomes.dtype:
+    if v_C.shape[0] != outcomes.num_children or v_C.dtype != outcomes.reward_NA.dtype:
         raise RuntimeError(
             f"v has size {len(v_C)} and dtype {v_C.dtype}; "
             f"the outcomes have {outcomes.num_children} children and dtype {outcomes.dtype}"
         )
 
 
-def _compiled(
-    reward_NA: Float[Tensor, "N A"],
-    weight: Tensor,
-    v_C: Float[Tensor, "C"],
-    times: int,
-    q_NA: Float[Tensor, "N A"] | None = None,
-) -> Float[Tensor, "N"]:
-    """The values after `times` >= 1 sweeps, compiled; q of the last one is written to `q_NA`."""
+def _arrays(reward_NA: Float[Tensor, "N A"], weight: Tensor, K: int) -> Arrays:
+    child = weight.col_indices().numpy()
+    return (
+        reward_NA.detach().reshape(-1).numpy(),
+        weight.values().numpy(),
+        child.view(np.uint32 if child.dtype == np.int32 else np.uint64),
+        reward_NA.shape[1],
+        K,
+    )
+
+
+def _compiled(arrays: Arrays, v_C: Float[Tensor, "C"], times: int, q: np.ndarray | None) -> np.ndarray:
+    """The values after `times` >= 1 sweeps, compiled; what the last one maximises is written to q."""
     from pgts_torch import bellman_kernels
 
-    child, A = weight.col_indices().numpy(), reward_NA.shape[1]
-    v = v_C.detach().contiguous().numpy()
-    return torch.from_numpy(
-        bellman_kernels.back_up(
-            reward_NA.detach().reshape(-1).numpy(),
-            weight.values().numpy(),
-            child.view(np.uint32 if child.dtype == np.int32 else np.uint64),
-            A,
-            len(child) // (len(reward_NA) * A),
-            v,
-            times,
-            v[:0] if q_NA is None else q_NA.view(-1).numpy(),
-        )
-    )
+    # Contiguous, because loops are compiled once for each kind of array.
+    v = np.ascontiguousarray((v_C.detach() if v_C.requires_grad else v_C).numpy())
+    values: np.ndarray = bellman_kernels.back_up(*arrays, v, times, v[:0] if q is None else q)
+    return values

@@ -22,7 +22,7 @@ import torch
 _Function = TypeVar("_Function", bound=Callable[..., object])
 
 SWITCH = "PGTS_COMPILED"
-"""The environment variable that is 0 where nothing is to be compiled."""
+"""The environment variable that is 0 where nothing is to be compiled; a process reads it once."""
 
 _torch_only = False
 
@@ -32,9 +32,7 @@ def can_compile(device: torch.device) -> bool:
 
     That numba is missing is said once.
     """
-    if device.type != "cpu" or _torch_only or os.environ.get(SWITCH) == "0":
-        return False
-    return _installed()
+    return device.type == "cpu" and not _torch_only and _wanted() and _installed()
 
 
 @contextmanager
@@ -64,6 +62,11 @@ def jit(function: _Function) -> _Function:
         _say_not_kept(str(error))
         machine_code = numba.njit(nogil=True)(function)
     return machine_code
+
+
+@functools.cache
+def _wanted() -> bool:
+    return os.environ.get(SWITCH) != "0"
 
 
 @functools.cache

@@ -57,7 +57,11 @@ def test_tensors_of_the_cpu_are_compiled_for_where_numba_is_installed() -> None:
 
 def test_the_environment_variable_turns_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(compiled.SWITCH, "0")
-    assert not compiled.can_compile(CPU)
+    compiled._wanted.cache_clear()
+    try:
+        assert not compiled.can_compile(CPU)
+    finally:
+        compiled._wanted.cache_clear()
 
 
 def test_without_numba_torch_is_used_and_that_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,10 +53,11 @@ def expectimax(
             shape or not finite (naming the state), errors that are no bounds.
         NodeBudgetExceeded: more than `max_nodes` would be needed.
     """
-    options = Expectimax(max_width=max_width, max_nodes=max_nodes, doubt=leaf_error is not None)
+    if max_width is not None or max_nodes is not MAX_NODES:  # checked, which takes longer than a small search
+        Expectimax(max_width=max_width, max_nodes=max_nodes, doubt=leaf_error is not None)
     leaves = Leaves(model, depth, q_leaf, v_leaf, leaf_error=leaf_error)
     topology = topology_of(model, topology)
-    return search_levels(leaves, topology, root_B, max_nodes=options.max_nodes, max_width=options.max_width)
+    return search_levels(leaves, topology, root_B, max_nodes=max_nodes, max_width=max_width)
 
 
 @torch.no_grad()
@@ -69,14 +70,14 @@ def search_levels(
     calls_before, expansions = topology.table.model_calls, leaves.expansions
     levels = topology.levels(root_B, expansions, max_nodes=max_nodes)
     bottom = levels.bottom(expansions)
-    q_NA = levels.back_up(leaves.v(bottom), expansions) if expansions else leaves.q(bottom)
+    q_NA = levels.back_up(leaves.v(bottom), expansions) if expansions else leaves.q(bottom).clone()
     doubt_NA = None if leaves.leaf_error is None else _doubt(leaves, levels, topology.model, bottom)
     return Lookahead.enumerated(
-        q_NA.index_select(0, levels.root_row_B),
+        levels.of_roots(q_NA),
         model_calls=topology.table.model_calls - calls_before,
         critic_calls=leaves.calls,
         nodes_per_level=levels.nodes_per_level(expansions),
-        doubt_BA=None if doubt_NA is None else doubt_NA.index_select(0, levels.root_row_B),
+        doubt_BA=None if doubt_NA is None else levels.of_roots(doubt_NA),
     )
 
 
@@ -90,7 +91,7 @@ def _doubt(
         return None
     error_N, expansions = leaves.errors(bottom), leaves.expansions
     if expansions == 0:
-        return error_N
+        return error_N.clone()
     error_N = error_N if error_N.ndim == 1 else error_N.amax(-1)
     doubt_NA = levels.back_up(error_N, expansions, reward=lambda state_N: _step_error(model, state_N))
     return doubt_NA.masked_fill(doubt_NA == -torch.inf, 0.0)

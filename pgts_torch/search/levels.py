@@ -3,10 +3,11 @@
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pgts_torch.bellman import Outcomes, backup, sweep
+from pgts_torch.bellman import Outcomes, backup, sweep, swept_backup
 
 
 @dataclass(eq=False)
@@ -27,8 +28,15 @@ class Levels:
     closed: Outcomes | None = None
     closed_states: Int[Tensor, "N"] = field(init=False)
 
+    _in_order: bool = field(init=False)
+
     def __post_init__(self) -> None:
-        self.closed_states = self.frontiers[0]
+        roots = self.closed_states = self.frontiers[0]
+        self._in_order = torch.equal(self.root_row_B, torch.arange(len(roots), device=roots.device))
+
+    def of_roots(self, q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "B A"]:
+        """The rows of the roots, of those of frontier 0."""
+        return q_NA if self._in_order else q_NA.index_select(0, self.root_row_B)
 
     @property
     def rows(self) -> int:
@@ -55,6 +63,9 @@ class Levels:
         Args:
             reward: takes the place of the rewards of allowed actions; states [N] to [N, A], or to None: those stay.
         """
+
+        if reward is None and len(self.outcomes) == 1 and self.closed is self.outcomes[0]:  # the roots are closed
+            return swept_backup(self.closed, v_N, expansions - 1)
 
         def paying(outcomes: Outcomes, states: Tensor) -> Outcomes:
             reward_NA = None if reward is None else reward(states)

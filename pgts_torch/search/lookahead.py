@@ -1,5 +1,6 @@
 """What every search takes and returns: leaf values in, values of all actions of the roots out."""
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -72,7 +73,7 @@ class Lookahead:
         doubt_BA: Float[Tensor, "B A"] | None = None,
     ) -> Self:
         """What a search finds that enumerates outcomes: without sampling error, and by default of full width."""
-        zero_BA = q_BA.new_zeros(()).expand_as(q_BA)  # one number in memory
+        zero_BA = _zero(q_BA.dtype, q_BA.device).expand_as(q_BA)  # one number in memory
         pruned_BA = zero_BA if pruned_BA is None else pruned_BA
         return cls(q_BA, zero_BA, pruned_BA, model_calls, critic_calls, nodes_per_level, doubt_BA=doubt_BA)
 
@@ -201,11 +202,19 @@ class Leaves:
 
     def _called(self, leaf: Leaf, state_N: Tensor, shape: tuple[int, ...]) -> Tensor:
         self.calls += 1
-        values = leaf(state_N).to(self._model.dtype)
+        values = leaf(state_N)
+        if values.dtype != self._model.dtype:
+            values = values.to(self._model.dtype)
         if values.shape != shape:
             raise PgtsError(f"the critic's values have shape {tuple(values.shape)}; of {len(state_N)} leaves: {shape}")
         check_finite("value", "the critic's value", values, state_N)
         return values
+
+
+@functools.cache
+@torch.inference_mode(False)
+def _zero(dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.zeros((), dtype=dtype, device=device)
 
 
 def checked_errors(

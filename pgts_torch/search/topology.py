@@ -49,9 +49,6 @@ class Topology:
         """An empty one of the same model and limits."""
         return Topology(self.model, max_bytes=self.max_bytes)
 
-    # What these methods make outlives the call: ordinary tensors, also where the caller is in inference mode.
-    @torch.inference_mode(False)
-    @torch.no_grad()
     def levels(self, root_B: Int[Tensor, "B"], expansions: int, *, max_nodes: int) -> Levels:
         """The levels below `root_B`, at least `expansions` of them or a closed set.
 
@@ -69,19 +66,31 @@ class Topology:
         key = root_B.dtype, root_B.shape, root_B.cpu().numpy().tobytes()
         levels = self._levels.get(key)
         if levels is None:
-            check_roots(root_B, self.model.num_states)
-            roots = self._positions.distinct(root_B)
-            levels = self._levels[key] = Levels([roots], self._positions.of(roots)[root_B])
+            levels = self._levels[key] = self._start(root_B)
             if len(self._levels) > _REMEMBERED_ROOTS:
                 self._levels.popitem(last=False)
         self._levels.move_to_end(key)
+        if levels.closed is None and len(levels.outcomes) < expansions:
+            self._grow(levels, expansions, max_nodes)
+        self._check_nodes(levels, expansions, expansions, max_nodes)
+        return levels
+
+    # What these methods make outlives the call: ordinary tensors, also where the caller is in inference mode.
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def _start(self, root_B: Int[Tensor, "B"]) -> Levels:
+        check_roots(root_B, self.model.num_states)
+        roots = self._positions.distinct(root_B)
+        return Levels([roots], self._positions.of(roots)[root_B])
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def _grow(self, levels: Levels, expansions: int, max_nodes: int) -> None:
         # Level by level: the nodes are counted, and their memory is found, before the model is queried.
         while levels.closed is None and len(levels.outcomes) < expansions:
             self._check_nodes(levels, len(levels.outcomes), expansions, max_nodes)
             self._afford(levels.frontiers[-1], levels, f"level {len(levels.outcomes)} of the {expansions}")
             self._expand(levels)
-        self._check_nodes(levels, expansions, expansions, max_nodes)
-        return levels
 
     @torch.inference_mode(False)
     @torch.no_grad()

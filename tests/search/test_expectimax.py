@@ -353,3 +353,10 @@ def test_a_leaf_value_too_large_for_the_dtype_of_the_model_is_refused():
     model = TabularModel(ladder(3), dtype=torch.float32)
     with pytest.raises(PgtsError, match="value of state 0 is inf"):
         expectimax(model, torch.arange(3), depth=1, v_leaf=lambda s: zeros(s) + 1e300)
+
+
+def test_the_result_shares_no_memory_with_the_values_of_the_critic():
+    model, q_SA = TabularModel(zoo("garnet")), some_q(zoo("garnet"))
+    for root_B in (all_states(zoo("garnet")), torch.tensor([3, 3, 1])):
+        look = expectimax(model, root_B, depth=0, q_leaf=lambda state_N: q_SA[: len(state_N)])
+        assert look.q_BA.untyped_storage().data_ptr() != q_SA.untyped_storage().data_ptr()
