@@ -20,15 +20,19 @@ from pgts_torch.models.base import (
     SamplingModel,
     Transitions,
 )
+from pgts_torch.models.optimism import (
+    Probabilities,
+    extra_visits,
+    lasting_worth,
+    probabilities,
+    reward_limits,
+    sampled_probabilities,
+)
 from pgts_torch.models.outcome_counts import OutcomeCounts
-from pgts_torch.models.rewards import value_range
 from pgts_torch.models.steps import check_rewards
 from pgts_torch.options.models import Counts
 from pgts_torch.seeding import uniform
 from pgts_torch.tabular.mdp import check_gamma
-
-Probabilities = tuple[Float[np.ndarray, "C"], Float[np.ndarray, "C"]]
-"""Of each outcome, and of the unknown outcome of its pair."""
 
 
 class _Memory:
@@ -123,13 +127,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         """The lowest and the highest value of a state: as given, or what the rewards seen so far allow."""
         if self.options.value_range is not None:
             return self.options.value_range[0], self.options.value_range[1]
-        reward_C, ends_C = self.counts.reward_C, self.counts.discount_C == 0
-        last_C, other_C = reward_C[ends_C], reward_C[~ends_C]
-        low, high = value_range((other_C.min(initial=0), other_C.max(initial=0)), self.gamma)
-        low, high = min(low, last_C.min(initial=0)), max(high, last_C.max(initial=0))
-        if high == 0 and not (len(reward_C) and reward_C.max() < 0):
-            high = np.abs(reward_C).max(initial=0) / (1 - self.gamma) or 1.0
-        return float(low), float(high)
+        return reward_limits(self.counts, self.gamma)
 
     @property
     def unknown_worth(self) -> float:
@@ -137,10 +135,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         low, high = self.value_range
         if self.options.optimism == "none":
             return low
-        if self.options.value_range is None:
-            going_on_C = self.counts.reward_C[self.counts.discount_C > 0]
-            high = max(high, 2 * float(going_on_C.max(initial=0)) / (1 - self.gamma))
-        return high
+        return high if self.options.value_range is not None else max(high, 2 * lasting_worth(self.counts, self.gamma))
 
     def plain(self) -> "CountsModel":
         """The same table without optimism. It goes on learning with this one, and so needs a `Topology` of its own."""
@@ -193,7 +188,8 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         memory, known = self._memory, len(self.counts.pair_C)
         if len(pair_N):
             counts = memory.counts.with_steps(pair_N, next_N, discount_N, reward_N)
-            memory.replace(counts, None if memory.sampled is None else self._sampled(counts, generator))
+            samples = memory.sampled is not None
+            memory.replace(counts, sampled_probabilities(self.options, counts, generator) if samples else None)
         return {"new_outcomes": len(memory.counts.pair_C) - known, "unknown_worth": self.unknown_worth}
 
     def is_news(self, observation_B: Int[Tensor, "B"], action_B: Int[Tensor, "B"]) -> bool:
@@ -203,7 +199,7 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         last `learn` as before it, unless no pair has had two outcomes so far.
         """
         memory, news = self._memory, False
-        least = 1 + math.floor(self._extra(memory.counts)) if self.options.optimism == "rmax" else 1
+        least = 1 + math.floor(extra_visits(self.options, memory.counts)) if self.options.optimism == "rmax" else 1
         for pair in (observation_B * self.num_actions + action_B).tolist():
             memory.since[pair] += 1
             before = memory.counts.visits(pair)
@@ -253,18 +249,24 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         """Pair, probability, probability of the unknown, what the outcome and the unknown add to r(s, a), discount and
         next state of each outcome; and last of a pair that was never visited."""
         counts, worth = self.counts, self.unknown_worth
-        share_C, unknown_C = self._probabilities(counts)
+        share_C, unknown_C = self._probabilities()
         reward_C, worth_C = share_C * counts.reward_C, unknown_C * worth
         columns = counts.pair_C, share_C, unknown_C, reward_C, worth_C, counts.discount_C, counts.next_C
         last = self.num_states * self.num_actions, 0, 1, 0, worth, 0, 0
         padded = (np.append(x_C, np.asarray(x, dtype=x_C.dtype)) for x_C, x in zip(columns, last, strict=True))
         return tuple(torch.from_numpy(x_C).to(self.device) for x_C in padded)
 
+    def _probabilities(self) -> Probabilities:
+        if self.options.optimism != "posterior":
+            return probabilities(self.options, self.counts)
+        assert self._memory.sampled is not None
+        return self._memory.sampled
+
     def _made_errors(self, confidence: float) -> Float[Tensor, "S A"]:
         """`step_error` of all states, as a share of the range for each pair, times its width."""
         counts, (low, high) = self.counts, self.value_range
         pairs = self.num_states * self.num_actions
-        share_C, unknown_C = self._probabilities(counts)
+        share_C, unknown_C = self._probabilities()
         n_C = counts.summed(counts.count_C).astype(np.float64)
         surely = math.inf if confidence == 1 else -math.log1p(-confidence)
         log_C = (self.num_states + 1) * math.log(2) + np.log(pairs * n_C * (n_C + 1)) + surely
@@ -273,35 +275,6 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         error_P[counts.pair_C] = np.minimum(1, np.sqrt(log_C / (2 * n_C)) + moved_C / 2)
         error_SA = torch.from_numpy((high - low) * error_P).view(self.num_states, self.num_actions)
         return error_SA.to(self.device)
-
-    def _extra(self, counts: OutcomeCounts) -> float:
-        """c of `Counts.optimism`."""
-        return self.options.strength * (counts.most - 1 or 1 / (1 + counts.num_repeated))
-
-    def _probabilities(self, counts: OutcomeCounts) -> Probabilities:
-        optimism, visits_C = self.options.optimism, counts.summed(counts.count_C)
-        if optimism == "posterior":
-            assert self._memory.sampled is not None
-            return self._memory.sampled
-        if optimism == "none":
-            unknown_C = np.zeros(len(visits_C))
-        elif optimism == "rmax":
-            unknown_C = (visits_C <= self._extra(counts)).astype(np.float64)
-        elif optimism == "bonus":
-            unknown_C = np.minimum(1, self._extra(counts) / np.sqrt(visits_C))
-        else:
-            unknown_C = self._extra(counts) / (visits_C + self._extra(counts))
-        sizes_C = np.repeat(counts.size_P, counts.size_P)
-        return (1 - unknown_C) * ((counts.count_C + 1) / (visits_C + sizes_C)), unknown_C
-
-    def _sampled(self, counts: OutcomeCounts, generator: torch.Generator) -> Probabilities:
-        """From the Dirichlet distribution with a count and 1 for each outcome of a pair, and c for the unknown one."""
-        seed = torch.randint(2**62, (1,), generator=generator, device=generator.device)
-        random = np.random.default_rng(int(seed))
-        gamma_C = random.standard_gamma(counts.count_C + 1)
-        unknown_C = np.repeat(random.standard_gamma(self._extra(counts), len(counts.size_P)), counts.size_P)
-        total_C = counts.summed(gamma_C) + unknown_C
-        return gamma_C / total_C, unknown_C / total_C
 
     def _checked(self, experience: Experience) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Pairs, next states, discounts and rewards."""
