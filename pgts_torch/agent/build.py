@@ -54,11 +54,15 @@ _UPDATES: _Choices = {
     CMPO: CMPOUpdate,
 }
 
-_PASSES: dict[str, Any] = {"minibatch_size": 256, "max_grad_norm": 1.0}
 _FITS = NetworkValues(
-    **_PASSES, num_epochs=4, learning_rate=2e-3, fresh_targets=False, method=NetworkTDLambda(lambda_=1.0)
+    num_epochs=4,
+    minibatch_size=256,
+    max_grad_norm=1.0,
+    learning_rate=2e-3,
+    fresh_targets=False,
+    method=NetworkTDLambda(lambda_=1.0),
 )
-_STEPS = CMPO(**_PASSES, num_epochs=1, temperature=1.0, clip=1.0)
+_STEPS = CMPO(num_epochs=1, minibatch_size=64, max_grad_norm=1.0, temperature=1.0, clip=1.0)
 """The critic and the update of networks that suit long imagined episodes: returns that are bootstrapped only where an
 episode was cut off, and one pass of short steps of the policy."""
 

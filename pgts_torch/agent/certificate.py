@@ -144,7 +144,8 @@ class Certificates:
         )
 
     def starts(self, experience: Rollout, state_N: Int[Tensor, "N"], v_N: Float[Tensor, "N"]) -> _Starts:
-        """Return the start states and v there: all of them where mu is known, else those of the episodes.
+        """Return the start states and v there: all of them where mu is known, else those of the episodes, if the
+        lookahead starts from them.
 
         Args:
             experience: the episodes of the iteration.
@@ -152,9 +153,12 @@ class Certificates:
         """
         start_S, num_episodes = self._world.start_S, experience.num_episodes
         if start_S is None:
-            starts, count_N = experience.state_TB[0].unique(return_counts=True)
+            first_B = experience.state_TB[0]
+            if experience.searched_TB is not None:
+                first_B = first_B[experience.searched_TB[0]]
+            starts, count_N = first_B.unique(return_counts=True)
             v_of_starts = v_N[torch.searchsorted(state_N, starts)]
-            return _Starts(starts, count_N.double() / num_episodes, v_of_starts.double(), num_episodes)
+            return _Starts(starts, count_N.double() / len(first_B), v_of_starts.double(), len(first_B))
         starts = torch.nonzero(start_S).flatten()
         if not self._critic.samples_when_queried:
             v_of_starts = self._critic.v(self._world.observe(starts))

@@ -90,13 +90,21 @@ class Dyna:
         """
         assert self.options.updates_per_step is not None
         assert self.options.length is not None
+        assert self.options.search_every is not None
         due = int(self.options.updates_per_step * self.replay.num_added) - self.num_updates
         every = self.replay.rows("state").unique() if self.options.starts == "all" else None
         for number in range(max(due, 1)):
             own = draws.update(number)
             self._world.reset_numbers()
             start_B = self._world.adopt(self._sampled(own) if every is None else every)
-            imagined = imagine(self._world, self.policy, start_B, self.options.length, generator=own.common)
+            imagined = imagine(
+                self._world,
+                self.policy,
+                start_B,
+                self.options.length,
+                search_every=self.options.search_every,
+                generator=own.common,
+            )
             self._steps += imagined.num_steps
             yield imagined, own
             self.num_updates += 1

@@ -16,15 +16,23 @@ from pgts_torch.seeding import sample_keys
 
 @torch.no_grad()
 def imagine(
-    world: ModelWorld, policy: Policy, start_B: Int[Tensor, "B"], length: int, *, generator: torch.Generator
+    world: ModelWorld,
+    policy: Policy,
+    start_B: Int[Tensor, "B"],
+    length: int,
+    *,
+    search_every: int = 1,
+    generator: torch.Generator,
 ) -> Rollout:
     """Run one episode of at most `length` steps in the model from each state; the environment is not stepped.
 
-    Outcomes are sampled from the model, so visits are an unbiased sample of what pi does in it.
+    Outcomes are sampled from the model, so visits are an unbiased sample of what pi does in it. An episode is cut off
+    before a step that the model does not trust, unless it is the first one.
 
     Args:
         world: its model is stepped, and gives the observations of its states.
         start_B: states of the model.
+        search_every: a lookahead starts from the visits at t = -b, search_every - b, ... of episode b.
         generator: for actions and outcomes.
 
     Returns:
@@ -43,6 +51,8 @@ def imagine(
     while len(rows) < length and bool(alive_B.any()):
         action_B = policy.sample(observations[-1], generator=generator)
         sampled = model.sample(state_B, action_B, key_N=sample_keys(len(state_B), generator=generator))
+        if rows and sampled.trusted_N is not None:
+            alive_B = alive_B & sampled.trusted_N
         reward_B, discount_B = torch.where(alive_B, sampled.reward_N.double(), 0.0), sampled.discount_N.double()
         if bool((off_B := reward_B == -torch.inf).any()):
             b = int(off_B.nonzero()[0, 0])
@@ -58,4 +68,8 @@ def imagine(
         states.append(state_B)
         observations.append(world.observe(state_B))
     columns: dict[str, Any] = dict(zip(COLUMNS, map(torch.stack, zip(*rows, strict=True)), strict=True))
-    return Rollout(torch.stack(observations), **columns, state_UB=torch.stack(states))
+    step_TB = torch.arange(len(rows), device=start_B.device)[:, None] + torch.arange(
+        len(start_B), device=start_B.device
+    )
+    searched_TB = None if search_every == 1 else step_TB % search_every == 0
+    return Rollout(torch.stack(observations), **columns, state_UB=torch.stack(states), searched_TB=searched_TB)

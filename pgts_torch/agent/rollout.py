@@ -59,6 +59,7 @@ class Rollout:
     state_UB: the states of these observations, which a lookahead may start from; None where there is no model.
     begins_B: whether an episode begins in the first row, where episodes go on from one rollout to the next; None: each
         does.
+    searched_TB: the visits that a lookahead starts from; None: all.
     finished: the undiscounted return and the length of each episode that ended, where episodes go on from one rollout
         to the next; None: all begin in this one.
     """
@@ -72,6 +73,7 @@ class Rollout:
     survival_TB: Float[Tensor, "T B"]
     state_UB: Int[Tensor, "U B"] | None = None
     begins_B: Bool[Tensor, "B"] | None = None
+    searched_TB: Bool[Tensor, "T B"] | None = None
     finished: tuple[tuple[float, int], ...] | None = None
 
     @property
@@ -138,7 +140,7 @@ class Rollout:
         return (self.weight_TB * self.reward_TB).sum(0)
 
     def visits(self, state_weight: StateWeight) -> tuple[Int[Tensor, "N"], Float[Tensor, "N"]]:
-        """Return the distinct visited states, ascending, and the weight w(s) of each.
+        """Return the distinct visited states that a lookahead starts from, ascending, and the weight w(s) of each.
 
         occupancy:  mean over episodes of sum_t weight_t 1(s_t = s), an estimate of d^pi(s)    [PGTS Sec. 2]
         visits:     fraction of all visits that are to s
@@ -147,7 +149,8 @@ class Rollout:
         states, row_V = self._distinct
         if state_weight == "uniform":
             return states, torch.ones(len(states), dtype=self.weight_TB.dtype, device=states.device)
-        weight_V = self.visit_weight(state_weight)
+        weight_V = self.visit_weight(state_weight)[self._searched_V]
+        weight_V = weight_V * (self.num_steps / len(weight_V))  # they stand for all visits
         # the sum of the weights of all visits to a state
         weight_N = torch.zeros(len(states), dtype=weight_V.dtype, device=states.device)
         return states, weight_N.index_add_(0, row_V, weight_V)
@@ -159,12 +162,17 @@ class Rollout:
         # the smallest index of a visit to each state
         visit_V = torch.arange(len(row_V), device=row_V.device)
         first_N = torch.full_like(states, len(row_V)).scatter_reduce_(0, row_V, visit_V, "amin")
-        return self.observation_V[first_N]
+        return self.observation_V[self._searched_V][first_N]
+
+    @property
+    def _searched_V(self) -> Any:
+        """Which of the visits a lookahead starts from, as an index."""
+        return slice(None) if self.searched_TB is None else self.searched_TB[self.alive_TB]
 
     @cached_property
     def _distinct(self) -> tuple[Int[Tensor, "N"], Int[Tensor, "V"]]:
         """The distinct visited states, ascending, and the index among them of the state of each visit."""
-        return self.state_TB[self.alive_TB].unique(return_inverse=True)
+        return self.state_TB[self.alive_TB][self._searched_V].unique(return_inverse=True)
 
     def visit_weight(self, state_weight: StateWeight) -> Float[Tensor, "V"]:
         """The weight that each visit adds to w(s), in the order of `alive_TB`; with "uniform" it is 1."""

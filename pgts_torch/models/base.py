@@ -23,11 +23,13 @@ class Transitions:
     """One sampled outcome for each of N pairs (state, action).
 
     reward_N: in reward units.   discount_N: in [0, 1], 0 after a terminal outcome.   next_state_N: states of the model.
+    trusted_N: whether the model knows enough of what follows for imagined episodes to go on; None: it always does.
     """
 
     reward_N: Float[Tensor, "N"]
     discount_N: Float[Tensor, "N"]
     next_state_N: Int[Tensor, "N"]
+    trusted_N: Bool[Tensor, "N"] | None = None
 
 
 class Experience(NamedTuple):

@@ -54,8 +54,8 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
     The networks are fitted to minibatches of all steps seen so far except a tenth, which is held out. Each member has
     its own initial weights and minibatches (Lakshminarayanan et al. 2017; Chua et al. 2018). `step` returns the means
     over members, with the discount gamma (1 - p) for the probability p of an end; `sample` samples the end, the one
-    thing that is random in this model. The model is an estimate: steps of the environment measure its error, and no
-    step contradicts it.
+    thing that is random in this model, and trusts no step on which members differ much. The model is an estimate:
+    steps of the environment measure its error, and no step contradicts it.
 
     replay: the steps seen; its column "state" has the states.
 
@@ -180,7 +180,28 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
                 raise NotFinite(
                     f"the mean of {name}s is {mean.tolist()}; what a model learns must be finite", what="model"
                 )
-            self._moments[name] = (mean.to(self.device), deviation.to(self.device))
+            self._standardise(name, mean.to(self.device), deviation.to(self.device))
+
+    @torch.no_grad()
+    def _standardise(self, name: str, mean: Tensor, deviation: Tensor) -> None:
+        """Take a new mean and deviation, and rescale the weights so that what is predicted stays the same, but where
+        numbers were or are constant, or inputs clipped (as PopArt, van Hasselt et al. 2016)."""
+        old_mean, old_deviation = self._moments[name]
+        self._moments[name] = mean, deviation
+        if self.generation == 0:  # nothing is predicted yet
+            return
+        varies = (deviation > 0) & (old_deviation > 0)
+        ratio = torch.where(varies, deviation / old_deviation, 1.0)
+        shift = torch.where(varies, (mean - old_mean) / old_deviation, 0.0)
+        if name == "state":  # inputs x become (x - shift) / ratio
+            weight, bias = self._layers[0]
+            bias += (shift @ weight[:, : self.state_size])[:, None]
+            weight[:, : self.state_size] *= ratio[:, None]
+            return
+        weight, bias = self._layers[-1]  # outputs, and what they are aimed at
+        of = slice(0, self.state_size) if name == "change" else slice(self.state_size, self.state_size + 1)
+        weight[..., of] /= ratio
+        bias[..., of] = (bias[..., of] - shift) / ratio
 
     def _fit(self, trained: Int[Tensor, "R"], ended: Int[Tensor, "Q"], generator: torch.Generator) -> float:
         """Take one gradient step, with a minibatch for each member. Return the loss.
@@ -251,18 +272,23 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
         """The means over members; the discount is gamma (1 - p)."""
-        next_END, reward_EN, end_EN = self.members(state_ND, action_N)
-        return reward_EN.mean(0).double(), self.gamma * (1 - end_EN.mean(0).double()), next_END.mean(0)
+        return self._means(self.members(state_ND, action_N))
+
+    def _means(self, said: Prediction) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
+        return said.reward_EN.mean(0).double(), self.gamma * (1 - said.end_EN.mean(0).double()), said.next_END.mean(0)
 
     def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
         """The means over members; the episode ends with their mean probability, and the discount is then 0, else gamma.
-        With repeated actions no end is sampled, and the discount is the mean one, as that of `step`."""
+        A step is trusted where `Prediction.disagreement` is at most `max_disagreement`. With repeated actions no end is
+        sampled, the discount is the mean one, as that of `step`, and all steps are trusted."""
         if self.action_repeat > 1:
             return super().sample(state_N, action_N, key_N=key_N)
         self.simulator_steps += len(state_N)
-        reward_N, discount_N, next_ND = self.step(self.states(state_N), action_N)
+        said = self.members(self.states(state_N), action_N)
+        trusted_N = said.disagreement(self._moments["state"][1]) <= self.options.max_disagreement
+        reward_N, discount_N, next_ND = self._means(said)
         goes_on_N = uniform(key_N) * self.gamma < discount_N
-        return Transitions(reward_N, self.gamma * goes_on_N.double(), self.number(next_ND))
+        return Transitions(reward_N, self.gamma * goes_on_N.double(), self.number(next_ND), trusted_N)
 
     def step_error(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"] | None:
         """An estimate, `Prediction.spread` for the values [l, u] that the rewards seen allow; None with one member,

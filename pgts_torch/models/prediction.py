@@ -17,11 +17,23 @@ class Prediction(NamedTuple):
     def spread(self, deviation_D: Float[Tensor, "D"], width: float) -> Float[Tensor, "N"]:
         """An estimate of the error of r + gamma (1 - p) v(s'), with |x| the largest x of a member less the smallest:
 
-            |r| + width min(1, |p| + root mean square of |s'| / deviation)
+            |r| + width * disagreement
 
-        for values v whose range times gamma has this width, and which change by no more over one deviation of states. A
-        number of the state that has never changed, of deviation 0, does not count.
+        for values v whose range times gamma has this width, and which change by no more over one deviation of states.
         """
-        next_ND, reward_N, end_N = (x.amax(0) - x.amin(0) for x in self)
-        moved_ND = torch.where(deviation_D > 0, next_ND / deviation_D, 0.0)
-        return reward_N + width * (end_N + moved_ND.square().mean(-1).sqrt()).clamp(max=1)
+        return _range(self.reward_EN) + width * self.disagreement(deviation_D)
+
+    def disagreement(self, deviation_D: Float[Tensor, "D"]) -> Float[Tensor, "N"]:
+        """How much members differ on what follows, as a share of the value span:
+
+            min(1, |p| + root mean square of |s'| / deviation)
+
+        A number of the state that has never changed, of deviation 0, does not count.
+        """
+        moved_ND = torch.where(deviation_D > 0, _range(self.next_END) / deviation_D, 0.0)
+        return (_range(self.end_EN) + moved_ND.square().mean(-1).sqrt()).clamp(max=1)
+
+
+def _range(value_EN: Tensor) -> Tensor:
+    """The largest value of a member less the smallest."""
+    return value_EN.amax(0) - value_EN.amin(0)

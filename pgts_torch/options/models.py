@@ -81,7 +81,12 @@ class Ensemble(Part):
     hidden: Sizes = Field(default=[64, 64])
     """Sizes of the hidden layers of each network."""
 
-    learning_rate: Positive = 1e-3
+    max_disagreement: Share = 0.2
+    """An imagined episode is cut off before a step on which the members differ by more: the largest difference of their
+    probabilities of an end, plus that of their next vectors, in standard deviations of what was seen (root mean square
+    over the numbers of a vector); 1: never, as with repeated actions."""
+
+    learning_rate: Positive = 3e-3
     """Step size of Adam."""
 
     weight_decay: NonNegative = 1e-5
@@ -90,7 +95,7 @@ class Ensemble(Part):
     minibatch_size: Count = 256
     """Steps of the environment in each gradient step, for each member."""
 
-    updates_per_step: Positive = 0.5
+    updates_per_step: Positive = 2.0
     """Gradient steps for each environment step."""
 
     first_updates: Count = 600

@@ -37,6 +37,10 @@ class UniformReplay(Part):
     """The largest number of steps of an imagined episode. Where a critic is bootstrapped after few steps, its errors at
     steep places of the value add up along the way to the goal."""
 
+    search_every: Count | None = null(tables=1, vectors=4)
+    """The policy is updated by a lookahead from every so-manieth visit of an imagined episode; the critic learns from
+    all of them."""
+
     polyak: Share = 0.5
     """The step of the slow copy of a network policy toward it after each update. Imagined episodes follow the copy, and
     updates start from it; 1: there is no copy."""

@@ -1,5 +1,7 @@
 """Training from imagined episodes that start in replayed states."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from pgts_torch.agent.imagine import imagine
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.ongoing import OngoingEpisodes
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.target_updates import NetworkMirrorUpdate
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
@@ -134,6 +137,59 @@ def test_imagined_returns_are_unbiased():
     assert abs(float(returns_B.mean() - v_S[0])) < 5 * error + cut  # outside with a probability below 1e-6
     assert rollout.state_UB is not None
     assert rollout.state_UB.equal(rollout.observation_UB)
+
+
+class Trusting(TabularModel):
+    """A table that does not trust steps from some states."""
+
+    def __init__(self, mdp, doubted: list[int]) -> None:
+        super().__init__(mdp)
+        self.doubted = torch.tensor(doubted)
+
+    def sample(self, state_N, action_N, *, key_N):
+        return replace(super().sample(state_N, action_N, key_N=key_N), trusted_N=~torch.isin(state_N, self.doubted))
+
+
+def test_imagined_episodes_are_cut_off_before_steps_that_are_not_trusted():
+    mdp, doubted = zoo("garnet"), [1, 2]
+    pi_SA, start_B = torch.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions), torch.arange(mdp.num_states)
+
+    def imagined(doubted: list[int]) -> Rollout:
+        world = TabularWorld(vector_env(mdp, 1), mdp, model=Trusting(mdp, doubted))
+        return imagine(world, following(pi_SA), start_B, 30, generator=stream(0, "test"))
+
+    cut, whole = imagined(doubted), imagined([])
+    assert bool(cut.alive_TB[0].all())  # the first step is taken everywhere
+    assert not torch.isin(cut.state_TB[1:][cut.alive_TB[1:]], torch.tensor(doubted)).any()
+    assert torch.isin(whole.state_TB[1:][whole.alive_TB[1:]], torch.tensor(doubted)).any()
+    # until then both are the same, and the state that an episode is cut off in is what its critic is asked for
+    assert cut.reward_TB[cut.alive_TB].equal(whole.reward_TB[: len(cut.alive_TB)][cut.alive_TB])
+    last_B, episode_B = cut.alive_TB.sum(0), torch.arange(mdp.num_states)
+    ends_B = cut.state_UB[last_B, episode_B]
+    assert torch.isin(ends_B[last_B < 30], torch.tensor(doubted)).all()
+    assert bool((cut.discount_TB[last_B - 1, episode_B] > 0).all())
+
+
+def test_a_lookahead_from_some_visits_weighs_states_like_one_from_all():
+    mdp = zoo("garnet")
+    world = TabularWorld(vector_env(mdp, 1), mdp)
+    pi_SA, start_B = torch.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions), torch.zeros(4000).long()
+    rollouts = [
+        imagine(world, following(pi_SA), start_B, 12, search_every=every, generator=stream(0, "test"))
+        for every in (1, 4)
+    ]
+    for weight in ("visits", "occupancy"):
+        whole_S, part_S = torch.zeros(2, mdp.num_states, dtype=torch.float64)
+        for into_S, rollout in zip((whole_S, part_S), rollouts, strict=True):
+            states, weight_N = rollout.visits(weight)
+            into_S[states] = weight_N
+            assert rollout.first_observation_N.equal(states)
+        assert float(part_S.sum()) == pytest.approx(float(whole_S.sum()), rel=0.02)
+        assert float((part_S - whole_S).abs().max()) < 0.05 * float(whole_S.max())
+        assert not part_S.equal(whole_S)
+    searched_TB = rollouts[1].searched_TB
+    assert int(searched_TB.sum()) == searched_TB.numel() // 4
+    assert rollouts[1].num_steps == rollouts[0].num_steps
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,41 @@ def test_members_differ_by_about_as_much_as_they_are_wrong():
     assert alone.step_error(alone.number(torch.zeros(1, 2))) is None
 
 
+def test_steps_on_which_members_differ_are_not_trusted():
+    def trusted(far: float, **options: float) -> float:
+        """The share of steps that are trusted in 200 states so many deviations from the mean."""
+        model = trained(options=Ensemble(members=3, hidden=[32], first_updates=800, **options))
+        state_ND = far * nn.functional.normalize(torch.randn(200, 2, generator=stream(0, "test")))
+        zero_N = torch.zeros(200, dtype=torch.int64)
+        found = model.sample(model.number(state_ND), zero_N, key_N=torch.arange(200)).trusted_N
+        assert found is not None
+        return float(found.double().mean())
+
+    assert trusted(0.5) > 0.9
+    assert trusted(8.0) < 0.1
+    assert trusted(8.0, max_disagreement=1.0) == 1
+
+
+def test_new_moments_change_no_prediction():
+    model, fresh = trained(), swing(50, seed=1)
+    asked = fresh.observation_N.float(), fresh.action_N
+    said, moments = model.step(*asked), dict(model._moments)
+    wide = swing(300, seed=2)
+    model.replay.add(
+        state=3 * wide.observation_N + 1,
+        action=wide.action_N,
+        reward=5 * wide.reward_N + 2,
+        end=0 * wide.reward_N,
+        next_state=4 * wide.next_observation_N,
+        follows=wide.follows_N,
+    )
+    model._measure_moments()
+    for now, before in zip(model.step(*asked), said, strict=True):
+        torch.testing.assert_close(now, before, rtol=1e-4, atol=1e-4)
+    model._moments = moments  # with other moments the same weights say something else
+    assert float((model.step(*asked)[2] - said[2]).abs().mean()) > 0.1
+
+
 def test_a_lookahead_in_it_is_that_of_its_means():
     model = trained()
     roots = model.number(torch.tensor([[0.1, 0.2], [0.5, -0.5]]))
