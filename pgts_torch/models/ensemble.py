@@ -7,12 +7,12 @@ import warnings
 from typing import Any, final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.models.base import Experience, FallibleModel, LearningModel, Transitions
-from pgts_torch.models.held_out import BLOCK, held_out_rows, runs
+from pgts_torch.models.held_out import BLOCK, held_out_rows, prediction_errors
 from pgts_torch.models.prediction import Prediction
 from pgts_torch.models.replay import ReplayBuffer
 from pgts_torch.models.rewards import value_range
@@ -29,16 +29,6 @@ _SELDOM = 0.02
 _ENDS = 0.25
 """The share of a minibatch that is sampled from steps that ended an episode, which may be rare among all steps."""
 
-_AHEAD = (1, 4, 16)
-"""The numbers of steps ahead for which the prediction error is measured."""
-
-_MOST_MEASURED = 256
-"""The most starts, the latest ones, from which an error is measured."""
-
-_MOST_OFF = 4.0
-"""The largest squared error of a change, in variances of changes, that counts: a few large ones, as where a car hits a
-wall, do not say that the observation is not the state."""
-
 _ENOUGH_STEPS, _UNEXPLAINED = 2000, 0.5
 """With so many steps and a larger share of the variance of changes unexplained, a warning is given."""
 
@@ -52,7 +42,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         end of the episode       cross-entropy; ends are oversampled, and the predicted odds corrected for that
 
     The networks are fitted to minibatches of all steps seen so far except a tenth, which is held out. Each member has
-    its own initial weights and minibatches (Lakshminarayanan et al. 2017; Chua et al. 2018). `step` returns the means
+    its own initial weights, minibatches and bootstrap sample of the steps (Chua et al. 2018). `step` returns the means
     over members, with the discount gamma (1 - p) for the probability p of an end; `sample` samples the end, the one
     thing that is random in this model, and trusts no step on which members differ much. The model is an estimate:
     steps of the environment measure its error, and no step contradicts it.
@@ -93,7 +83,10 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         self.replay: ReplayBuffer = ReplayBuffer(capacity)
         none = torch.zeros(0)
         vectors, whole, flags = torch.zeros(0, state_size), none.long(), none.bool()
-        self.replay.add(state=vectors, action=whole, reward=none, end=none, next_state=vectors, follows=flags)
+        copies = torch.zeros(0, options.members)
+        self.replay.add(
+            state=vectors, action=whole, reward=none, end=none, next_state=vectors, follows=flags, copies=copies
+        )
         self._warned, self._end_share = False, 0.0
         sizes = [state_size + num_actions, *options.hidden, state_size + 2]
         generator = stream(seed, "model")
@@ -145,6 +138,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
             end=ends.float(),
             next_state=experience.next_observation_N.float(),
             follows=experience.follows_N,
+            copies=self._copies(ends, generator),
         )
         self._measure_moments()
         held_out = held_out_rows(self.replay)
@@ -171,6 +165,14 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
                 "have, if there is one"
             )
         return observation_N.float()
+
+    def _copies(self, end_N: Bool[Tensor, "N"], generator: torch.Generator) -> Float[Tensor, "N E"]:
+        """How often each member has each step: Poisson with mean 1, as in a bootstrap sample of many steps (Oza and
+        Russell 2001). All have the ends, which may be too few to miss one."""
+        if self.options.members == 1:
+            return torch.ones(len(end_N), 1)
+        mean_NE = torch.ones(len(end_N), self.options.members, device=generator.device)
+        return torch.where(end_N[:, None].cpu(), 1.0, torch.poisson(mean_NE, generator=generator).cpu())
 
     def _measure_moments(self) -> None:
         state_ND, next_ND, reward_N = (self.replay.rows(name) for name in ("state", "next_state", "reward"))
@@ -221,14 +223,15 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         state, action, reward, end, after = (self.replay.rows(c, at.flatten()).to(self.device) for c in columns)
         # The frequency of a row among all steps, divided by that in the minibatch, where ends are oversampled. The loss
         # of ends has no such weight: their log odds are corrected by `_log_odds_added`.
-        weight = 1 / (1 - _ENDS + _ENDS * end / self._end_share) if extra else torch.ones_like(end)
+        copies = self.replay.rows("copies")[at, torch.arange(E)[:, None]].flatten().to(self.device)
+        weight = copies / (1 - _ENDS + _ENDS * end / self._end_share) if extra else copies
         output = self._outputs(self._inputs(state, action).view(E, N, -1)).reshape(E * N, -1)
         aimed = torch.cat([self._scaled("change", after - state), self._scaled("reward", reward[:, None])], -1)
         changes, rewards, logits = output.split([self.state_size, 1, 1], -1)
         loss = (
             weight @ nn.functional.smooth_l1_loss(changes, aimed[:, :-1], reduction="none").mean(-1) / len(weight)
             + weight @ (rewards - aimed[:, -1:]).square()[:, 0] / len(weight)
-            + nn.functional.binary_cross_entropy_with_logits(logits[:, 0], end)
+            + nn.functional.binary_cross_entropy_with_logits(logits[:, 0], end, copies)
         )
         self._optimiser.zero_grad()
         loss.backward()
@@ -302,25 +305,10 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         spread_N = said.spread(self._moments["state"][1], self.gamma * (high - low))
         return spread_N.double().view(-1, self.num_actions)
 
-    @torch.no_grad()
     def _errors(self, held_out: Tensor) -> dict[str, float]:
         """The errors on held-out steps, by name (`learn`)."""
-        errors = {}
-        for steps in _AHEAD:
-            starts = runs(held_out, self.replay.rows("follows"), steps)[-_MOST_MEASURED:]
-            if len(starts) == 0:
-                continue
-            state_ND = self.replay.rows("state", starts).to(self.device)
-            for ahead in range(steps):
-                at_N = (starts + ahead) % self.replay.capacity
-                state_ND = self.step(state_ND, self.replay.rows("action", at_N).to(self.device))[2]
-            true_ND = self.replay.rows("next_state", at_N).to(self.device)
-            errors[f"error_{steps}"] = float(
-                self._scaled("state", state_ND).sub(self._scaled("state", true_ND)).square().mean().sqrt()
-            )
-            if steps == 1:  # `_scaled` subtracts the mean change, which the difference of two states does not have
-                off_ND = self._scaled("change", state_ND - true_ND + self._moments["change"][0])
-                errors["unexplained"] = float(off_ND.square().clamp(max=_MOST_OFF).mean())
+        deviations = {name: deviation for name, (_, deviation) in self._moments.items()}
+        errors = prediction_errors(self.replay, held_out, self.step, deviations)
         if errors.get("unexplained", 0.0) > _UNEXPLAINED and len(self.replay) >= _ENOUGH_STEPS and not self._warned:
             self._warned = True
             warnings.warn(

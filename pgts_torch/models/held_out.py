@@ -1,5 +1,7 @@
 """Steps of a replay buffer that a model is not trained on, to measure its errors."""
 
+from collections.abc import Callable, Mapping
+
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
@@ -8,6 +10,16 @@ from pgts_torch.models.replay import ReplayBuffer
 
 BLOCK, _HELD_OUT = 32, 10
 """Of every 10 blocks of 32 steps in a row the last one is held out."""
+
+_AHEAD = (1, 4, 16)
+"""The numbers of steps ahead for which the prediction error is measured."""
+
+_MOST_MEASURED = 256
+"""The most starts, the latest ones, from which an error is measured."""
+
+_MOST_OFF = 4.0
+"""The largest squared error of a change, in variances of changes, that counts: a few large ones, as where a car hits a
+wall, do not say that the observation is not the state."""
 
 
 def held_out_rows(buffer: ReplayBuffer) -> Bool[Tensor, "R"]:
@@ -41,3 +53,40 @@ def sequences(
         rows.append(at_N)
         counts.append(counts_N)
     return torch.stack(rows), torch.stack(counts)
+
+
+@torch.no_grad()
+def prediction_errors(
+    buffer: ReplayBuffer,
+    held_out_R: Bool[Tensor, "R"],
+    step: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]],
+    deviations: Mapping[str, Tensor],
+) -> dict[str, float]:
+    """The errors of a model on held-out steps, by name; left out where too few are held out.
+
+    error_1, error_4, error_16: the root mean square error of the state predicted so many steps ahead, in standard
+    deviations of states. unexplained: the share of the variance of changes that is not predicted, but for outliers.
+
+    Args:
+        step: returns reward, discount and next state.
+        deviations: of "state" and "change"; numbers of deviation 0 do not count.
+    """
+    errors = {}
+    for steps in _AHEAD:
+        starts = runs(held_out_R, buffer.rows("follows"), steps)[-_MOST_MEASURED:]
+        if len(starts) == 0:
+            continue
+        device = deviations["state"].device
+        state_ND = buffer.rows("state", starts).to(device)
+        for ahead in range(steps):
+            at_N = (starts + ahead) % buffer.capacity
+            state_ND = step(state_ND, buffer.rows("action", at_N).to(device))[2]
+        off_ND = state_ND - buffer.rows("next_state", at_N).to(device)
+        errors[f"error_{steps}"] = float(_squares(off_ND, deviations["state"]).mean().sqrt())
+        if steps == 1:
+            errors["unexplained"] = float(_squares(off_ND, deviations["change"]).clamp(max=_MOST_OFF).mean())
+    return errors
+
+
+def _squares(off_ND: Tensor, deviation_D: Tensor) -> Tensor:
+    return torch.where(deviation_D > 0, off_ND / deviation_D, 0.0).square()

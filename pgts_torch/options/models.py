@@ -76,7 +76,7 @@ class Ensemble(Part):
     type: Literal["ensemble"] = "ensemble"
 
     members: Count = 3
-    """The number of networks. Each has its own initial weights and minibatches."""
+    """The number of networks. Each has its own initial weights, minibatches and bootstrap sample of the steps."""
 
     hidden: Sizes = Field(default=[64, 64])
     """Sizes of the hidden layers of each network."""
