@@ -134,6 +134,21 @@ def test_new_moments_change_no_prediction():
     assert float((model.step(*asked)[2] - said[2]).abs().mean()) > 0.1
 
 
+def test_each_member_has_a_bootstrap_sample_of_the_steps_and_all_ends():
+    options = Ensemble(members=2, hidden=[8], first_updates=1)
+    copies_RE = trained(4000, options=options).replay.rows("copies")
+    ended_R = trained(4000, options=options).replay.rows("end") > 0
+    assert int(ended_R.sum()) > 50
+    assert bool((copies_RE[ended_R] == 1).all())
+    drawn_RE = copies_RE[~ended_R]
+    count = len(drawn_RE)  # each of the three statistics is within 5 deviations with a probability above 1 - 1e-5
+    assert float((drawn_RE.mean(0) - 1).abs().max()) < 5 / count**0.5
+    assert float(((drawn_RE == 0).double().mean(0) - math.exp(-1)).abs().max()) < 5 * 0.49 / count**0.5
+    assert abs(float(torch.corrcoef(drawn_RE.T)[0, 1])) < 5 / count**0.5
+    alone = trained(100, options=Ensemble(members=1, hidden=[8], first_updates=1)).replay.rows("copies")
+    assert bool((alone == 1).all())
+
+
 def test_a_lookahead_in_it_is_that_of_its_means():
     model = trained()
     roots = model.number(torch.tensor([[0.1, 0.2], [0.5, -0.5]]))
