@@ -54,17 +54,14 @@ _UPDATES: _Choices = {
     CMPO: CMPOUpdate,
 }
 
+_PASSES: dict[str, Any] = {"minibatch_size": 256, "max_grad_norm": 1.0}
 _FITS = NetworkValues(
-    num_epochs=4,
-    minibatch_size=256,
-    max_grad_norm=1.0,
-    learning_rate=2e-3,
-    fresh_targets=False,
-    method=NetworkTDLambda(lambda_=1.0),
+    **_PASSES, num_epochs=4, learning_rate=2e-3, fresh_targets=False, method=NetworkTDLambda(lambda_=1.0)
 )
-_STEPS = CMPO(num_epochs=1, minibatch_size=64, max_grad_norm=1.0, temperature=1.0, clip=1.0)
+_STEPS = CMPO(**_PASSES, num_epochs=1, temperature=1.0, clip=1.0)
 """The critic and the update of networks that suit long imagined episodes: returns that are bootstrapped only where an
-episode was cut off, and one pass of short steps of the policy."""
+episode was cut off, and one pass of short steps of the policy. Where fewer visits are searched minibatches are as much
+smaller, so that the steps are as many."""
 
 
 def make_device(device: torch.device | str) -> torch.device:
@@ -96,15 +93,19 @@ def chosen(options: Training, world: World) -> Training:
         critic = fits if isinstance(policy, Network) else TabularValues()
     if isinstance(critic, NetworkValues) and isinstance(critic.network, OwnNetwork) and isinstance(policy, Network):
         critic = critic.model_copy(update={"network": policy})
-    if isinstance(update, AutoUpdate):
-        lookahead = _STEPS if replayed else CMPO()
-        neural = PPO() if isinstance(options.estimator, SampledAdvantages) else lookahead
-        mirror = Mirror(step_size=20.0) if replayed else Mirror()
-        update = neural if isinstance(policy, Network) else Projected() if isinstance(policy, Simplex) else mirror
     if isinstance(replay, UniformReplay):
         if replay.starts == "all" and not numbered:
             raise PgtsError("replay.starts is 'all', which is for tables; observations here are no numbered states")
         replay = replay.filled("tables" if numbered else "images" if latent else "vectors")
+    if isinstance(update, AutoUpdate):
+        lookahead = CMPO()
+        if isinstance(replay, UniformReplay):
+            assert replay.search_every is not None
+            size = max(_STEPS.minibatch_size // replay.search_every, 1)
+            lookahead = _STEPS.model_copy(update={"minibatch_size": size})
+        neural = PPO() if isinstance(options.estimator, SampledAdvantages) else lookahead
+        mirror = Mirror(step_size=20.0) if replayed else Mirror()
+        update = neural if isinstance(policy, Network) else Projected() if isinstance(policy, Simplex) else mirror
     return checked(dict(options) | {"policy": policy, "critic": critic, "update": update, "replay": replay})
 
 

@@ -197,7 +197,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         shift = torch.where(varies, (mean - old_mean) / old_deviation, 0.0)
         if name == "state":  # inputs x become (x - shift) / ratio
             weight, bias = self._layers[0]
-            bias += (shift @ weight[:, : self.state_size])[:, None]
+            bias.add_((shift @ weight[:, : self.state_size])[:, None])
             weight[:, : self.state_size] *= ratio[:, None]
             return
         weight, bias = self._layers[-1]  # outputs, and what they are aimed at

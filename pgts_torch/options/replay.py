@@ -37,7 +37,7 @@ class UniformReplay(Part):
     """The largest number of steps of an imagined episode. Where a critic is bootstrapped after few steps, its errors at
     steep places of the value add up along the way to the goal."""
 
-    search_every: Count | None = null(tables=1, vectors=4)
+    search_every: Count | None = null(tables=1, vectors=4, images=1)
     """The policy is updated by a lookahead from every so-manieth visit of an imagined episode; the critic learns from
     all of them."""
 
