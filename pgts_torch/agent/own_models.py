@@ -154,7 +154,7 @@ def own_model(options: OwnModel) -> Model:
     assert options.make is not None
     module, _, name = options.make.partition(":")
     try:
-        made = getattr(importlib.import_module(module), name)()
+        made = getattr(importlib.import_module(module), name)(**options.arguments)
     except BaseException as error:
         raise failure(f"model.make is {options.make}, which cannot be made", error) from error
     if not isinstance(made, Model):

@@ -58,7 +58,7 @@ class PGTS:
             Default: tables where observations are numbered states, else networks.
         model: what the lookahead queries. "auto": that of the environment, as above; "ensemble" (observations are
             vectors), "latent" (images) or "counts" (numbered states): one that is learned from the steps; or a `Model`
-            whose states are the observations.
+            whose states are the observations, or the "module:name" of what makes one.
         replay: "uniform": many updates an iteration, from episodes imagined in the model, which start in states
             visited so far; "none": one update, from the episodes of the iteration; "auto": uniform if the model learns.
         horizon: when the episodes of an iteration end (`options.rollouts`); "auto" depends on the replay.

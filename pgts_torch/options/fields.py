@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -57,18 +58,21 @@ RESERVED_KWARGS = {
 
 
 def _check_kwargs(kwargs: dict[str, Any]) -> dict[str, Any]:
-    for name in kwargs:
-        key = f"env.kwargs.{name}"
+    for name in RESERVED_KWARGS.keys() & kwargs.keys():
+        raise conflict(f"env.kwargs must not have the key {name}: {RESERVED_KWARGS[name]}", f"env.kwargs.{name}")
+    return _check_arguments("env.kwargs", kwargs)
+
+
+def _check_arguments(key: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    for name in arguments:
         if not name.isidentifier():
-            raise conflict(f"env.kwargs has the key {name!r}, which cannot be the name of an argument", key)
-        if name in RESERVED_KWARGS:
-            raise conflict(f"env.kwargs must not have the key {name}: {RESERVED_KWARGS[name]}", key)
-    for value in _plain_values(kwargs):
+            raise conflict(f"{key} has the key {name!r}, which cannot be the name of an argument", f"{key}.{name}")
+    for value in _plain_values(arguments):
         if isinstance(value, float) and not math.isfinite(value):
-            raise conflict(f"env.kwargs holds {value}; numbers must be finite")
+            raise conflict(f"{key} holds {value}; numbers must be finite", key)
         if not (value is None or isinstance(value, bool | int | float | str)):
-            raise conflict(f"env.kwargs holds {value!r}; values must be plain")
-    return kwargs
+            raise conflict(f"{key} holds {value!r}; values must be plain", key)
+    return arguments
 
 
 def _plain_values(value: Any) -> Iterator[Any]:
@@ -90,6 +94,7 @@ def conflict(reason: str, *keys: str) -> PydanticCustomError:
 
 
 Kwargs = Annotated[dict[str, Any], AfterValidator(_check_kwargs)]
+Arguments = Annotated[dict[str, Any], AfterValidator(partial(_check_arguments, "model.arguments"))]
 
 
 def _check_ascending(pair: list[float]) -> list[float]:

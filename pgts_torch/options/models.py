@@ -4,7 +4,18 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from pgts_torch.options.fields import Ascending, Between, Count, Entry, NonNegative, Positive, Share, Sizes, conflict
+from pgts_torch.options.fields import (
+    Arguments,
+    Ascending,
+    Between,
+    Count,
+    Entry,
+    NonNegative,
+    Positive,
+    Share,
+    Sizes,
+    conflict,
+)
 from pgts_torch.options.part import Part, null
 from pgts_torch.options.policies import CNN
 
@@ -139,7 +150,10 @@ class OwnModel(Part):
     type: Literal["own"] = "own"
 
     make: Entry | None = None
-    """A class or a function without arguments that makes it; its module is imported."""
+    """A class or a function that makes it, MODULE:NAME; its module is imported. model: MODULE:NAME is short for it."""
+
+    arguments: Arguments = Field(default={})
+    """Arguments of that class or function, for instance --model.arguments.size 7."""
 
     @field_validator("make")
     @classmethod

@@ -286,6 +286,10 @@ def _with_types(data: dict[str, Any]) -> dict[str, Any]:
 
     It is the first type that goes with the other values and has all these keys; if none has, the first that goes.
     """
+    model = data.get("model")
+    model = {"type": model} if isinstance(model, str) else model
+    if isinstance(model, dict) and isinstance(name := model.get("type"), str) and ":" in name:
+        data = data | {"model": model | {"type": "own", "make": name}}  # a name of the caller's own, MODULE:NAME
     data = _with_type(_with_type(data, "model", [Ensemble, Counts, Latent, OwnModel]), "replay", [UniformReplay])
     replayed = _type(data, "replay") == "uniform" or _type(data, "model") in ("ensemble", "counts", "latent")
     horizons: list[type[Part]] = [FixedHorizon, GeometricHorizon]

@@ -168,6 +168,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a number in [0, 1]": st.floats(0, 1),
     "a number in (0, 1]": st.floats(0, 0.5, exclude_min=True),
     "a number in (0, 1] or null": st.none() | st.floats(0, 1, exclude_min=True),
+    "a number in (0, 1) or null": st.none() | st.floats(0, 1, exclude_min=True, exclude_max=True),
     "a number in [0, 1] or null": st.none() | st.floats(0, 1),
     "a number in (0, 1] or mean": st.just("mean") | st.floats(0, 1, exclude_min=True),
     "true or false": st.booleans(),
@@ -244,7 +245,7 @@ def configurations(draw: st.DrawFn) -> Config:
     if types["model.type"] == "counts" and given["model.optimism"] == "none":
         given["model.strength"] = None
     if types["model.type"] == "counts" and given["model.value_range"] is None:
-        given["model.confidence"] = None
+        given["model.confidence"] = given["model.certificate"] = None
     silent = {
         "counts": given.get("model.confidence") is None,
         "ensemble": given.get("model.members") == 1 or given.get("search.action_repeat", 1) > 1,
@@ -252,7 +253,7 @@ def configurations(draw: st.DrawFn) -> Config:
     if given.get("search.doubt") and (given["search.max_width"] is not None or silent.get(types["model.type"])):
         given["search.doubt"] = False
     is_learned = types["model.type"] in ("counts", "ensemble")
-    if is_learned:
+    if is_learned and given.get("model.certificate") is None:
         given["search.stop_at"] = None
     if types["rollout.horizon.type"] == "steps" and (types["replay.type"], is_learned) != ("auto", True):
         given = {key: value for key, value in given.items() if not key.startswith("replay.")}

@@ -7,7 +7,10 @@ import pytest
 
 from pgts_torch import PGTS
 from pgts_torch.cli.main import main
+from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.run import build
+from pgts_torch.options import OwnModel
 from pgts_torch.trust import check_imports
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -109,13 +112,16 @@ def model():
 
 def nothing():
     return None
+
+def of_size(length):
+    return TabularModel(ladder(length, start=0))
 """
 
 
 def test_a_model_of_the_callers_own_is_named_in_a_configuration_and_imported_only_where_it_is_trusted(here, capsys):
     (here / "models_of_mine.py").write_text(OWN)
     own = {"type": "own", "make": "models_of_mine:model"}
-    main(["train", *SHORT, "--model.type=own", "--model.make=models_of_mine:model"])
+    main(["train", *SHORT, "--model", "models_of_mine:model"])
     assert type(PGTS("pgts/Ladder-v0", model=own, env_kwargs={"start": 0}).world.model).__name__ == "TabularModel"
     trace = forgotten()
     sys.modules.pop("models_of_mine", None)
@@ -127,6 +133,25 @@ def test_a_model_of_the_callers_own_is_named_in_a_configuration_and_imported_onl
     assert not trace.exists()
     PGTS.load(saved, trust_imports=True)
     assert trace.exists()
+    sys.modules.pop("models_of_mine", None)
+
+
+def test_a_model_of_the_callers_own_takes_arguments(here, tmp_path):
+    (here / "models_of_mine.py").write_text(OWN)
+    (here / "own.yaml").write_text(
+        "env: {kwargs: {n: 7}}\nmodel: {make: 'models_of_mine:of_size', arguments: {length: 7}}"
+    )
+    flags = ["--model", "models_of_mine:of_size", "--model.arguments.length", "7", "--env.kwargs.n", "7"]
+    for config in (load(here / "own.yaml"), load(None, flags)):
+        assert config.model == OwnModel(make="models_of_mine:of_size", arguments={"length": 7})
+        training = build(config)
+        assert training.world.model.num_states == training.world.env.single_observation_space.n == 7
+    training.save(here / "model.pt")
+    assert PGTS.load(here / "model.pt", trust_imports=True).world.model.num_states == 7
+    with pytest.raises(PgtsError, match=r"models_of_mine:of_size, which cannot be made.*missing 1 required"):
+        PGTS("pgts/Ladder-v0", model="models_of_mine:of_size")
+    with pytest.raises(PgtsError, match=r"model\.arguments holds inf; numbers must be finite"):
+        PGTS("pgts/Ladder-v0", model={"make": "models_of_mine:of_size", "arguments": {"length": float("inf")}})
     sys.modules.pop("models_of_mine", None)
 
 
