@@ -1,5 +1,6 @@
 """Advice at the end of a run: the policy hardly moved, has not converged, or is worse when it acts greedily."""
 
+import copy
 import math
 from typing import Any
 
@@ -32,12 +33,14 @@ _DECAY = 0.9
 class Movement:
     """How far a policy has moved since the first iteration, and how much better a lookahead still finds its actions.
 
+    before: the policy before the next iteration; set it before the first one of this process.
+
     Args:
         first: the initial policy.
     """
 
     def __init__(self, first: Policy) -> None:
-        self.first = first
+        self.first = self.before = first
         self.moved: float | None = None
         self.gap_share: float | None = None
         self.pace: float | None = None
@@ -47,10 +50,12 @@ class Movement:
 
             sum_s w(s) 1/2 sum_a |pi_{k+1}(a|s) - pi_k(a|s)|,        in [0, 1], w the weights of the update, of sum 1
 
-        Of tabular policies only, where it costs next to nothing.
+        Of tabular policies only, where it costs next to nothing. An iteration with replay has many updates; the states
+        and weights are those of the last one.
         """
         if isinstance(algorithm.policy, TabularPolicy):
-            moved = _distance(algorithm, iteration, iteration.pi_NA)
+            moved = _distance(algorithm, iteration, self.before.probs(iteration.observation_N))
+            self.before = copy.deepcopy(algorithm.policy)
             self.pace = moved if self.pace is None else _DECAY * self.pace + (1 - _DECAY) * moved
 
     def measure(self, algorithm: PGTS, iteration: Iteration) -> None:

@@ -1,5 +1,6 @@
 """What a run does between iterations: log, evaluate, save; and at its end, sum up."""
 
+import copy
 import math
 import time
 from collections.abc import Iterator
@@ -53,6 +54,7 @@ class Recorder:
     ) -> None:
         self.config, self.algorithm, self.path, self.folder, self.stop = config, algorithm, path, folder, stop
         self.movement = movement
+        movement.before = copy.deepcopy(algorithm.policy)
         self.progress = Progress()
         self.truth = diagnostics.Truth(algorithm) if folder is not None and algorithm.world.mdp is not None else None
         self.report = Reporter(config.total_steps, shown=folder is not None)

@@ -1,13 +1,15 @@
 """A run that learned little says so at its end, and one that had nothing to learn does not."""
 
+import copy
 from pathlib import Path
 
 import pytest
 
+from pgts_torch import PGTS
 from pgts_torch.agent.evaluate import Evaluation, Score
 from pgts_torch.config import load
 from pgts_torch.experiment import run
-from pgts_torch.experiment.advice import greedy_is_worse
+from pgts_torch.experiment.advice import Movement, greedy_is_worse
 from pgts_torch.experiment.report.page import write
 from pgts_torch.experiment.summary import Summary, describe, from_json
 
@@ -92,3 +94,21 @@ def test_greedy_episodes_that_are_worse_beyond_chance_are_pointed_out():
     assert greedy_is_worse(evaluation(0.4, 0.2), evaluation(0.8, 0.3)) is None
     assert greedy_is_worse(evaluation(0.8, 0.1), evaluation(0.2, 0.1)) is None
     assert greedy_is_worse(evaluation(0.0, None), evaluation(0.8, None)) is None
+
+
+def test_with_replay_the_movement_of_an_iteration_is_that_of_all_its_updates():
+    replay = {"type": "uniform", "updates_per_step": 1, "starts": 2, "length": 4}
+    training = PGTS(
+        "pgts/RiverSwim-v0", replay=replay, horizon={"type": "steps", "first": 30}, update={"step_size": 0.01}
+    )
+    first = training.policy_table()
+    movement = Movement(copy.deepcopy(training.policy))
+    iteration = training.iterate()
+    movement.follow(training, iteration)
+    states, share_N = iteration.state_N, iteration.weight_N / iteration.weight_N.sum()
+    expected = share_N @ (training.policy_table() - first)[states].abs().sum(-1) / 2
+    assert movement.pace == pytest.approx(float(expected))
+    latest = share_N @ (training.policy_table()[states] - iteration.pi_NA).abs().sum(-1) / 2
+    assert movement.pace > 5 * float(latest) > 0  # the last update alone moves it much less
+    movement.follow(training, training.iterate())
+    assert movement.before.probs(states).equal(training.policy.probs(states))
