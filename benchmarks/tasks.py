@@ -157,7 +157,13 @@ def table(records: list[Record], tasks: Mapping[str, Task] = TASKS, methods: Map
     return "\n".join(lines)
 
 
-def picture(records: list[Record], *, shape: tuple[int, int] = (2, 4), methods: Mapping[str, str] = METHODS) -> Figure:
+def picture(
+    records: list[Record],
+    *,
+    shape: tuple[int, int] = (2, 4),
+    tasks: Mapping[str, Task] = TASKS,
+    methods: Mapping[str, str] = METHODS,
+) -> Figure:
     """The return of greedy episodes against environment steps, for each task; a line is a median over seeds.
 
     Args:
@@ -165,24 +171,24 @@ def picture(records: list[Record], *, shape: tuple[int, int] = (2, 4), methods: 
         methods: what each is called.
     """
     rows, columns = shape
-    tasks = [task for task in TASKS if any(r["task"] == task for r in records)]
+    seen = [task for task in tasks if any(r["task"] == task for r in records)]
     figure = Figure(figsize=(3 * columns, 2.7 * rows), layout="constrained")
     panels = figure.subplots(rows, columns).flatten()
-    for axes, task in zip(panels, tasks, strict=False):
+    for axes, task in zip(panels, seen, strict=False):
         for method, name in methods.items():
             mine = [r for r in records if r["task"] == task and r["method"] == method]
             if not mine:
                 continue
-            x = np.geomspace(FIRST_LOOK, TASKS[task].budget, 100)
+            x = np.geomspace(FIRST_LOOK, tasks[task].budget, 100)
             # A run that has ended early stays where it was.
             y = [np.interp(x, *np.array(r["curve"], dtype=float).T) for r in mine]
             axes.plot(x, np.median(y, axis=0), label=name)
-        axes.axhline(TASKS[task].reach, color="k", linestyle=":", linewidth=1)
+        axes.axhline(tasks[task].reach, color="k", linestyle=":", linewidth=1)
         axes.set(title=task, xscale="log")
         if axes.get_ylim()[0] < -1000:  # whoever never falls off the cliff and never arrives
             axes.set_yscale("symlog", linthresh=10)
     panels[0].legend()
-    for axes in panels[len(tasks) :]:
+    for axes in panels[len(seen) :]:
         axes.remove()
     figure.supxlabel("environment steps")
     figure.supylabel("return of greedy episodes")

@@ -125,22 +125,22 @@ class Latent(Part):
     size: Count = 64
     """Numbers of a vector."""
 
-    hidden: Sizes = Field(default=[128, 128])
+    hidden: Sizes = Field(default=[128])
     """Sizes of the hidden layers of the network that steps vectors."""
 
     unroll: Count = 5
     """Steps that are predicted one after another in each gradient step."""
 
-    learning_rate: Positive = 1e-3
+    learning_rate: Positive = 2e-3
     """Step size of Adam."""
 
-    minibatch_size: Count = 64
+    minibatch_size: Count = 32
     """Sequences of steps of the environment in each gradient step."""
 
     updates_per_step: Positive = 0.5
     """Gradient steps for each environment step."""
 
-    first_updates: Count = 600
+    first_updates: Count = 500
     """Gradient steps after the first rollouts."""
 
 

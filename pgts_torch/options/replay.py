@@ -30,10 +30,10 @@ class UniformReplay(Part):
     updates_per_step: Positive | None = null(tables=0.2, vectors=0.05, images=0.05)
     """Updates of critic and policy for each environment step."""
 
-    starts: Count | Literal["all"] | None = null(tables="all", vectors=64, images=64)
+    starts: Count | Literal["all"] | None = null(tables="all", vectors=64, images=32)
     """Imagined episodes of an update; all: one from each state seen so far, for tables only."""
 
-    length: Count | None = null(tables=16, vectors=128, images=16)
+    length: Count | None = null(tables=16, vectors=128, images=12)
     """The largest number of steps of an imagined episode. Where a critic is bootstrapped after few steps, its errors at
     steep places of the value add up along the way to the goal."""
 

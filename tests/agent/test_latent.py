@@ -80,10 +80,19 @@ def untrained(options: Latent = SMALL, *, seed: int = 0, **more) -> LatentModel:
 
 
 @pytest.fixture(scope="module")
-def trained() -> LatentModel:
+def learned() -> tuple[LatentModel, dict[str, float]]:
+    """A model that has learned from 600 steps, and what it said of them."""
     model = untrained()
-    model.learn(played(600), generator=stream(0, "learn"))
-    return model
+    return model, model.learn(played(600), generator=stream(0, "learn"))
+
+
+@pytest.fixture
+def trained(learned) -> LatentModel:
+    return learned[0]
+
+
+def with_updates(count: int) -> Latent:
+    return SMALL.model_copy(update={"first_updates": count})
 
 
 def agreement(model: LatentModel) -> tuple[float, float, float]:
@@ -125,7 +134,7 @@ def test_an_end_is_sampled_with_its_probability():
     steps = Experience(
         image_N, torch.zeros(count).long(), ended_N.double(), GAMMA * (~ended_N).double(), image_N, ~ended_N
     )
-    model = untrained()
+    model = untrained(with_updates(300))
     model.learn(steps, generator=stream(0, "learn"))
     reward_1, discount_1, _ = model.step(model.represent(image_N[:1]), torch.zeros(1).long())
     p = 1 - float(discount_1) / GAMMA
@@ -183,10 +192,8 @@ def test_sequences_stay_in_their_episode_and_out_of_what_is_held_out():
     assert counts_KN.T.long().tolist() == [[1, 1, 1, 0], [1, 1, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0]]
 
 
-def test_errors_are_of_held_out_steps_and_fall_with_training():
-    brief = untrained(SMALL.model_copy(update={"first_updates": 1})).learn(played(600), generator=stream(0, "learn"))
-    model = untrained()
-    losses = model.learn(played(600), generator=stream(0, "learn"))
+def test_errors_are_of_held_out_steps_and_fall_with_training(learned):
+    brief, losses = untrained(with_updates(1)).learn(played(600), generator=stream(0, "learn")), learned[1]
     assert set(losses) == {
         "reward",
         "end",
@@ -199,7 +206,7 @@ def test_errors_are_of_held_out_steps_and_fall_with_training():
 
 
 def test_images_are_kept_as_bytes():
-    model = untrained(SMALL.model_copy(update={"first_updates": 1}), capacity=1000)
+    model = untrained(with_updates(1), capacity=1000)
     model.learn(played(100), generator=stream(0, "learn"))
     for name in ("state", "next_state"):
         assert model.replay.rows(name).dtype == torch.uint8
@@ -219,7 +226,7 @@ def test_a_policy_that_catches_the_ball_is_learned_from_images():
 
 
 def test_a_saved_training_goes_on_bit_for_bit(tmp_path):
-    brief = TRAINING | {"model": SMALL.model_copy(update={"first_updates": 20})}
+    brief = TRAINING | {"model": with_updates(20)}
     training = PGTS(small_catch, **brief).learn(250)
     training.save(tmp_path / "model.pt")
     loaded = PGTS.load(tmp_path / "model.pt", env=small_catch)
