@@ -6,10 +6,10 @@ from typing import Any
 import torch
 
 from pgts_torch.agent.critics import Critic, ExactCritic, RolloutCritic, TabularCritic
+from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.networks import default_network
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate, PPOUpdate
-from pgts_torch.agent.own_models import LatentWorld
 from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy, TabularPolicy
 from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate, Update
@@ -82,7 +82,7 @@ def chosen(options: Training, world: World) -> Training:
     """
     policy, critic, update, replay = options.policy, options.critic, options.update, options.replay
     numbered, replayed = isinstance(world, TabularWorld), isinstance(options.replay, UniformReplay)
-    latent = isinstance(world, LatentWorld)
+    latent = isinstance(world.model, LatentModel)
     if isinstance(policy, AutoPolicy):
         network = default_network(world.perceived_space)
         if isinstance(network, MLP) and replayed and not latent:

@@ -65,6 +65,7 @@ class LatentModel(TensorModel, LearningModel):
 
     `step` is deterministic, `sample` samples the end. A tenth of the steps is held out to measure errors.
 
+    space: of the vectors.
     replay: the steps seen; its columns "state" and "next_state" have the images, as they came.
 
     Args:
@@ -102,6 +103,7 @@ class LatentModel(TensorModel, LearningModel):
         none, images = torch.zeros(0), torch.from_numpy(np.zeros((0, *space.shape), space.dtype))
         self.replay.add(state=images, action=none.long(), reward=none, end=none, next_state=images, follows=none.bool())
         generator, inputs = stream(seed, "model"), spaces.Box(-np.inf, np.inf, (options.size + num_actions,))
+        self.space = spaces.Box(-np.inf, np.inf, (options.size,))
         image_trunk = make_trunk(options.network or default_network(space), space, generator=generator)
         step_trunk = make_trunk(MLP(hidden=options.hidden, activation="relu"), inputs, generator=generator)
         self._representation = Network(image_trunk, options.size, gain=1.0, generator=generator).to(device)
@@ -124,8 +126,8 @@ class LatentModel(TensorModel, LearningModel):
         self._values, self._logits = critic.network, policy.network
 
     def represent(self, image_N: Shaped[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
-        """The vectors of images, without gradient."""
-        return _norm(self._representation.outputs(image_N.to(self.device)))
+        """The vectors of images, without gradient; vectors are returned as they are."""
+        return image_N if image_N.ndim == 2 else _norm(self._representation.outputs(image_N.to(self.device)))
 
     @torch.inference_mode(False)
     @torch.enable_grad()

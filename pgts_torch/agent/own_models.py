@@ -26,11 +26,11 @@ from pgts_torch.options.models import Counts, Ensemble, Latent, OwnModel
 
 @final
 class VectorWorld(VectorStates):
-    """Environments whose observations are vectors, which are the states of a model.
+    """Environments whose observations are vectors, or are represented as vectors, which are the states of a model.
 
     Args:
         env: the environments.
-        model: its states are observations.
+        model: its states are observations, or what it makes of them.
         observation_key: the entry of dictionary observations that is used.
     """
 
@@ -39,56 +39,16 @@ class VectorWorld(VectorStates):
     ) -> None:
         super().__init__(env, gamma=gamma, observation_key=observation_key, device=device)
         self.model: TensorModel = model
+        if isinstance(model, LatentModel):
+            self.perceive, self.perceived_space = model.represent, model.space
 
-    def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B D"]:
-        """The observations, because they are the states."""
+    def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B ..."]:
+        """The observations, because they are the states, or these are made of them."""
         return encoded_B.to(self.model.state_dtype)
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Shaped[Tensor, "N D"]:
-        """The states, because they are the observations."""
+        """The states, because policies take them."""
         return self.model.states(state_N)
-
-
-@final
-class LatentWorld(ModelWorld):
-    """Environments whose observations are images, which a model represents as vectors: its states, which policies and
-    critics take.
-
-    Args:
-        env: the environments.
-        model: represents and steps.
-        observation_key: the entry of dictionary observations that is used.
-    """
-
-    def __init__(
-        self, env: VectorEnv, model: LatentModel, *, gamma: float, observation_key: str | None, device: torch.device
-    ) -> None:
-        super().__init__(env, gamma=gamma, observation_key=observation_key, device=device)
-        self.model: LatentModel = model
-        self.perceive, self.perceived_space = model.represent, spaces.Box(-torch.inf, torch.inf, (model.state_size,))
-
-    def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B D"]:
-        """The vectors that represent the images."""
-        return self.model.represent(encoded_B)
-
-    def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
-        return self.model.number(read_N)
-
-    def observe(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N D"]:
-        """The states, because policies and critics take these."""
-        return self.model.states(state_N)
-
-    def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        return self.model.states(state_N).cpu()
-
-    def adopt(self, exported: Tensor) -> Int[Tensor, "N"]:
-        """The numbers of vectors, or of images that a replay has kept."""
-        vectors_ND = exported.to(self.device) if exported.ndim == 2 else self.model.represent(exported)
-        return self.model.number(vectors_ND)
-
-    def reset_numbers(self) -> None:
-        """Drop all states, because hardly any is met again."""
-        self.model.clear()
 
 
 def learned_world(
@@ -131,7 +91,6 @@ def learned_world(
         "device": device,
         "action_repeat": action_repeat,
     }
-    shared: dict[str, Any] = {"gamma": gamma, "observation_key": observation_key, "device": device}
     axes = len(space.shape) if isinstance(space, spaces.Box) else 0
     if axes != (needed := 3 if isinstance(options, Latent) else 1):
         kind = {1: "vectors of numbers", 3: "images (height, width, channels)"}[needed]
@@ -141,8 +100,10 @@ def learned_world(
         )
     assert isinstance(space, spaces.Box)
     if isinstance(options, Latent):
-        return LatentWorld(env, LatentModel(space, world.num_actions, **given), **shared)
-    return VectorWorld(env, EnsembleModel(space.shape[0], world.num_actions, **given), **shared)
+        model: TensorModel = LatentModel(space, world.num_actions, **given)
+    else:
+        model = EnsembleModel(space.shape[0], world.num_actions, **given)
+    return VectorWorld(env, model, gamma=gamma, observation_key=observation_key, device=device)
 
 
 def own_model(options: OwnModel) -> Model:

@@ -256,8 +256,8 @@ class VectorStates(ModelWorld):
 
     model: TensorModel
 
-    def numbers(self, read_N: Float[Tensor, "N D"]) -> Int[Tensor, "N"]:
-        return self.model.number(read_N)
+    def numbers(self, read_N: Shaped[Tensor, "N ..."]) -> Int[Tensor, "N"]:
+        return self.model.number(self.perceive(read_N))
 
     def export(self, state_N: Int[Tensor, "N"]) -> Tensor:
         return self.model.states(state_N).cpu()
