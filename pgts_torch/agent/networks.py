@@ -203,13 +203,28 @@ class Network(nn.Module):
         return list(self.parameters())
 
     @cached_property
-    def _functions(self) -> list[Callable[[Tensor], Tensor]]:
+    def tensors(self) -> list[Tensor]:
+        """Weights and running statistics."""
+        return list(self._named.values())
+
+    @cached_property
+    def layers(self) -> list[nn.Module]:
+        """The layers of the trunk, and the head."""
+        return [*self.trunk.layers, self.head]
+
+    @cached_property
+    def is_dense(self) -> bool:
+        """Whether all layers are dense ones or activations."""
+        return all(isinstance(layer, nn.Linear | nn.Tanh | nn.ReLU) for layer in self.layers)
+
+    @cached_property
+    def functions(self) -> list[Callable[[Tensor], Tensor]]:
         """The layers as plain functions, because calling a module costs as much as a small layer."""
         return [
             partial(nn.functional.linear, weight=layer.weight, bias=layer.bias)
             if isinstance(layer, nn.Linear)
             else layer.forward
-            for layer in (*self.trunk.layers, self.head)
+            for layer in self.layers
         ]
 
     @cached_property
@@ -222,7 +237,7 @@ class Network(nn.Module):
         return self.trunk.encoder(observation_N)
 
     def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
-        for function in self._functions:
+        for function in self.functions:
             input_N = function(input_N)
         return input_N
 

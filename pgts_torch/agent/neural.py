@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pgts_torch.agent.advantages import critic_targets
 from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.networks import Network, Trunk, default_network, make_trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
@@ -167,8 +168,16 @@ class NetworkCritic(Critic):
         columns, norms = (input_V, action_V, y_V.float()), []
         for _ in range(num_passes):
             for input_N, action_N, y_N in minibatches(columns, self.options.minibatch_size, generator=generator):
-                loss = (y_N - self._taken(self.network(input_N), action_N)).square().mean()
-                norms.append(self._optimiser.step(self.network.weights, loss, "value"))
+                made = Forward(self.network, input_N)
+                off_N = self._taken(made.output_ND, action_N) - y_N
+                # The gradient of mean_n off_n^2 in the outputs, of which each row has one that counts.
+                down_N1 = (2 / len(off_N) * off_N)[:, None]
+                if self.target == "v":
+                    down_ND = down_N1
+                else:
+                    down_ND = torch.zeros_like(made.output_ND).scatter_(-1, action_N[:, None], down_N1)
+                gradients, loss = made.gradients(down_ND), off_N.square().mean()
+                norms.append(self._optimiser.step(self.network.weights, gradients, loss, "value"))
         self._num_fits += 1
         self._move_target_network()
         return norms

@@ -8,6 +8,7 @@ from the action taken, A_t / pi(a_t|s_t) for it and 0 for the others, a row for 
     sum_a pi_old(a|s) min(rho_a adv, clip(rho_a) adv)           is                    min(rho A_t, clip(rho) A_t)
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,10 +19,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pgts_torch.agent.gradients import Forward, through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural import NetworkPolicy
-from pgts_torch.agent.optimisers import Optimiser, minibatches
+from pgts_torch.agent.optimisers import Optimiser, Undo, minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.updates import Update
 from pgts_torch.errors import NotFinite, PgtsError
@@ -57,6 +59,7 @@ class NetworkUpdate(Update):
             max_grad_norm=limit(options.max_grad_norm),
             method=options.optimizer,
         )
+        self._undo = Undo()
 
     def __call__(self, policy: Policy, batch: Batch, *, generator: torch.Generator) -> dict[str, float]:
         """Take the gradient steps.
@@ -90,12 +93,11 @@ class NetworkUpdate(Update):
     @contextmanager
     def _restored_unless_finite(self, policy: NetworkPolicy) -> Iterator[None]:
         """A context that restores policy and optimiser where it is left by NotFinite."""
-        before = policy.state_dict(), self.state_dict()
+        self._undo.keep(policy.network.tensors, self._optimiser)
         try:
             yield
         except NotFinite:
-            policy.load_state_dict(before[0])
-            self.load_state_dict(before[1])
+            self._undo.restore(self._optimiser)
             raise
 
     def state_dict(self) -> dict[str, Any]:
@@ -113,9 +115,10 @@ class NetworkUpdate(Update):
     def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
         """Take the gradient steps of this kind of update; `input_N` are the encoded observations of the batch."""
 
-    def step(self, network: Network, loss: Tensor, *, through: tuple[Tensor, Tensor] | None = None) -> float:
-        """Take one step down the loss (see `Optimiser.step`). Return the norm of its gradient."""
-        return self._optimiser.step(network.weights, loss, "policy", through=through)
+    def step(self, network: Network, made: Forward, loss: Tensor, down_NA: Float[Tensor, "N A"]) -> float:
+        """Take one step down a loss (see `Optimiser.step`), whose gradient in the logits of `made` is given. Return the
+        norm of its gradient."""
+        return self._optimiser.step(network.weights, made.gradients(down_NA), loss, "policy")
 
 
 @final
@@ -134,11 +137,15 @@ class GradientUpdate(NetworkUpdate):
 
     def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
         """Losses: policy, minus the objective without entropy, before the step; grad_norm, before clipping."""
-        log_NA = network(input_N).log_softmax(-1)
+        made = Forward(network, input_N)
+        logits_NA = made.output_ND.requires_grad_()
+        log_NA = logits_NA.log_softmax(-1)
         policy_loss = -(batch.weight_N @ (log_NA.exp() * batch.advantage_NA.float()).sum(-1))
         coef = self.options.entropy_coef
         bonus = batch.weight_N @ entropy(log_NA) if coef else 0.0
-        norm = self.step(network, policy_loss - coef * bonus)
+        loss = policy_loss - coef * bonus
+        (down_NA,) = torch.autograd.grad(loss, logits_NA)
+        norm = self.step(network, made, loss, down_NA)
         losses = {"policy": float(policy_loss.detach()), "grad_norm": norm}
         return Move(log_NA.detach(), log_probs(network, input_N), losses)
 
@@ -170,17 +177,16 @@ class PPOUpdate(NetworkUpdate):
             advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N)
         columns, policy_losses, norms = (input_N, old_NA, advantage_NA, weight_N), [], []
         made = passes(network, columns, self.options.num_epochs, self.options.minibatch_size, generator)
-        for log_NA, (_, before_NA, part_NA, part_N) in made:
+        for forward, log_NA, (_, before_NA, part_NA, part_N) in made:
             if (
                 self.options.target_kl is not None
                 and mean(part_N, divergence(before_NA, log_NA)) > self.options.target_kl
             ):
                 break
-            with torch.no_grad():
-                gain_NA, push_NA = self.objective(log_NA, before_NA, part_NA)
-                policy_loss = -mean(part_N, (before_NA.exp() * gain_NA).sum(-1))
-                down_NA = -push_NA * (part_N / len(part_N))[:, None]
-            norms.append(self.step(network, policy_loss, through=(log_NA, down_NA)))
+            gain_NA, push_NA = self.objective(log_NA, before_NA, part_NA)
+            policy_loss = -mean(part_N, (before_NA.exp() * gain_NA).sum(-1))
+            down_NA = through_log_softmax(log_NA, -push_NA * (part_N / len(part_N))[:, None])
+            norms.append(self.step(network, forward, policy_loss, down_NA))
             policy_losses.append(float(policy_loss))
         new_NA = log_probs(network, input_N)
         outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.options.clip_range
@@ -234,11 +240,13 @@ def log_probs(network: Network, input_N: Float[Tensor, "N ..."]) -> Float[Tensor
 
 def passes(
     network: Network, columns: Sequence[Tensor], num_epochs: int, minibatch_size: int, generator: torch.Generator
-) -> Iterator[tuple[Float[Tensor, "N A"], tuple[Tensor, ...]]]:
-    """Yield minibatches of the columns, the first of which are inputs, with log pi of the current network."""
+) -> Iterator[tuple[Forward, Float[Tensor, "N A"], tuple[Tensor, ...]]]:
+    """Yield minibatches of the columns, the first of which are inputs, with their pass through the current network and
+    log pi, without gradient."""
     for _ in range(num_epochs):
         for part in minibatches(columns, minibatch_size, generator=generator):
-            yield network(part[0]).log_softmax(-1), part
+            made = Forward(network, part[0])
+            yield made, made.output_ND.log_softmax(-1), part
 
 
 def mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"]) -> Float[Tensor, ""]:
@@ -255,6 +263,8 @@ def _scale(
 
 def _check_numbers(advantage_NA: Tensor, weight_N: Tensor) -> None:
     for name, value in (("advantage_NA", advantage_NA), ("weight_N", weight_N)):
+        if math.isfinite(value.sum()):
+            continue
         off = torch.nonzero(~value.isfinite())
         if len(off):
             number = float(value[tuple(off[0])])

@@ -33,32 +33,28 @@ class Optimiser:
         self, *, learning_rate: float, max_grad_norm: float | None, method: Literal["adam", "sgd"] = "adam"
     ) -> None:
         self.learning_rate, self.max_grad_norm, self.method = learning_rate, max_grad_norm, method
-        self._num_steps = 0
+        self.num_steps = 0
         self._first_D: Tensor | None = None
         self._second_D: Tensor | None = None
 
     def step(
         self,
         parameters: Sequence[nn.Parameter],
+        gradients: Sequence[Tensor],
         loss: Tensor,
         name: str,
-        *,
-        through: tuple[Tensor, Tensor] | None = None,
     ) -> float:
         """Take a step; the parameters must be the same in each call. Return the norm of the gradient before clipping.
 
         Args:
+            gradients: of the loss, one for each parameter.
             loss: what is minimised.
             name: of the loss, in errors.
-            through: an output of the network and the loss's gradient with respect to it, where a formula is cheaper
-                than autograd. The loss then needs no gradient of its own.
 
         Raises:
             NotFinite: the loss, its gradient or the step is not finite. No parameter has changed then.
             PgtsError: the moments are those of other parameters.
         """
-        output, gradient = (loss, None) if through is None else through
-        gradients = torch.autograd.grad(output, parameters, gradient)
         with torch.no_grad():
             gradient_D = torch.cat([piece.reshape(-1) for piece in gradients])
             norm = float(torch.linalg.vector_norm(gradient_D))
@@ -81,24 +77,35 @@ class Optimiser:
                 f"the optimiser has moments of {len(self._first_D)} parameters; the network has {len(gradient_D)}"
             )
         first_D, second_D = self._first_D, self._second_D = self._first_D.to(gradient_D), self._second_D.to(gradient_D)
-        self._num_steps += 1
+        self.num_steps += 1
         first_D.lerp_(gradient_D, 1 - _BETAS[0])
         second_D.mul_(_BETAS[1]).addcmul_(gradient_D, gradient_D, value=1 - _BETAS[1])
         # m / c1 / (sqrt(v / c2) + eps), with the corrections taken out of the vectors.
-        mean_correction, square_correction = (1 - beta**self._num_steps for beta in _BETAS)
+        mean_correction, square_correction = (1 - beta**self.num_steps for beta in _BETAS)
         root = math.sqrt(square_correction)
         scale_D = second_D.sqrt().add_(_EPSILON * root)
         return torch.div(first_D, scale_D).mul_(-self.learning_rate * root / mean_correction)
+
+    @property
+    def moments(self) -> list[Tensor]:
+        """The moments, which steps change in place; none before the first step."""
+        return [] if self._first_D is None or self._second_D is None else [self._first_D, self._second_D]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the moments and the number of steps; empty before the first step."""
         if self._first_D is None or self._second_D is None:
             return {}
         return {
-            "num_steps": self._num_steps,
+            "num_steps": self.num_steps,
             "first_D": self._first_D.cpu().clone(),
             "second_D": self._second_D.cpu().clone(),
         }
+
+    def rewind(self, num_steps: int) -> None:
+        """Count steps as before later ones that were taken back; before the first there are no moments."""
+        self.num_steps = num_steps
+        if num_steps == 0:
+            self._first_D = self._second_D = None
 
     def check_fits(self, parameters: Sequence[Tensor]) -> None:
         """PgtsError unless the moments, if there are any, have the size and dtype of these parameters."""
@@ -110,7 +117,7 @@ class Optimiser:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load what `state_dict` returned; PgtsError if it is something else."""
         if not state:
-            self._num_steps, self._first_D, self._second_D = 0, None, None
+            self.num_steps, self._first_D, self._second_D = 0, None, None
             return
         num_steps, first_D = state.get("num_steps"), state.get("first_D")
         if type(num_steps) is not int or num_steps < 1 or not isinstance(first_D, Tensor) or self.method == "sgd":
@@ -118,7 +125,31 @@ class Optimiser:
         second_D = fitting(state, "second_D", first_D)
         if not bool((second_D >= 0).all()):
             raise PgtsError("second_D has negative squares")
-        self._num_steps, self._first_D, self._second_D = num_steps, first_D.clone(), second_D
+        self.num_steps, self._first_D, self._second_D = num_steps, first_D.clone(), second_D
+
+
+@final
+class Undo:
+    """Takes back gradient steps. The copies lie in memory that is kept from one update to the next."""
+
+    def __init__(self) -> None:
+        self._tensors: list[Tensor] = []
+        self._copies: list[Tensor] = []
+        self._num_steps = 0
+
+    @torch.no_grad()
+    def keep(self, tensors: Sequence[Tensor], optimiser: Optimiser) -> None:
+        """Remember the weights, which are changed in place, and the optimiser."""
+        self._tensors, self._num_steps = [*tensors, *optimiser.moments], optimiser.num_steps
+        if [like.shape for like in self._copies] != [each.shape for each in self._tensors]:
+            self._copies = [torch.empty_like(each) for each in self._tensors]
+        torch._foreach_copy_(self._copies, self._tensors)
+
+    @torch.no_grad()
+    def restore(self, optimiser: Optimiser) -> None:
+        """Put them back as they were in the latest `keep`."""
+        torch._foreach_copy_(self._tensors, self._copies)
+        optimiser.rewind(self._num_steps)
 
 
 def _check_finite(what: str, name: str, value: float) -> None:

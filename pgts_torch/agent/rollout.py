@@ -76,7 +76,7 @@ class Rollout:
     searched_TB: Bool[Tensor, "T B"] | None = None
     finished: tuple[tuple[float, int], ...] | None = None
 
-    @property
+    @cached_property
     def observation_V(self) -> Shaped[Tensor, "V ..."]:
         """The observation of each of the V = `num_steps` visits, in the order of `alive_TB`."""
         return self.observation_UB[:-1][self.alive_TB]
@@ -98,7 +98,7 @@ class Rollout:
         assert self.state_UB is not None
         return self.state_UB[1:]
 
-    @property
+    @cached_property
     def num_steps(self) -> int:
         """The number of steps, without padding."""
         return int(self.alive_TB.sum())

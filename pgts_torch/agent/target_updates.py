@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pgts_torch.agent.gradients import through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural_updates import Move, NetworkUpdate, divergence, log_probs, log_probs_before, mean, passes
@@ -40,8 +41,11 @@ class TargetUpdate(NetworkUpdate):
         weight_N = batch.weight_N / batch.weight_N.mean()
         columns, norms = (input_N, target_NA, weight_N), []
         made = passes(network, columns, self.options.num_epochs, self.options.minibatch_size, generator)
-        for log_NA, (_, part_NA, part_N) in made:
-            norms.append(self.step(network, mean(part_N, divergence(part_NA, log_NA))))
+        for forward, log_NA, (_, part_NA, part_N) in made:
+            # Of KL(target || pi) in log pi it is -target, and so in the logits pi - target.
+            down_NA = -(part_N * (1 / len(part_N)))[:, None] * part_NA.exp()
+            loss = mean(part_N, divergence(part_NA, log_NA))
+            norms.append(self.step(network, forward, loss, through_log_softmax(log_NA, down_NA)))
         new_NA = log_probs(network, input_N)
         after = float(mean(weight_N, divergence(target_NA, new_NA)))
         return Move(old_NA, new_NA, {"policy": after, "grad_norm": sum(norms) / len(norms)})

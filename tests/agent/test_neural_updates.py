@@ -1,5 +1,6 @@
 """How network policies move: as tables do where a network is one, and as A2C and PPO where actions were sampled."""
 
+import copy
 import math
 from collections.abc import Callable
 from typing import Any
@@ -11,16 +12,18 @@ from torch import Tensor
 
 from pgts_torch.agent import saving
 from pgts_torch.agent.advantages import gae, score_function
+from pgts_torch.agent.gradients import Forward, through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
-from pgts_torch.agent.optimisers import Optimiser
+from pgts_torch.agent.optimisers import Optimiser, Undo
 from pgts_torch.agent.policies import SoftmaxPolicy
 from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.agent.updates import MirrorUpdate, SoftmaxUpdate
 from pgts_torch.errors import PgtsError
 from pgts_torch.options import (
     CMPO,
+    CNN,
     MLP,
     PPO,
     FixedHorizon,
@@ -140,9 +143,9 @@ def test_with_sampled_advantages_the_clipped_objective_is_that_of_ppo(monkeypatc
     advantage_NA = score_function(action_N, advantage_N, policy.probs(states))
     seen = []
 
-    def step(optimiser, parameters, loss, name, *, through):
+    def step(optimiser, parameters, gradients, loss, name):
         """The first step takes the policy to 0.7 and 0.3; the second is looked at."""
-        seen.append((float(loss), torch.autograd.grad(through[0], parameters, through[1])[1]))
+        seen.append((float(loss), gradients[1]))
         policy.network.head.bias.data.copy_(torch.tensor([0.7, 0.3]).log())
         return 0.0
 
@@ -169,7 +172,7 @@ def test_the_clip_fraction_is_the_old_probability_of_actions_whose_ratio_is_out_
     new_NA = old_NA * torch.tensor([[0.7, 1.3, 1.3], [0.8995, 1.0, 1.201]])
     policy.load_state_dict({"head.weight": old_NA.log().T, "head.bias": torch.zeros(3)})
 
-    def step(optimiser, parameters, loss, name, *, through):
+    def step(optimiser, parameters, gradients, loss, name):
         policy.network.head.weight.data.copy_(new_NA.log().T)
         return 0.0
 
@@ -334,11 +337,65 @@ def test_a_number_that_is_not_finite_changes_nothing_and_is_named(update, value)
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
 
 
+@pytest.mark.parametrize("options", [MLP(hidden=()), MLP(), MLP(hidden=(7, 5), activation="relu"), CNN()])
+def test_gradients_that_are_written_out_have_the_bits_of_autograd(options):
+    shape = (7, 7, 3) if isinstance(options, CNN) else (4,)
+    policy = NetworkPolicy(spaces.Box(-9, 9, shape), 3, options)
+    generator = stream(0, "gradients")
+    network, input_N = policy.network, policy.network.encode(torch.randn((40, *shape), generator=generator))
+    down_NA = torch.randn((40, 3), generator=generator)
+    made, logits_NA = Forward(network, input_N), network(input_N)
+    log_NA = logits_NA.log_softmax(-1)
+    expected = torch.autograd.grad(log_NA, network.weights, down_NA)
+    found = made.gradients(through_log_softmax(made.output_ND.log_softmax(-1), down_NA))
+    assert torch.equal(made.output_ND, logits_NA)
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+    assert [piece.shape for piece in found] == [weight.shape for weight in network.weights]
+    assert not torch.equal(Forward(network, input_N).gradients(down_NA)[0], expected[0])
+
+
+@pytest.mark.parametrize("steps", [0, 3])
+def test_weights_and_optimiser_are_put_back_bit_for_bit_in_memory_that_is_made_once(steps, monkeypatch):
+    policy, undo, optimiser = (
+        NetworkPolicy(spaces.Discrete(3), 2),
+        Undo(),
+        Optimiser(learning_rate=0.1, max_grad_norm=1),
+    )
+    weights = policy.network.weights
+
+    def move() -> None:
+        gradients = [torch.ones_like(weight) for weight in weights]
+        optimiser.step(weights, gradients, torch.zeros(()), "test")
+
+    for _ in range(steps):
+        move()
+    before = copy.deepcopy((policy.state_dict(), optimiser.state_dict()))
+    made = []
+    real = torch.empty_like
+    monkeypatch.setattr(torch, "empty_like", lambda *args, **kwargs: made.append(None) or real(*args, **kwargs))
+    for _ in range(3):
+        undo.keep(policy.network.tensors, optimiser)
+        move()
+        assert not same_states((policy.state_dict(), optimiser.state_dict()), before)
+        undo.restore(optimiser)
+        assert same_states((policy.state_dict(), optimiser.state_dict()), before)
+    assert len(made) == len(policy.network.tensors) + (2 if steps else 0)
+
+
+def same_states(one: tuple[dict[str, Any], ...], other: tuple[dict[str, Any], ...]) -> bool:
+    pairs = zip(one, other, strict=True)
+    return all(
+        a.keys() == b.keys() and all(torch.equal(*map(torch.as_tensor, (a[n], b[n]))) for n in a) for a, b in pairs
+    )
+
+
 def test_a_gradient_that_is_not_finite_changes_nothing_and_is_named():
     parameter = torch.nn.Parameter(torch.tensor([0.0, 1.0]))
     optimiser = Optimiser(learning_rate=0.1, max_grad_norm=None)
+    loss = parameter.sqrt().sum()
+    gradients = torch.autograd.grad(loss, [parameter])
     with pytest.raises(PgtsError, match="the gradient of the test loss is inf"):
-        optimiser.step([parameter], parameter.sqrt().sum(), "test")
+        optimiser.step([parameter], gradients, loss, "test")
     assert parameter.tolist() == [0.0, 1.0]
     assert optimiser.state_dict() == {}
 
@@ -353,7 +410,8 @@ def test_adam_is_that_of_torch_and_gradients_are_clipped_as_torch_does():
         losses[1].backward()
         norm = torch.nn.utils.clip_grad_norm_(theirs, 0.5)
         adam.step()
-        assert optimiser.step(ours, losses[0], "test") == pytest.approx(float(norm), rel=1e-5)
+        gradients = torch.autograd.grad(losses[0], ours)
+        assert optimiser.step(ours, gradients, losses[0], "test") == pytest.approx(float(norm), rel=1e-5)
     for one, other in zip(ours, theirs, strict=True):
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
     assert (ours[0] - 1).abs().max() > 0.1

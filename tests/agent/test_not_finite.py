@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pgts_torch import PGTS
 from pgts_torch.agent import advantages
+from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate
@@ -132,8 +133,8 @@ def in_parameters(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
 def in_losses(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
     step = Optimiser.step
 
-    def wrapped(self, parameters, loss, name, **kwargs):
-        return step(self, parameters, loss * value if name == "policy" else loss, name, **kwargs)
+    def wrapped(self, parameters, gradients, loss, name):
+        return step(self, parameters, gradients, loss * value if name == "policy" else loss, name)
 
     patch.setattr(Optimiser, "step", wrapped)
 
@@ -142,7 +143,14 @@ def in_gradients(patch: pytest.MonkeyPatch, model: PGTS, value: float) -> None:
     """From the second minibatch of the update on, where it has several."""
     calls = iter(range(100))
     late = type(model.update).__name__ != "GradientUpdate"
-    model.policy.network.weights[0].register_hook(lambda grad: grad * value if next(calls) >= late else grad)
+    plain, network = Forward.gradients, model.policy.network
+
+    def wrapped(made: Forward, down_ND: Tensor) -> list[Tensor]:
+        first, *others = plain(made, down_ND)
+        is_due = made.network is network and next(calls) >= late
+        return [first * value if is_due else first, *others]
+
+    patch.setattr(Forward, "gradients", wrapped)
 
 
 ALL, NETWORKS = list(KINDS), ["networks", "mirror", "sampled"]
