@@ -198,7 +198,8 @@ class LatentModel(TensorModel, LearningModel):
             losses = outcome_losses(output_C3, reward_C / (self._reward_scale or 1.0), end_C)
             losses["consistency"] = consistency_loss(steps)
             losses |= equivalence_losses(steps, self._values, self._logits)
-            self._optimiser.step(weights, torch.stack(list(losses.values())).sum(), "model")
+            loss = torch.stack(list(losses.values())).sum()
+            self._optimiser.step(weights, torch.autograd.grad(loss, weights), loss, "model")
             for name, value in losses.items():
                 totals[name] = totals.get(name, 0.0) + float(value.detach()) / count
         if extra and count:
