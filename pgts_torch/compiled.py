@@ -64,6 +64,16 @@ def jit(function: _Function) -> _Function:
     return machine_code
 
 
+def inlined(function: _Function) -> _Function:
+    """The function, which becomes a part of those that call it: they are marked with `jit`, in the same file."""
+    import numba
+
+    function = inspect.unwrap(function)
+    inside = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, nogil=True)
+    machine_code: _Function = inside(function)
+    return machine_code
+
+
 @functools.cache
 def _wanted() -> bool:
     return os.environ.get(SWITCH) != "0"

@@ -8,9 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.compiled import can_compile
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import EnumeratingModel
+from pgts_torch.models.base import EnumeratingModel, Model
 from pgts_torch.options.search import MAX_NODES, MCTS
+from pgts_torch.search.forest import Forest
 from pgts_torch.search.known import KnownStates
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_roots, unexpanded
 from pgts_torch.search.split import Rule, sigma
@@ -53,8 +55,11 @@ def mcts(
     are visited in proportion to their probabilities, not sampled. A node below which everything is expanded is
     exhausted and never selected again, so after finitely many simulations the answer is T^m Q.
 
-    Simulations go down in waves (`pgts_torch.search.tree`): those of one wave are split among actions and outcomes as
-    if they came one by one, but do not know each other's values. What a wave could not use is sent again.
+    On the CPU simulations come one after another below each root, in compiled loops (`pgts_torch.search.forest`), which
+    stop at unknown states until the model and the critic have been called for those of all roots together. On other
+    devices, with `merge`, or where numba is missing, they go down in waves (`pgts_torch.search.tree`): those of one
+    wave are split among actions and outcomes as if they came one by one, but do not know each other's values. What a
+    wave could not use is sent again. With waves of 1 both are the same search.
 
     With root="gumbel" the root's actions get simulations by sequential halving of g(a) + log prior(a) + sigma(q(a))
     (Danihelka et al. 2022); the trees below them are separate, so those of one round run side by side. With merge=False
@@ -66,9 +71,9 @@ def mcts(
         root: sequential halving at the root, or the tree rule there too.
         rule, exploration: how actions are selected below the root, see `Selection`. Default of c: 1.25.
         wave: the most simulations of one action of a root (with root="rule": of the root) that are under way before
-            values are backed up. 1 is the ordinary search, one simulation after another. Default: a whole round of
-            sequential halving (with root="rule": as many as before it together): several times faster, and a little
-            less right with as many simulations.
+            values are backed up. 1 is the ordinary search, one simulation after another. Default: 1 in compiled loops,
+            else a whole round of sequential halving (with root="rule": as many as before it together), which is
+            several times faster there, and less right with as many simulations.
         prior: the policy, states [N] to probabilities [N, A]. Default: uniform.
         backup: "max", or for comparison "mean": q(n, a) = (q_0 + sum_i G_i) / (1 + N_a) over the critic's first
             estimate q_0 and the returns G_i of simulations, which does not converge to T^m Q; its `pruned_BA` is inf.
@@ -112,6 +117,37 @@ def search_tree(
         return unexpanded(leaves, root_B)
     state_B, row_B = root_B.unique(return_inverse=True)
     calls_before = topology.table.model_calls
+    grow = _grow_compiled if _can_compile(topology.model, options) else _grow
+    q_NA, pruned_NA, nodes_per_level = grow(leaves, topology, state_B, options, generator)
+    return Lookahead.enumerated(
+        q_NA[row_B],
+        pruned_BA=pruned_NA[row_B],
+        model_calls=topology.table.model_calls - calls_before,
+        critic_calls=leaves.calls,
+        nodes_per_level=nodes_per_level,
+    )
+
+
+def _can_compile(model: Model, options: MCTS) -> bool:
+    """Whether the search is one of trees and of one simulation after another, for which there are compiled loops."""
+    is_simple = not options.merges and options.wave in (None, 1)
+    return is_simple and model.dtype in (torch.float32, torch.float64) and can_compile(model.device)
+
+
+def _grow_compiled(
+    leaves: Leaves, topology: Topology, state_B: Tensor, options: MCTS, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """q and pruned mass of the roots, and the nodes of each level."""
+    forest = Forest(leaves, topology, options, state_B)
+    values = forest.search(_preference(forest.prior_BA, state_B, generator))
+    q_BA, pruned_BA = (value_BA.to(topology.model.dtype) for value_BA in values)
+    return q_BA, pruned_BA, forest.nodes_per_level
+
+
+def _grow(
+    leaves: Leaves, topology: Topology, state_B: Tensor, options: MCTS, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """The same by torch, in waves."""
     # A level is tens of small operations, each a fifth cheaper without the bookkeeping of autograd.
     with torch.inference_mode():
         known = KnownStates(topology, leaves)
@@ -121,16 +157,9 @@ def search_tree(
         if options.root == "rule":
             _by_rule(tree, node_B, options)
         else:
-            _halve(tree, node_B, options, _preference(known, state_B, generator))
+            _halve(tree, node_B, options, _preference(known.prior_TA[known.rows(state_B)], state_B, generator))
         pruned_NA = tree.backup_all(node_B)
-        q_NA = tree.nodes.q_NA[node_B]
-    return Lookahead.enumerated(
-        q_NA[row_B],
-        pruned_BA=pruned_NA[row_B],
-        model_calls=topology.table.model_calls - calls_before,
-        critic_calls=leaves.calls,
-        nodes_per_level=tree.nodes.nodes_per_level(),
-    )
+        return tree.nodes.q_NA[node_B], pruned_NA, tree.nodes.nodes_per_level()
 
 
 def _by_rule(tree: Tree, node_B: Tensor, options: MCTS) -> None:
@@ -203,13 +232,14 @@ def _order(tree: Tree, node_B: Tensor, preference_BA: Tensor, alive_BA: Tensor) 
     return by_score_BA.gather(1, rank_BA.argsort(dim=1, stable=True))
 
 
-def _preference(known: KnownStates, state_B: Tensor, generator: torch.Generator | None) -> Float[Tensor, "B A"]:
+def _preference(
+    prior_BA: Float[Tensor, "B A"], state_B: Tensor, generator: torch.Generator | None
+) -> Float[Tensor, "B A"]:
     """log prior(a), plus standard Gumbel noise if there is a generator: a function of the search, the state and the
     action."""
-    log_prior_BA = known.prior_TA[known.rows(state_B)].log()
     if generator is None:
-        return log_prior_BA
-    key = sample_keys(1, generator=generator).to(known.device)
-    action_A = torch.arange(known.num_actions, device=known.device)
+        return prior_BA.log()
+    key = sample_keys(1, generator=generator).to(state_B.device)
+    action_A = torch.arange(prior_BA.shape[1], device=state_B.device)
     u_BA = uniform(mix(key, state_B.unsqueeze(1), action_A)).clamp_min(torch.finfo(torch.float64).tiny)
-    return log_prior_BA - (-u_BA.log()).log().to(known.dtype)
+    return prior_BA.log() - (-u_BA.log()).log().to(prior_BA.dtype)

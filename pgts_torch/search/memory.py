@@ -43,6 +43,12 @@ class Sizes:
         return 2 * s + 24 + A * (2 * s + 8) + E * (2 * s + 16)
 
     @property
+    def grown(self) -> int:
+        """A node of the trees of `Forest`."""
+        _, A, E = self._parts
+        return 28 + 32 * A + 32 * E
+
+    @property
     def _parts(self) -> tuple[int, int, int]:
         return self.dtype.itemsize, self.num_actions, self.num_actions * self.num_outcomes
 
@@ -59,6 +65,7 @@ def search_bytes(
     resampled: int = 0,
     learned: int = 0,
     nodes: int = 0,
+    grown: int = 0,
     places: int = 0,
     arms: int = 0,
 ) -> int:
@@ -76,7 +83,8 @@ def search_bytes(
         sampled: nodes whose outcomes were sampled, after the step.   sampling: those that the step samples.
         resampled: nodes that the bootstrap samples again at once.
         learned: rows of `KnownStates`.
-        nodes: rows of `Nodes`.   places: of tables by level, by state and by both.   arms: that a wave passes at once.
+        nodes: rows of `Nodes`.   grown: nodes for which a `Forest` has room.
+        places: of tables by level, by state and by both.   arms: that a wave passes at once.
     """
     s, A, E = sizes.dtype.itemsize, sizes.num_actions, sizes.num_actions * sizes.num_outcomes
     widest = max(s, 8) * E
@@ -87,6 +95,7 @@ def search_bytes(
     total += sampled * (2 * (s + 16) * E + 48) + sampling * 64 * E + resampled * RESAMPLED * E
     total += learned * (GROWTH * sizes.known + widest)
     total += nodes * (GROWTH * sizes.node + widest + E * (4 * s + 16) + 40 * A)
+    total += 2 * grown * sizes.grown  # twice, as outcomes of an action may become more
     total += 8.0 * places
     total += arms * (96 * sizes.num_outcomes + 160)
     return int(total)

@@ -81,7 +81,8 @@ OTHERS: dict[str, Callable[[], Iterator[tuple[int, list[int], Lookahead]]]] = {
     "grid_narrow": lambda: others("grid", partial(expectimax, max_width=6), 0, 45),
     "garnet_sampled_level": lambda: others("garnet", drawn("level"), 0, 7),
     "garnet_sampled_search": lambda: others("garnet", drawn("search"), 0, 7),
-    "frozen_lake_mcts_tree": lambda: others("FrozenLake", partial(mcts, simulations=24), 0, 14),
+    "frozen_lake_mcts_tree": lambda: others("FrozenLake", partial(mcts, simulations=24, wave=24), 0, 14),
+    "frozen_lake_mcts_one_by_one": lambda: others("FrozenLake", partial(mcts, simulations=24, wave=1), 0, 14),
     "garnet_mcts_graph": lambda: others("garnet", partial(mcts, simulations=24, merge=True), 0, 7),
 }
 

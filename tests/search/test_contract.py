@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
+from pgts_torch.compiled import torch_only
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import EnumeratingModel, SimulatorModel, TabularModel
 from pgts_torch.search import Lookahead, expectimax, mcts, sampled
@@ -25,11 +26,17 @@ def complete_samples(model, root_B, **kwargs) -> Lookahead:
     return sampled(model, root_B, samples=[None], generator=stream(0, "contract"), replicates=0, **kwargs)
 
 
+def tree_by_torch(model, root_B, **kwargs) -> Lookahead:
+    with torch_only():
+        return mcts(model, root_B, simulations=5_000, **kwargs)
+
+
 ENGINES: dict[str, Engine] = {
     "expectimax": expectimax,
     "pruned": lambda *args, **kwargs: expectimax(*args, max_width=10_000, **kwargs),
     "sampled": complete_samples,
     "mcts, tree": lambda *args, **kwargs: mcts(*args, simulations=5_000, **kwargs),
+    "mcts, tree, torch": tree_by_torch,
     "mcts, graph": lambda *args, **kwargs: mcts(*args, simulations=5_000, merge=True, **kwargs),
 }
 """Each search with a budget that leaves nothing out."""

@@ -10,6 +10,7 @@ from pgts_torch.models.tabular import TabularModel
 from pgts_torch.options import MCTS, Auto, Expectimax, Sampled
 from pgts_torch.options.search import MAX_BYTES
 from pgts_torch.search import expectimax, mcts, sampled
+from pgts_torch.search import forest as forest_module
 from pgts_torch.search import known as known_module
 from pgts_torch.search import topology as topology_module
 from pgts_torch.search.auto import AutoSearch
@@ -38,7 +39,14 @@ def look_of(kind: str, model: EnumeratingModel, max_bytes: int) -> tuple[Lookahe
         share, generator = kind.removeprefix("sampled "), stream(0, "search")
         return sampled(**ask, samples=3, share=share, generator=generator, max_bytes=max_bytes), topology
     if kind.startswith("mcts"):
-        options = {"mcts": {}, "mcts, merged": {"merge": True}, "mcts, means": {"backup": "mean"}}[kind]
+        A = model.num_actions
+        options = {
+            "mcts": {},
+            "mcts, in waves": {"wave": 30},
+            "mcts, prior": {"prior": lambda state_N: torch.full((len(state_N), A), 1 / A)},
+            "mcts, merged": {"merge": True},
+            "mcts, means": {"backup": "mean"},
+        }[kind]
         return mcts(**ask, simulations=30, topology=topology, **options), topology
     return expectimax(**ask, topology=topology, max_width=100 if kind == "pruned" else None), topology
 
@@ -47,7 +55,7 @@ def least_bytes(kind: str, model: EnumeratingModel, monkeypatch: pytest.MonkeyPa
     """The smallest limit under which the search is made."""
     told = [0]
     with monkeypatch.context() as patch:
-        for module in (topology_module, known_module):
+        for module in (topology_module, known_module, forest_module):
             patch.setattr(module, "check_memory", lambda needed, most, what: told.append(needed))
         look_of(kind, model, MAX_BYTES)
     return max(told)
@@ -60,6 +68,8 @@ KINDS = [
     "sampled none",
     "sampled search",
     "mcts",
+    "mcts, in waves",
+    "mcts, prior",
     "mcts, merged",
     "mcts, means",
 ]

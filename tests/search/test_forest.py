@@ -1,0 +1,157 @@
+"""Trees that compiled loops grow are those of torch; model and critic are called for all roots at once."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from pgts_torch.compiled import torch_only
+from pgts_torch.models import EnumeratingModel, TabularModel
+from pgts_torch.search import Lookahead, Topology, mcts
+from pgts_torch.search import forest as forest_module
+from pgts_torch.seeding import stream
+from pgts_torch.tabular import random_mdp
+from tests.search.models import Critic, InterningModel, all_states, assert_close, paths, some_v, watched, zeros
+from tests.support import mdps, random_policy, rewarded
+
+pytest.importorskip("numba")
+
+roots = st.sampled_from(["gumbel", "rule"])
+rules = st.sampled_from(["gumbel", "puct", "uct"])
+backups = st.sampled_from(["max", "mean"])
+
+
+def both(model: EnumeratingModel, root_B: Tensor, *, noise: int | None = None, **options) -> list[Lookahead]:
+    """The same search, compiled and by torch."""
+
+    def look() -> Lookahead:
+        generator = None if noise is None else stream(noise, "noise")
+        return mcts(model, root_B, wave=1, generator=generator, **options)
+
+    with torch_only():
+        by_torch = look()
+    return [look(), by_torch]
+
+
+def assert_same(compiled: Lookahead, by_torch: Lookahead, tolerance: float = 1e-12) -> None:
+    assert_close(compiled.q_BA, by_torch.q_BA, tolerance)
+    assert_close(compiled.pruned_BA, by_torch.pruned_BA, tolerance)
+    assert compiled.nodes_per_level == by_torch.nodes_per_level
+    assert compiled.model_calls == by_torch.model_calls
+
+
+@given(
+    mdps(max_states=6, max_actions=5, max_outcomes=4),
+    st.integers(0, 4),
+    st.integers(1, 60),
+    st.integers(0, 99),
+    roots,
+    rules,
+    backups,
+    st.sampled_from([1e-3, 1.0, 1e6]),
+)
+def test_compiled_trees_are_those_of_torch(mdp, depth, simulations, seed, root, rule, backup, scale):
+    mdp, options = rewarded(mdp, factor=scale), {"root": root, "rule": rule, "backup": backup}
+    if root == "gumbel":
+        options["noise"] = seed
+    if not (root == "rule" and rule == "uct"):
+        options["prior"] = Critic(random_policy(mdp, seed))
+    options |= {"depth": depth, "v_leaf": Critic(scale * some_v(mdp, seed)), "simulations": simulations}
+    assert_same(*both(TabularModel(mdp), all_states(mdp), **options))
+
+
+def test_more_simulations_are_another_search():
+    mdp = random_mdp(30, 4, branching=3)
+    options = {"depth": 5, "v_leaf": Critic(some_v(mdp))}
+    compiled, _ = both(TabularModel(mdp), all_states(mdp), simulations=20, **options)
+    _, by_torch = both(TabularModel(mdp), all_states(mdp), simulations=21, **options)
+    with pytest.raises(AssertionError):
+        assert_same(compiled, by_torch)
+
+
+def forked(state: int, action: int) -> tuple[float, list[tuple[float, float, int]]]:
+    """The further down, the more outcomes; action 2 is allowed in multiples of 3 only, and 9 is the end."""
+    if action == 2 and state % 3:
+        return -math.inf, [(1.0, 0.9, 10**9)]
+    K = 1 + state % 7
+    following = [(1 / K, 0.9 if state + k != 8 else 0.0, state + action + k + 1) for k in range(K)]
+    return math.sin(7.0 * state + action), following
+
+
+@pytest.mark.parametrize("backup", ["max", "mean"])
+@pytest.mark.parametrize("root", ["gumbel", "rule"])
+def test_a_model_that_meets_states_and_outcomes_as_it_goes_is_searched_alike(root, backup):
+    def leaf(model: InterningModel) -> Critic:
+        return lambda state_N: torch.tensor([math.cos(model.states[s]) for s in state_N.tolist()]).double()
+
+    looks = []
+    for compiled in (True, False):
+        model = InterningModel(forked, [0, 1], num_actions=3)
+        options = {"depth": 3, "v_leaf": leaf(model), "simulations": 60, "root": root, "backup": backup}
+        looks.append(both(model, torch.tensor([0, 1]), **options)[not compiled])
+    assert_same(*looks)
+    assert looks[0].nodes_per_level[-1] > 0
+
+
+def test_float32_is_searched_in_float64():
+    mdp = random_mdp(50, 4, branching=3, seed=3)
+    v_S = some_v(mdp).float()
+    options = {"depth": 4, "v_leaf": lambda s: v_S[s], "simulations": 50}
+    compiled, by_torch = both(TabularModel(mdp, dtype=torch.float32), all_states(mdp), **options)
+    assert compiled.q_BA.dtype == compiled.pruned_BA.dtype == torch.float32
+    assert_close(compiled.q_BA, by_torch.q_BA, 1e-5)
+
+
+def test_model_and_critic_are_called_once_a_wave_for_all_roots():
+    """No two paths meet, so every simulation comes to a state that is unknown."""
+    model, simulations = InterningModel(paths, [(i,) for i in range(10)], num_actions=2), 21
+    model.num_outcomes = 2
+    calls, queried = [], model.outcomes
+    model.outcomes = lambda state_N: calls.append(len(state_N)) or queried(state_N)
+    look = mcts(model, torch.arange(10), depth=6, v_leaf=zeros, simulations=simulations)
+    # The roots, and then waves of one simulation of each of the two actions of each root.
+    assert calls == [10] + [20] * 10
+    assert look.critic_calls == len(calls)
+    assert sum(calls) == 10 * simulations == look.model_calls / 2
+
+
+def test_where_the_outcomes_are_known_the_critic_is_called_once():
+    mdp, model = random_mdp(60, 3, branching=3), watched(random_mdp(60, 3, branching=3))
+    topology, critic = Topology(model), Critic(some_v(mdp))
+    options = {"depth": 5, "v_leaf": critic, "simulations": 30, "topology": topology}
+    fresh = mcts(model, torch.arange(4), **options)
+    called, queries = len(critic.calls), len(model.calls)
+    known = mcts(model, torch.arange(4), **options)
+    assert called > 2
+    assert len(critic.calls) == called + 1
+    assert len(model.calls) == queries
+    assert torch.equal(known.q_BA, fresh.q_BA)
+    # No more states than the simulations could have expanded, and their children, are valued.
+    few = mcts(model, torch.tensor([0]), **(options | {"simulations": 2}))
+    assert few.critic_calls <= 2
+    assert sum(map(len, critic.calls[-few.critic_calls :])) <= 3 * 9
+
+
+def test_trees_that_take_turns_in_a_few_slots_are_the_same(monkeypatch):
+    calls = []
+
+    def look() -> Lookahead:
+        model = InterningModel(paths, [(i,) for i in range(20)], num_actions=2)
+        calls.append(0)
+
+        def v(state_N: Tensor) -> Tensor:
+            calls[-1] += 1
+            return torch.tensor([math.sin(sum(map(hash, model.states[s]))) for s in state_N.tolist()]).double()
+
+        return mcts(model, torch.arange(20), depth=5, v_leaf=v, simulations=30)
+
+    at_once = look()
+    monkeypatch.setattr(forest_module, "_ROOM", 7 * 30 * 4)
+    in_turns = look()
+    assert torch.equal(in_turns.q_BA, at_once.q_BA)
+    assert torch.equal(in_turns.pruned_BA, at_once.pruned_BA)
+    assert in_turns.nodes_per_level == at_once.nodes_per_level
+    assert calls[1] > 2 * calls[0]
