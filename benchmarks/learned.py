@@ -80,7 +80,9 @@ def applies(key: Key) -> bool:
 def configured(task: str, method: str, seed: int) -> Config:
     """The configuration of a method of ours; of the others, the one that says what the environment is. deep_sea_50 is
     that of deep_sea with 50 rows."""
-    task, size = ("deep_sea", ["--env.kwargs.n", "50"]) if task == "deep_sea_50" else (task, [])
+    size = []
+    if task == "deep_sea_50":
+        task, size = "deep_sea", ["--env.kwargs.n", "50", "--rollout.horizon.length", "50"]
     folder = "configs/learned" if method in ("learned", "given") or task == "lunar_lander" else "configs"
     given = ["--model", "given", "--replay.type", "uniform"] if method == "given" else []
     return load(str(ROOT / folder / f"{task}.yaml"), ["--seed", str(seed), *given, *size])
