@@ -1,6 +1,7 @@
 """A certificate from counts is true as often as it says, and is never called proved."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ import torch
 from pgts_torch import PGTS
 from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.report.page import write
 from pgts_torch.experiment.run import train
 from pgts_torch.experiment.summary import describe
 from pgts_torch.options import Counts, StepsHorizon, UniformReplay
@@ -86,6 +88,11 @@ def test_a_run_says_what_its_certificate_is_and_says_nothing_of_one_that_it_has_
     assert (summary.certificate_trust, summary.certificate_confidence) == ("posterior", 0.9)
     assert f"{summary.certificate:.3g} (posterior, 90 %)" in text
     assert "proved" not in text
+    answer = write(tmp_path / "asked", None)
+    assert (answer["certificate"]["trust"], answer["certificate"]["bound"]) == ("posterior", summary.certificate)
+    page = Path(answer["page"]).read_text()
+    assert "posterior probability model.certificate" in page
+    assert "is a proof" not in page
     assert any(value is not None for value in logged)
     assert summary.certificate >= summary.J_optimal - summary.J if summary.J_optimal is not None else True
     summary, text, logged = run("ended", "--model", asked, "--search.stop_at", "1.0")

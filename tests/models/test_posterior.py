@@ -13,7 +13,7 @@ from pgts_torch.options import Counts
 from pgts_torch.seeding import numpy_stream, stream
 from pgts_torch.tabular import TabularMDP, exact, random_mdp
 from tests.models.test_counts import every_pair, learned, steps
-from tests.support import random_policy, uniform_policy, zoo
+from tests.support import random_policy, rewarded, uniform_policy, zoo
 
 
 def greedy(mdp: TabularMDP, model: CountsModel) -> torch.Tensor:
@@ -92,6 +92,19 @@ def test_states_that_were_never_visited_take_no_room():
     assert found[0] == found[1]
     tables, visited = sampled_tables(many, 3, unknown_worth=1.0, random=numpy_stream(0, "draws"))
     assert (tables.num_states, len(visited)) == (3 * 5, 4)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e6])
+def test_certificates_have_the_unit_of_rewards(factor):
+    found = []
+    for scale in (1.0, factor):
+        mdp = rewarded(random_mdp(5, 2, branching=2, gamma=0.9), factor=scale)
+        options = Counts(value_range=[0.0, 10.0 * scale])
+        model = CountsModel(mdp.num_states, mdp.num_actions, gamma=0.9, options=options)
+        model.learn(steps(mdp, every_pair(mdp, 20)), generator=stream(0, "learn"))
+        given = {"num_starts": 3, "generator": stream(0, "draws")}
+        found.append(posterior_certificate(model, uniform_policy(mdp), mdp.start_S, **given))
+    assert found[1] == pytest.approx(factor * found[0], rel=1e-9)
 
 
 def posterior_mean(seen: list[list[int]], pair: list[int]) -> list[float]:
