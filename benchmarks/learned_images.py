@@ -44,7 +44,7 @@ def run(key: Key) -> Record:
     if key["method"] == "learned":
         return tasks.train(experiment.build(config), task, lambda model: mean_return(model, task, seed))
     assert isinstance(config.model, Latent)
-    assert config.model.network is not None
+    assert isinstance(config.model.network, CNN)
     watch, network = Watch(task), config.model.network
     _train_ppo(lambda: gymnasium.make(config.env.id, **config.env.kwargs), network, config.env.gamma, task, seed, watch)
     return watch.record()

@@ -22,7 +22,7 @@ from pgts_torch.models.replay import ReplayBuffer
 from pgts_torch.models.state_index import hash_rows
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options.models import Latent
-from pgts_torch.options.policies import MLP
+from pgts_torch.options.policies import CNN, MLP
 from pgts_torch.seeding import stream, uniform
 
 _SELDOM = 0.02
@@ -104,7 +104,8 @@ class LatentModel(TensorModel, LearningModel):
         self.replay.add(state=images, action=none.long(), reward=none, end=none, next_state=images, follows=none.bool())
         generator, inputs = stream(seed, "model"), spaces.Box(-np.inf, np.inf, (options.size + num_actions,))
         self.space = spaces.Box(-np.inf, np.inf, (options.size,))
-        image_trunk = make_trunk(options.network or default_network(space), space, generator=generator)
+        network = options.network if isinstance(options.network, CNN) else default_network(space)
+        image_trunk = make_trunk(network, space, generator=generator)
         step_trunk = make_trunk(MLP(hidden=options.hidden, activation="relu"), inputs, generator=generator)
         self._representation = Network(image_trunk, options.size, gain=1.0, generator=generator).to(device)
         # a small gain: at first nothing changes

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.actions import all_actions
 from pgts_torch.models.adapters import adapter_for
-from pgts_torch.models.answers import Seen, Step, observed
+from pgts_torch.models.answers import Seen, Step
 from pgts_torch.models.chance import Chance
 from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.rewards import RewardRange
@@ -27,7 +27,8 @@ class Stepper:
     steps: how often it was stepped.   chance: its generator, watched.
 
     Args:
-        env, gamma, actions, adapter, observe: as in `SimulatorModel`, which says what is raised.
+        env, gamma, actions, adapter: as in `SimulatorModel`, which says what is raised.
+        observe: what is kept of an observation.
     """
 
     def __init__(
@@ -37,7 +38,7 @@ class Stepper:
         gamma: float,
         actions: Sequence[Any] | None,
         adapter: SnapshotAdapter | None,
-        observe: Callable[[Any], Any] | None,
+        observe: Callable[[Any], Any],
     ) -> None:
         self.made = EnvSource.of(env).make_one()
         self.name = env_name(self.made)
@@ -133,4 +134,4 @@ class Stepper:
             observation = self.transforms.observation(observation)
             if isinstance(self.space, spaces.Box):
                 observation = np.asarray(observation, self.space.dtype)
-        return observed(observation, self._observe)
+        return self._observe(observation)

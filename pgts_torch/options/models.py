@@ -113,14 +113,20 @@ class Ensemble(Part):
     """Gradient steps after the first rollouts."""
 
 
+class AutoNetwork(Part):
+    """A cnn, with strides where images are large."""
+
+    type: Literal["auto"] = "auto"
+
+
 class Latent(Part):
     """Networks that learn from the steps of the environment alone to represent an image as a vector, and what follows a
     vector and an action: the next vector, the reward, and whether the episode ends (Schrittwieser et al. 2020)."""
 
     type: Literal["latent"] = "latent"
 
-    network: CNN | None = None
-    """The network that represents images; null: a cnn, with strides where images are large."""
+    network: AutoNetwork | CNN = Field(default=AutoNetwork(), discriminator="type")
+    """The network that represents images."""
 
     size: Count = 64
     """Numbers of a vector."""

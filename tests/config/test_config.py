@@ -117,7 +117,7 @@ def test_a_shipped_configuration_is_valid_and_says_what_it_shows(name: str) -> N
     config = load(SHIPPED[name])
     assert SHIPPED[name].read_text().startswith("# ")
     assert config.name == name
-    if config.env.id.startswith("MiniGrid-"):
+    if "minigrid" in config.env.id.lower():
         pytest.importorskip("minigrid", exc_type=ImportError)
     made = EnvSource.of(config.env.id, kwargs=config.env.kwargs).make_one()
     assert made.spec is not None
@@ -129,7 +129,8 @@ def test_the_shipped_configurations_are_those_of_the_paper_and_of_gymnasium() ->
     own = {"deep_sea", "deep_sea_bsuite", "deep_sea_stochastic", "grid", "ladder", "random", "tightrope"}
     toy_text = {"cliff_walking", "frozen_lake_4x4", "frozen_lake_8x8", "taxi"}
     others = toy_text | {"acrobot", "cartpole", "mountain_car", "door_key"}
-    learned = {f"learned_{name}" for name in (toy_text | {"acrobot", "cartpole", "deep_sea", "mountain_car"})}
+    images = {"catch", "minigrid_door_key", "minigrid_empty"}
+    learned = {f"learned_{name}" for name in (toy_text | {"acrobot", "cartpole", "deep_sea", "mountain_car"} | images)}
     assert set(SHIPPED) == own | others | learned
     assert own | {"learned_deep_sea"} == {
         name for name, path in SHIPPED.items() if load(path).env.id.startswith("pgts/")
@@ -246,13 +247,17 @@ def configurations(draw: st.DrawFn) -> Config:
         given["model.strength"] = None
     if types["model.type"] == "counts" and given["model.value_range"] is None:
         given["model.confidence"] = given["model.certificate"] = None
+    if types["model.type"] == "latent" and "cnn" in (types["policy.type"], types.get("critic.network.type")):
+        types = types | {"model.type": "auto"}
+        given = {key: value for key, value in given.items() if not key.startswith("model.")}
     silent = {
+        "latent": True,
         "counts": given.get("model.confidence") is None,
         "ensemble": given.get("model.members") == 1 or given.get("search.action_repeat", 1) > 1,
     }
     if given.get("search.doubt") and (given["search.max_width"] is not None or silent.get(types["model.type"])):
         given["search.doubt"] = False
-    is_learned = types["model.type"] in ("counts", "ensemble")
+    is_learned = types["model.type"] in ("counts", "ensemble", "latent")
     if is_learned and given.get("model.certificate") is None:
         given["search.stop_at"] = None
     if types["rollout.horizon.type"] == "steps" and (types["replay.type"], is_learned) != ("auto", True):
@@ -321,7 +326,7 @@ def _leaves(data: dict[str, Any], prefix: str = "") -> list[str]:
 
 NUMBERED = TabularWorld(EnvSource.of("pgts/Ladder-v0").make(1), ladder())
 PICTURED = SimpleNamespace(
-    observation_space=spaces.Box(0, 255, (7, 7, 3), np.uint8), num_actions=2, device=torch.device("cpu")
+    perceived_space=spaces.Box(0, 255, (7, 7, 3), np.uint8), num_actions=2, device=torch.device("cpu"), model=None
 )
 """The world of a numbered environment, and as much of one with images as parts ask for."""
 
@@ -346,6 +351,8 @@ PARTS = [
     ["--rollout.horizon.type", "fixed", "--model.type", "given", "--replay.type", "none"],
     ["--model.type", "counts", "--rollout.horizon.first", "7"],
     ["--model.type", "own", "--model.make", "models_of_mine:model"],
+    ["--model.type", "latent", "--replay.length", "3"],
+    ["--model.type", "latent", "--model.network.type", "cnn"],
     ["--model.members", "2", "--replay.length", "3"],
 ]
 """Command lines that together name every type there is."""
