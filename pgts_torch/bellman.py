@@ -52,6 +52,20 @@ class Outcomes:
     child_NAK: Int[Tensor, "N A K"]
     num_children: int
 
+    @classmethod
+    def of_rows(cls, reward_NA: Float[Tensor, "N A"], weight: Tensor, child: Tensor, K: int, num_children: int) -> Self:
+        """Outcomes with the given sparse `weight`, in the same memory: p gamma stands for p, and 1 for gamma.
+
+        Args:
+            weight, child: N A K numbers, flat.
+        """
+        shape = (*reward_NA.shape, K)
+        outcomes = cls(
+            reward_NA, weight.view(shape), weight.new_ones(()).expand(shape), child.view(shape), num_children
+        )
+        vars(outcomes)["weight"] = _rows(weight, child, K, num_children)
+        return outcomes
+
     @property
     def num_states(self) -> int:
         return self.reward_NA.shape[0]

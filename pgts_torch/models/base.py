@@ -125,10 +125,12 @@ class EnumeratingModel(Model):
 
     num_outcomes: K; None: it is not known before the first query.
     samples_outcomes: whether it samples the outcomes that it enumerates, and remembers them.
+    table: the outcomes of all states, for good, where it keeps such a table; searches then read it without a copy.
     """
 
     num_outcomes: int | None = None
     samples_outcomes: bool = False
+    table: Outcomes | None = None
 
     @abstractmethod
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:

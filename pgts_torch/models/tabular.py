@@ -39,6 +39,7 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
     """
 
     kind, is_cheap = "table", True
+    table: Outcomes
 
     def __init__(
         self, mdp: TabularMDP, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64

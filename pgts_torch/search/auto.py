@@ -88,7 +88,7 @@ class AutoSearch(Search):
                 if isinstance(error, MemoryBudgetExceeded):
                     # What earlier searches, or this attempt, left in the topology takes memory too: try without it.
                     calls_left_behind += topology.table.model_calls - calls_before
-                    is_full = topology.table.count > 0
+                    is_full = topology.table.num_queried > 0
                     topology = self.topology = topology.fresh()
                     calls_before = 0
                     if is_full and not is_emptied:

@@ -60,6 +60,8 @@ def search_bytes(
     remembered: int = 0,
     looked_up: int = 0,
     kept: int = 0,
+    gathered: int = 0,
+    gathering: int = 0,
     sampled: int = 0,
     sampling: int = 0,
     resampled: int = 0,
@@ -80,6 +82,7 @@ def search_bytes(
         remembered: rows of the `OutcomeTable`, after the step.
         looked_up: states whose outcomes the step reads, new or not.
         kept: rows of outcomes of levels, with their sparse weights, after the step.
+        gathered: rows of levels read from the model's own table, after the step.   gathering: those of the step.
         sampled: nodes whose outcomes were sampled, after the step.   sampling: those that the step samples.
         resampled: nodes that the bootstrap samples again at once.
         learned: rows of `KnownStates`.
@@ -92,6 +95,11 @@ def search_bytes(
     total += remembered * (GROWTH * sizes.outcomes + widest)
     total += looked_up * (sizes.outcomes + 56 * E + 4 * A * s + 64)
     total += kept * (sizes.outcomes + E * (s + 4) + A * (2 * s + 4) + 24)
+    if gathered:
+        # The sparse weights of the whole table, marks of what was met, and a list of some of that, sorted.
+        total += states * (E * (s + 4) + 8 * A + 1 + 1)
+        total += gathered * (A * (2 * s + 4) + E * (s + 4) + 2 * s + 24) + gathering * 8 * A
+        total += min(states, gathering * E) * (3 * s + 48)  # children: states, positions, what is new, values
     total += sampled * (2 * (s + 16) * E + 48) + sampling * 64 * E + resampled * RESAMPLED * E
     total += learned * (GROWTH * sizes.known + widest)
     total += nodes * (GROWTH * sizes.node + widest + E * (4 * s + 16) + 40 * A)

@@ -14,14 +14,17 @@ from pgts_torch.search.table import Table, with_room
 _TOLERANCE = 1e-4
 """By how much the probabilities of a model may miss 1: enough for many of them in float32."""
 
+_NOT_QUERIED, _NO_ROW = -1, -2
+
 
 @final
 class OutcomeTable(Table):
     """The outcomes of the states that a model was queried for, in the order of the queries: each state only once.
 
     reward_RA, prob_RAK, discount_RAK, child_RAK: as in `Outcomes`, children as states of the model.
-    row_S: the row R of a state; -1 where the model was not queried. It may be longer than there are states.
-    model_calls: for how many (state, action) the model was queried.
+    row_S: the row R of a state; -1 where the model was not queried, -2 where it was, and its own table was read. It may
+        be longer than there are states.
+    num_queried: for how many states the model was queried.   model_calls: for how many (state, action).
 
     Args:
         model: enumerates outcomes.
@@ -31,7 +34,7 @@ class OutcomeTable(Table):
 
     def __init__(self, model: EnumeratingModel) -> None:
         super().__init__(model.num_actions, 1, model.dtype, model.device)
-        self.model, self.model_calls = model, 0
+        self.model, self.num_queried, self.model_calls = model, 0, 0
         self.reward_RA = self._column("A")
         self.prob_RAK, self.discount_RAK = self._column("AK"), self._column("AK")
         self.child_RAK = self._column("AK", dtype=torch.int64)
@@ -40,12 +43,18 @@ class OutcomeTable(Table):
     @property
     def queried(self) -> Int[Tensor, "N"]:
         """The states that the model was queried for, ascending."""
-        return torch.nonzero(self.row_S >= 0).flatten()
+        return torch.nonzero(self.row_S != _NOT_QUERIED).flatten()
 
     def missing(self, state_N: Int[Tensor, "N"]) -> Int[Tensor, "missing"]:
-        """Those of the states that the model was not queried for."""
+        """Those of the states that have no row."""
         self.row_S = with_room(self.row_S, self.model.num_states)
         return state_N[self.row_S[state_N] < 0]
+
+    def read(self, state_N: Int[Tensor, "N"]) -> None:
+        """These distinct states count as queried; what follows them is read in the model's own table."""
+        missing = self.missing(state_N)
+        self._count(missing)
+        self.row_S[missing] = _NO_ROW
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
         """A copy of the outcomes of these distinct states; the model is queried for the missing ones.
@@ -57,7 +66,7 @@ class OutcomeTable(Table):
         missing = self.missing(state_N)
         if len(missing):
             answer = self.model.outcomes(missing)
-            self.model_calls += len(missing) * self.num_actions
+            self._count(missing)
             check_outcomes(self.model, missing, answer)
             # The model may have met new states, which get room before their ids are used.
             self.row_S = with_room(self.row_S, self.model.num_states)
@@ -70,12 +79,20 @@ class OutcomeTable(Table):
         return self._rows(self.row_S[state_N])
 
     def all(self) -> tuple[Int[Tensor, "R"], Outcomes]:
-        """The state of each row, and the outcomes, with states as children and in the memory of the table."""
+        """The queried states and their outcomes, with states as children: in the memory of this table, or rows of the
+        model's own."""
         queried = self.queried
+        if self.model.table is not None:
+            return queried, self.model.table.rows(queried)
         # The inverse of `row_S`.
         state_R = torch.empty_like(queried)
         state_R[self.row_S[queried]] = queried
         return state_R, self._rows(slice(self.count))
+
+    def _count(self, missing: Int[Tensor, "missing"]) -> None:
+        new = int((self.row_S[missing] == _NOT_QUERIED).sum())
+        self.num_queried += new
+        self.model_calls += new * self.num_actions
 
     def _rows(self, at: Tensor | slice) -> Outcomes:
         columns = self.reward_RA[at], self.prob_RAK[at], self.discount_RAK[at], self.child_RAK[at]

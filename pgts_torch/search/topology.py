@@ -1,7 +1,7 @@
 """Which states a lookahead meets at which level. Transitions do not depend on the policy, so this outlives a search."""
 
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
 from typing import final
 
@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from pgts_torch.bellman import Outcomes
+from pgts_torch.bellman import COMPILED_FROM, Outcomes
+from pgts_torch.compiled import can_compile
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.options.search import MAX_BYTES
@@ -108,10 +109,7 @@ class Topology:
         """
         self._check_generation()
         self._afford(state_N, None, "one level", kept=kept)
-        outcomes = self.table.outcomes(state_N)
-        # Children are those of outcomes with weight: nothing below the others can change a value.
-        weighs_NAK = has_weight(outcomes)
-        children = self._positions.distinct(outcomes.child_NAK.masked_select(weighs_NAK))
+        outcomes, weighs_NAK, children = self._answers(state_N)
         return self._with_positions(outcomes, weighs_NAK, children), children
 
     @torch.inference_mode(False)
@@ -136,12 +134,10 @@ class Topology:
 
     def _expand(self, levels: Levels) -> None:
         """One more level: query the model for the states of the last frontier that are new, and find their children."""
-        outcomes = self.table.outcomes(levels.frontiers[-1])
-        weighs_NAK = has_weight(outcomes)
-        children = self._positions.distinct(outcomes.child_NAK.masked_select(weighs_NAK))
+        children, with_positions = self._children(levels.frontiers[-1])
         # Without new children all states met so far lead to each other: the closed set, in which `step` then points.
         new = self._positions.missing(children, levels.closed_states)
-        step = self._with_positions(outcomes, weighs_NAK, children if len(new) else levels.closed_states)
+        step = with_positions(children if len(new) else levels.closed_states)
         # `levels` changes only after the last thing that may fail for want of memory.
         if len(new):
             levels.closed_states = torch.cat([levels.closed_states, new])
@@ -149,10 +145,49 @@ class Topology:
         elif len(levels.frontiers) == 1:  # the roots are closed by themselves
             levels.closed = step
         else:
-            self._afford(levels.closed_states, levels, "the closed set")
-            inside = self.table.outcomes(levels.closed_states)
-            levels.closed = self._with_positions(inside, has_weight(inside), levels.closed_states)
+            self._afford(levels.closed_states, levels, "the closed set", kept=step.num_states)
+            _, with_positions = self._children(levels.closed_states)
+            levels.closed = with_positions(levels.closed_states)
         levels.outcomes.append(step)
+
+    def _children(
+        self, state_N: Int[Tensor, "N"]
+    ) -> tuple[Int[Tensor, "children"], Callable[[Int[Tensor, "C"]], Outcomes]]:
+        """The distinct children of these states, ascending; and the outcomes with positions among the states C."""
+        table = self._own_table
+        if table is not None:
+            self.table.read(state_N)
+            return _children_in(table, state_N), lambda states: self._gathered(table, state_N, states)
+        outcomes, weighs_NAK, children = self._answers(state_N)
+        return children, lambda states: self._with_positions(outcomes, weighs_NAK, states)
+
+    def _answers(self, state_N: Int[Tensor, "N"]) -> tuple[Outcomes, Bool[Tensor, "N A K"], Int[Tensor, "children"]]:
+        """A copy of the outcomes, which of them have weight, and their distinct children, ascending."""
+        outcomes = self.table.outcomes(state_N)
+        # Children are those of outcomes with weight: nothing below the others can change a value.
+        weighs_NAK = has_weight(outcomes)
+        return outcomes, weighs_NAK, self._positions.distinct(outcomes.child_NAK.masked_select(weighs_NAK))
+
+    @property
+    def _own_table(self) -> Outcomes | None:
+        """The table of the model, where its levels are found by compiled loops."""
+        table = self.model.table
+        compiles = table is not None and table.child_NAK.numel() >= COMPILED_FROM and can_compile(table.device)
+        return table if compiles else None
+
+    def _gathered(self, table: Outcomes, state_N: Int[Tensor, "N"], states: Int[Tensor, "C"]) -> Outcomes:
+        """Rows of the table with children given by their position among `states`, as small as they can be: p gamma
+        stands for p and 1 for gamma, and the sparse weight is in the same memory."""
+        from pgts_torch.search import level_kernels
+
+        N, A, K = len(state_N), table.num_actions, table.num_outcomes
+        index = table.weight.col_indices().dtype
+        reward_NA = torch.empty(N, A, dtype=table.dtype)
+        weight, child = torch.empty(N * A * K, dtype=table.dtype), torch.empty(N * A * K, dtype=index)
+        to = reward_NA.view(-1), weight, child
+        place_S = self._positions.of(states)
+        level_kernels.gather(state_N.numpy(), *table.arrays, place_S.numpy(), *(x.numpy() for x in to))
+        return Outcomes.of_rows(reward_NA, weight, child, K, len(states))
 
     def _with_positions(
         self, outcomes: Outcomes, weighs_NAK: Bool[Tensor, "N A K"], states: Int[Tensor, "C"]
@@ -181,11 +216,14 @@ class Topology:
         Raises:
             NodeBudgetExceeded: they would not fit all the same.
         """
-        missing, looked_up = len(self.table.missing(state_N)), len(state_N)
+        reads_table = levels is not None and self._own_table is not None
+        missing, looked_up = 0 if reads_table else len(self.table.missing(state_N)), len(state_N)
         own = 0 if levels is None else levels.rows
 
         def needed() -> int:
             others = sum(each.rows for each in self._levels.values() if each is not levels)
+            if reads_table:
+                return self.bytes(0, gathered=kept + own + others + looked_up, gathering=looked_up)
             return self.bytes(missing, looked_up=looked_up, kept=kept + own + others + looked_up)
 
         def check() -> None:
@@ -209,6 +247,19 @@ class Topology:
     def _check_generation(self) -> None:
         if self.model.generation != self._generation:
             raise PgtsError("the model has been reset since this topology was made: make a new topology")
+
+
+def _children_in(table: Outcomes, state_N: Int[Tensor, "N"]) -> Int[Tensor, "children"]:
+    """The distinct children of states of the table, ascending."""
+    from pgts_torch.search import level_kernels
+
+    met_S = torch.zeros(table.num_children, dtype=torch.bool)
+    # Few are sorted; many are read from their marks.
+    found = torch.empty(
+        min(len(state_N) * table.num_actions * table.num_outcomes, len(met_S) // 32 + 1), dtype=torch.int64
+    )
+    count = level_kernels.children(state_N.numpy(), *table.arrays, met_S.numpy(), found.numpy())
+    return found[:count].sort().values if count <= len(found) else torch.nonzero(met_S).flatten()
 
 
 def topology_of(model: EnumeratingModel, topology: Topology | None) -> Topology:

@@ -99,7 +99,7 @@ class UpperBound:
             "bound": self._grown(self._bound_S)[queried].cpu(),
             "below": self._grown(self._below_S)[queried].cpu(),
             "settled": self._settled,
-            "current": self._taken == self.topology.table.count,
+            "current": self._taken == self.topology.table.num_queried,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -116,9 +116,9 @@ class UpperBound:
     def _update_states(self) -> None:
         """Take the states that were expanded since into X. The sweeps from below start again: with more states the old
         values need not be below v_hat any more."""
-        if self._taken == self.topology.table.count:
+        if self._taken == self.topology.table.num_queried:
             return
-        self._taken, self._settled = self.topology.table.count, False
+        self._taken, self._settled = self.topology.table.num_queried, False
         self._state_X, outcomes = _without_ends(*self.topology.table.all())
         self._num_outcomes, self._rounding = outcomes.num_outcomes, (outcomes.num_outcomes + 4) * _EPS
         self._reward, self._weight = outcomes.reward_NA.double().reshape(-1, 1), outcomes.to(dtype=torch.float64).weight

@@ -92,7 +92,7 @@ def test_a_search_stays_below_the_limit_and_is_refused_just_below_what_it_needs(
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_search_that_goes_deeper_again_and_over_other_roots_stays_below_the_limit(dtype):
     model = TabularModel(random_mdp(2000, 3, branching=3, seed=5), dtype=dtype)
-    limit, made = 3_000_000, []
+    limit, made = 1_250_000, []
 
     def searches() -> Topology:
         topology = Topology(model, max_bytes=limit)

@@ -9,11 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from pgts_torch import compiled
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NodeBudgetExceeded, PgtsError
 from pgts_torch.models import EnumeratingModel, TabularModel
-from pgts_torch.search import Topology, expectimax
-from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder
+from pgts_torch.search import Lookahead, Topology, expectimax, mcts
+from pgts_torch.seeding import stream
+from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder, random_mdp
+from tests.memory import peak_bytes
 from tests.search.models import Critic, InterningModel, WatchedModel, paths, some_q, some_v, watched, zeros
 from tests.support import mdps, zoo
 
@@ -296,3 +299,71 @@ def test_a_search_that_failed_in_its_model_can_be_repeated():
     look = expectimax(model, root, depth=6, q_leaf=Critic(q_SA), topology=topology)
     torch.testing.assert_close(look.q_BA[0], exact.lookahead(mdp, q_SA, 6)[44], rtol=1e-11, atol=1e-11)
     assert len(model.queried) == len(set(model.queried))
+
+
+# Levels over the table of the model, by compiled loops, and as torch finds them
+
+
+def searches_of(mdp: TabularMDP, dtype: torch.dtype, root_B: Tensor) -> list[Lookahead]:
+    """Deeper and deeper, from the same roots and from others, over one topology; some of bounded width."""
+    model = TabularModel(mdp, dtype=dtype)
+    topology, v_S = Topology(model), torch.randn(mdp.num_states, generator=stream(0, "v")).to(dtype)
+    return [
+        expectimax(model, roots, depth=depth, v_leaf=lambda n: v_S[n], topology=topology, max_width=width)
+        for depth in (0, 1, 3, 9)
+        for roots in (root_B, root_B[:1])
+        for width in (None, 4, None)
+    ]
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(
+    "mdp",
+    [
+        grid(),
+        deep_sea(20),
+        random_mdp(300, 3, branching=2, seed=1),
+        random_mdp(80, 4, branching=5, seed=2),
+        random_mdp(4000, 2, branching=1, seed=3),
+    ],
+    ids=["closed roots", "ends", "garnet", "wide garnet", "many states, certain"],
+)
+def test_levels_read_from_the_table_of_the_model_are_those_of_its_answers(mdp, dtype):
+    pytest.importorskip("numba")
+    root_B = torch.tensor([5, 0, 5, 17])
+    found = searches_of(mdp, dtype, root_B)
+    with compiled.torch_only():
+        expected = searches_of(mdp, dtype, root_B)
+    for got, wanted in zip(found, expected, strict=True):
+        assert got.nodes_per_level == wanted.nodes_per_level
+        assert (got.model_calls, got.critic_calls) == (wanted.model_calls, wanted.critic_calls)
+        tolerance = 1e-12 if dtype == torch.float64 else 1e-5
+        torch.testing.assert_close(got.q_BA, wanted.q_BA, rtol=tolerance, atol=tolerance)
+        torch.testing.assert_close(got.pruned_BA, wanted.pruned_BA, rtol=tolerance, atol=tolerance)
+    assert len({look.nodes for look in found}) > 3
+
+
+def test_what_was_read_in_the_table_of_the_model_counts_as_queried_and_is_copied_where_rows_are_needed():
+    mdp = random_mdp(200, 3, branching=2, seed=1)
+    model = TabularModel(mdp)
+    topology = Topology(model)
+    calls = expectimax(model, torch.tensor([0]), depth=2, v_leaf=zeros, topology=topology).model_calls
+    queried = topology.table.queried
+    assert topology.table.num_queried == len(queried) == calls / 3
+    state_R, outcomes = topology.table.all()
+    assert torch.equal(state_R.sort().values, queried)
+    rows = mdp.outcomes.rows(state_R)
+    for name in ("reward_NA", "prob_NAK", "discount_NAK", "child_NAK"):
+        assert torch.equal(getattr(outcomes, name), getattr(rows, name))
+    assert mcts(model, torch.tensor([0]), depth=2, v_leaf=zeros, simulations=8, topology=topology).model_calls == 0
+    assert topology.table.model_calls == calls
+
+
+def test_a_search_that_reads_the_table_of_the_model_keeps_less_than_half_of_what_answers_take():
+    pytest.importorskip("numba")
+    model, root_B = TabularModel(random_mdp(5000, 4, branching=5, seed=1)), torch.arange(100)
+    search = lambda: expectimax(model, root_B, depth=4, v_leaf=zeros, topology=Topology(model))  # noqa: E731
+    nodes = search().nodes
+    with compiled.torch_only():
+        copies = peak_bytes(search)
+    assert peak_bytes(search) <= min(250 * nodes, copies / 2)
