@@ -3,6 +3,7 @@
     python benchmarks/learning.py deep_sea      who finds the treasure, and could one have known?
     python benchmarks/learning.py learned       how soon is it solved from steps alone, with a learned model?
     python benchmarks/learning.py learned_images    and from images, with a learned model of them?
+    python benchmarks/learning.py simulators    what does a call of a simulator cost beside the step of the environment?
     python benchmarks/learning.py tasks         how soon is an environment solved, against PPO, A2C and DQN?
     python benchmarks/learning.py throughput    how fast is the training, and what does a lookahead cost?
     python benchmarks/learning.py variance      what does the depth do to the gradient estimate?
@@ -13,7 +14,7 @@ What follows are the options of the script of that name: --help lists them.
 import argparse
 import importlib
 
-QUESTIONS = ("deep_sea", "learned", "learned_images", "tasks", "throughput", "variance")
+QUESTIONS = ("deep_sea", "learned", "learned_images", "simulators", "tasks", "throughput", "variance")
 
 
 def main() -> None:

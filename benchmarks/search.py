@@ -4,7 +4,8 @@
 
 1. The paper's 10 x 10 grid: all 100 states as roots, depth 8, v^pi of the uniform policy at the leaves. mctx searches
    the same MDP from the same roots with the same leaves and priors, jitted, 64 simulations.
-2. mcts: simulations a second from 128 roots, depth 8, 64 simulations each, beside the two policies of mctx.
+2. mcts: simulations a second from 128 roots and from one, depth 8, 64 simulations each, and how right they are, beside
+   the two policies of mctx.
 3. New leaf values for roots that were searched before: what is saved.
 4. Depth 32 and depth 64 on known states: how the time grows, and how many calls the model gets.
 5. Depth 1 to 64 from one root: nodes, model calls and time with merging, and without it as far as that fits.
@@ -39,7 +40,7 @@ from peers import POLICIES, mctx_searcher
 
 from pgts_torch.bellman import Outcomes, backup
 from pgts_torch.models import TabularModel
-from pgts_torch.search import Lookahead, Topology, mcts
+from pgts_torch.search import Topology, mcts
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid
 
@@ -84,62 +85,76 @@ def print_beside_mctx(rows: dict[str, Any]) -> None:
 
 
 def mcts_throughput(repeats: int, device: str) -> dict[str, Any]:
-    """Milliseconds of one search of 128 distinct roots: ours with known and with fresh topology, and mctx's."""
+    """Milliseconds of one search of 128 distinct roots, and of 1 root: ours with known and with fresh topology, and
+    mctx's; and how right they are against T^8 Q."""
     answer = {}
     # A grid of 12 x 12, because roots that are alike would be searched once by ours and again and again by mctx.
     mdps = {"Grid, 12 x 12": grid(12, traps=(14, 38)), "Garnet(200,4,5)": garnet(), "DeepSea(20)": deep_sea(20)}
     for name, mdp in mdps.items():
-        root_B, v_S = sampled_roots(mdp, MCTS_ROOTS), uniform_evaluation(mdp).v_S
-        forms: dict[str, Form] = {}
-        for merge in (False, True):
-            for keep in (True, False):
-                label = f"mcts, {'merged' if merge else 'tree'}, {'known' if keep else 'fresh'}"
-                forms[label] = _mcts(mdp, root_B, v_S, device, merge=merge, keep=keep)
-        for policy in POLICIES:
-            peer = mctx_searcher(mdp, v_S, root_B, policy=policy, simulations=SIMULATIONS, max_depth=DEPTH + 1)
-            if peer:
-                forms[f"mctx, {policy}"] = peer
-        times = take_turns(forms, repeats)
-        answer[name] = {
-            form: {"milliseconds": statistics.median(times[form])}
-            | {
-                f"{policy}_time_ratio": median_ratio(times[f"mctx, {policy}"], times[form])
-                for policy in POLICIES
-                if f"mctx, {policy}" in times
+        for roots in (MCTS_ROOTS, 1):
+            root_B, evaluation = sampled_roots(mdp, roots), uniform_evaluation(mdp)
+            forms = _mcts_forms(mdp, root_B, evaluation.v_S, device)
+            truth_BA = exact.lookahead(mdp, evaluation.q_SA, DEPTH)[root_B]
+            right = {form: _rightness(search(), truth_BA) for form, search in forms.items()}
+            times = take_turns(forms, repeats)
+            answer[f"{name}, {roots} root{'s' * (roots > 1)}"] = {
+                form: {"milliseconds": statistics.median(times[form]), "roots": roots}
+                | right[form]
+                | {
+                    f"{policy}_time_ratio": median_ratio(times[f"mctx, {policy}"], times[form])
+                    for policy in POLICIES
+                    if f"mctx, {policy}" in times
+                }
+                for form in forms
             }
-            for form in forms
-        }
     return answer
 
 
+def _mcts_forms(mdp: TabularMDP, root_B: torch.Tensor, v_S: torch.Tensor, device: str) -> dict[str, Form]:
+    """Searches that return the values of the root's actions."""
+    forms: dict[str, Form] = {}
+    ways: dict[str, dict[str, Any]] = {"tree": {}, "waves": {"wave": SIMULATIONS}, "merged": {"merge": True}}
+    for way, options in ways.items():
+        for keep in (True, False) if way == "tree" else (True,):
+            form = f"mcts, {way}, {'known' if keep else 'fresh'}"
+            forms[form] = _mcts(mdp, root_B, v_S, device, keep=keep, **options)
+    for policy in POLICIES:
+        peer = mctx_searcher(mdp, v_S, root_B, policy=policy, simulations=SIMULATIONS, max_depth=DEPTH + 1)
+        if peer:
+            forms[f"mctx, {policy}"] = peer
+    return forms
+
+
+def _rightness(q_BA: torch.Tensor, truth_BA: torch.Tensor) -> dict[str, float]:
+    """The mean error, and the share of roots whose best action is right."""
+    error_BA, best_B1 = (q_BA.cpu() - truth_BA).abs(), q_BA.cpu().argmax(1, keepdim=True)
+    right_B = truth_BA.gather(1, best_B1).squeeze(1) >= truth_BA.amax(1) - 1e-9
+    return {"mean_error": float(error_BA.mean()), "right": float(right_B.double().mean())}
+
+
 def _mcts(
-    mdp: TabularMDP, root_B: torch.Tensor, v_S: torch.Tensor, device: str, *, merge: bool, keep: bool
-) -> Callable[[], Lookahead]:
+    mdp: TabularMDP, root_B: torch.Tensor, v_S: torch.Tensor, device: str, *, keep: bool, **options: Any
+) -> Callable[[], torch.Tensor]:
     model, generator = TabularModel(mdp, device=device), stream(0, "mcts", device=device)
     topology, root_B, v_S = Topology(model) if keep else None, root_B.to(device), v_S.to(device)
-    return lambda: mcts(
-        model,
-        root_B,
-        depth=DEPTH,
-        v_leaf=lambda state_N: v_S[state_N],
-        simulations=SIMULATIONS,
-        merge=merge,
-        topology=topology,
-        generator=generator,
-    )
+    options |= {"topology": topology, "generator": generator, "v_leaf": lambda state_N: v_S[state_N]}
+    return lambda: mcts(model, root_B, depth=DEPTH, simulations=SIMULATIONS, **options).q_BA
 
 
 def print_mcts_throughput(table: dict[str, Any]) -> None:
-    print(f"\nmcts: simulations a second, {MCTS_ROOTS} roots, depth {DEPTH}, {SIMULATIONS} simulations each")
-    print(f"{'':<18}{'':<22}{'ms':>10}{'sims / s':>14}{'to muzero':>12}{'to gumbel':>12}")
+    print(f"\nmcts: simulations a second, depth {DEPTH}, {SIMULATIONS} simulations each")
+    print(f"{'':<28}{'':<22}{'ms':>9}{'sims / s':>12}{'to muzero':>11}{'to gumbel':>11}{'error':>9}{'right':>7}")
     for name, rows in table.items():
         for form, row in rows.items():
-            rate = MCTS_ROOTS * SIMULATIONS / row["milliseconds"] * 1e3
+            rate = row["roots"] * SIMULATIONS / row["milliseconds"] * 1e3
             ratios = (f"{row[key]:.2f}" if (key := f"{p}_time_ratio") in row else "" for p in POLICIES)
             print(
-                f"{name:<18}{form:<22}{row['milliseconds']:>10.2f}{rate:>14,.0f}" + "".join(f"{r:>12}" for r in ratios)
+                f"{name:<28}{form:<22}{row['milliseconds']:>9.3f}{rate:>12,.0f}"
+                + "".join(f"{r:>11}" for r in ratios)
+                + f"{row['mean_error']:>9.2g}{row['right']:>7.0%}"
             )
-    print("to muzero, to gumbel: mctx's time with that policy to this time; above 1, ours is faster.")
+    print("to muzero, to gumbel: mctx's time with that policy to this time; above 1, ours is faster. error: the mean")
+    print("against T^8 Q^pi over roots and actions. right: roots whose best action is the best by T^8 Q^pi.")
 
 
 def bandwidth(repeats: int, device: str, num_nodes: int) -> list[dict[str, Any]]:

@@ -48,7 +48,7 @@ def torch_only() -> Iterator[None]:
 
 def jit(function: _Function) -> _Function:
     """The function, compiled by numba when it is first called: for numpy arrays and numbers, and with sums in the order
-    in which they are written.
+    in which they are written. Divisions by zero are not noticed.
 
     What it calls must be marked too and stand in the same file: a function from the disk does not notice what has
     changed in another file.
@@ -57,10 +57,10 @@ def jit(function: _Function) -> _Function:
 
     function = inspect.unwrap(function)  # without the shape checks of tests, which numba cannot read
     try:
-        machine_code: _Function = numba.njit(cache=True, nogil=True)(function)
+        machine_code: _Function = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError as error:  # no folder for it
         _say_not_kept(str(error))
-        machine_code = numba.njit(nogil=True)(function)
+        machine_code = numba.njit(nogil=True, error_model="numpy")(function)
     return machine_code
 
 
@@ -69,7 +69,9 @@ def inlined(function: _Function) -> _Function:
     import numba
 
     function = inspect.unwrap(function)
-    inside = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, nogil=True)
+    inside = numba.njit(
+        forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, nogil=True, error_model="numpy"
+    )
     machine_code: _Function = inside(function)
     return machine_code
 

@@ -137,17 +137,16 @@ class GradientUpdate(NetworkUpdate):
 
     def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
         """Losses: policy, minus the objective without entropy, before the step; grad_norm, before clipping."""
-        made = Forward(network, input_N)
-        logits_NA = made.output_ND.requires_grad_()
-        log_NA = logits_NA.log_softmax(-1)
-        policy_loss = -(batch.weight_N @ (log_NA.exp() * batch.advantage_NA.float()).sum(-1))
-        coef = self.options.entropy_coef
-        bonus = batch.weight_N @ entropy(log_NA) if coef else 0.0
-        loss = policy_loss - coef * bonus
-        (down_NA,) = torch.autograd.grad(loss, logits_NA)
-        norm = self.step(network, made, loss, down_NA)
-        losses = {"policy": float(policy_loss.detach()), "grad_norm": norm}
-        return Move(log_NA.detach(), log_probs(network, input_N), losses)
+        made, coef = Forward(network, input_N), self.options.entropy_coef
+        log_NA, slope_NA = made.output_ND.log_softmax(-1), batch.advantage_NA.float()
+        pi_NA = log_NA.exp()
+        policy_loss = loss = -(batch.weight_N @ (pi_NA * slope_NA).sum(-1))
+        if coef:
+            # sum_a pi (adv - coef (log pi + 1)) d log pi  is the change of the objective of a state.
+            loss, slope_NA = loss - coef * (batch.weight_N @ entropy(log_NA)), slope_NA - coef * (log_NA + 1)
+        down_NA = -batch.weight_N[:, None] * slope_NA * pi_NA
+        norm = self.step(network, made, loss, through_log_softmax(log_NA, down_NA))
+        return Move(log_NA, log_probs(network, input_N), {"policy": float(policy_loss), "grad_norm": norm})
 
 
 @final

@@ -3,6 +3,7 @@
 import itertools
 import math
 import pickle
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +46,11 @@ def take_much_memory(steps: dict[Query, Step]) -> bool:
     """Whether answers should be dropped, by the mean size of some of them."""
     some = list(itertools.islice(steps.values(), 0, None, math.ceil(len(steps) / _MEASURED) or 1))
     return bool(some) and sum(map(_bytes_of, some)) / len(some) * len(steps) > _MOST_BYTES
+
+
+def observed(observation: Any, observe: Callable[[Any], Any] | None) -> Any:
+    """What is remembered of an observation: a copy, because an environment may write into its arrays."""
+    return copied(observe(observation) if observe else observation)
 
 
 def copied(observation: Any) -> Any:

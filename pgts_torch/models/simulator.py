@@ -81,7 +81,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         check_count("action_repeat", action_repeat)
         if action_repeat > 1 and highest_value < math.inf:
             raise PgtsError(f"highest_value is {highest_value}; under repeated actions no bound of v* stays one")
-        self._stepper = stepper = Stepper(env, gamma=gamma, actions=actions, adapter=adapter, observe=self._observed)
+        self._stepper = stepper = Stepper(env, gamma=gamma, actions=actions, adapter=adapter, observe=observe)
         super().__init__(stepper.name, stepper.space, observe, device)
         self.action_repeat, self.adapter, self.actions = action_repeat, stepper.adapter, stepper.actions
         self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value

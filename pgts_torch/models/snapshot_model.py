@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.answers import Seen, copied
+from pgts_torch.models.answers import Seen, observed
 from pgts_torch.models.base import Model
 from pgts_torch.models.snapshots import Snapshot
 
@@ -47,12 +47,8 @@ class SnapshotModel(Model):
         """The number of a state: a new one if no equal state was met before."""
         number = self._enter(Seen(snapshot))
         if observation is not None and self._seen[number].observation is None:
-            self._seen[number].observation = self._observed(observation)
+            self._seen[number].observation = observed(observation, self._observe)
         return number
-
-    def _observed(self, observation: Any) -> Any:
-        """What is remembered of an observation: copied, as an environment may write into its arrays."""
-        return copied(self._observe(observation) if self._observe else observation)
 
     def _enter(self, seen: Seen) -> int:
         """The number of a state. What is known of its observation here or there is then known in both."""

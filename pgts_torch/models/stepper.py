@@ -9,7 +9,7 @@ from gymnasium import spaces
 from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.actions import all_actions
 from pgts_torch.models.adapters import adapter_for
-from pgts_torch.models.answers import Seen, Step
+from pgts_torch.models.answers import Seen, Step, observed
 from pgts_torch.models.chance import Chance
 from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.rewards import RewardRange
@@ -27,8 +27,7 @@ class Stepper:
     steps: how often it was stepped.   chance: its generator, watched.
 
     Args:
-        env, gamma, actions, adapter: as in `SimulatorModel`, which says what is raised.
-        observe: what is kept of an observation.
+        env, gamma, actions, adapter, observe: as in `SimulatorModel`, which says what is raised.
     """
 
     def __init__(
@@ -38,7 +37,7 @@ class Stepper:
         gamma: float,
         actions: Sequence[Any] | None,
         adapter: SnapshotAdapter | None,
-        observe: Callable[[Any], Any],
+        observe: Callable[[Any], Any] | None,
     ) -> None:
         self.made = EnvSource.of(env).make_one()
         self.name = env_name(self.made)
@@ -134,4 +133,4 @@ class Stepper:
             observation = self.transforms.observation(observation)
             if isinstance(self.space, spaces.Box):
                 observation = np.asarray(observation, self.space.dtype)
-        return self._observe(observation)
+        return observed(observation, self._observe)

@@ -14,6 +14,7 @@ from pgts_torch.search.lookahead import Leaves
 from pgts_torch.search.memory import check_memory, check_nodes, tree_nodes
 from pgts_torch.search.split import Rule
 from pgts_torch.search.topology import Topology
+from pgts_torch.seeding import sample_keys
 
 _ROOM = 2**20
 """The most edges of all trees that grow side by side, if there is more than one tree."""
@@ -66,10 +67,13 @@ class Forest:
         self._learn(self._wanted_N[:reached].sort().values)
         self._make_trees()
 
-    @property
-    def prior_BA(self) -> Float[Tensor, "B A"]:
-        """The prior at the roots."""
-        return self._prior_TA[torch.from_numpy(self._state_S["row"][self._root_B.numpy()])]
+    def preference(self, generator: torch.Generator | None) -> Float[Tensor, "B A"]:
+        """log prior(a) of the roots, plus standard Gumbel noise if there is a generator."""
+        preference_BA = self._prior_TA[torch.from_numpy(self._state_S["row"][self._root_B.numpy()])].log()
+        if generator is not None:
+            key = sample_keys(1, generator=generator).numpy().view(np.uint64)[0]
+            self._kernels.add_noise(key, self._root_B.numpy(), preference_BA.numpy())
+        return preference_BA
 
     @property
     def nodes_per_level(self) -> tuple[int, ...]:
@@ -107,8 +111,8 @@ class Forest:
     def _query(self, state_N: Int[Tensor, "N"]) -> None:
         """Have the outcomes of these states in the table, and room for the states that the model has met by then."""
         missing = self._table.missing(state_N)
-        self._check_memory(len(state_N), len(missing))
         if len(missing):
+            self._check_memory(len(state_N), len(missing))
             self._topology.step(missing)
         more = len(self._table.row_S) - len(self._state_S)
         if more:

@@ -27,6 +27,11 @@ _TINY = float(np.finfo(np.float64).tiny)
 _VISITS, _SCALE = 50.0, 0.1
 """As in `split`."""
 
+_ODD = np.uint64(0x9E3779B97F4A7C15)
+_FACTORS = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_27, _30, _31, _11 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(11)
+"""Of SplitMix64, as in `seeding`. All numbers are unsigned: with others numba makes them floats."""
+
 STATE = np.dtype([("v", "f8"), ("row", "i8")])
 """v: the critic's value; NaN where it is not known, infinite where the critic is to be called.
 row: of the prior, where the outcomes of the state and the values of its children are known too."""
@@ -367,6 +372,24 @@ def search(  # type: ignore[no-untyped-def]
                     _open_mass(node, arm, edge, rules, root, x.nodes, mass_N, mass_BA, x.root)
                 x.root = -1
     return num_wanted
+
+
+@inlined
+def _avalanche(x):  # type: ignore[no-untyped-def]
+    """As in `seeding`."""
+    x = (x ^ (x >> _30)) * _FACTORS[0]
+    x = (x ^ (x >> _27)) * _FACTORS[1]
+    return x ^ (x >> _31)
+
+
+@jit
+def add_noise(key, state_B, noise_BA):  # type: ignore[no-untyped-def]
+    """Add standard Gumbel noise, the same for equal keys, states and actions: `seeding.uniform` of `seeding.mix`."""
+    for b in range(len(state_B)):
+        of_state = _avalanche(key * _ODD + np.uint64(state_B[b]))
+        for a in range(noise_BA.shape[1]):
+            bits = _avalanche(_avalanche(of_state * _ODD + np.uint64(a)) + _ODD) >> _11
+            noise_BA[b, a] -= math.log(-math.log(max(float(bits) * 2.0**-53, _TINY)))
 
 
 @inlined

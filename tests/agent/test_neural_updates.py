@@ -337,6 +337,24 @@ def test_a_number_that_is_not_finite_changes_nothing_and_is_named(update, value)
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
 
 
+@pytest.mark.parametrize("entropy_coef", [0.0, 0.3])
+def test_a_policy_gradient_is_that_of_autograd(entropy_coef):
+    generator, options = stream(1, "step"), MLP(hidden=(7,))
+    policy, same = (NetworkPolicy(spaces.Box(-9, 9, (4,)), 3, options) for _ in range(2))
+    observation_ND = torch.randn(20, 4, generator=generator)
+    advantage_NA = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    weight_N = torch.rand(20, generator=generator, dtype=torch.float64)
+    given = Gradient(learning_rate=0.5, optimizer="sgd", max_grad_norm="never", entropy_coef=entropy_coef)
+    before = [weight.detach().clone() for weight in same.network.weights]
+    GradientUpdate(given)(policy, Batch(observation_ND, advantage_NA, weight_N), generator=generator)
+    pi_NA = same.network(observation_ND).softmax(-1)
+    gain_N = (pi_NA * (advantage_NA - entropy_coef * pi_NA.log())).sum(-1)
+    pulls = torch.autograd.grad((weight_N * gain_N).sum(), same.network.weights)
+    for moved, start, pull in zip(policy.network.weights, before, pulls, strict=True):
+        torch.testing.assert_close(moved, start + 0.5 * pull)
+        assert not torch.allclose(moved, start, atol=1e-4)
+
+
 @pytest.mark.parametrize("options", [MLP(hidden=()), MLP(), MLP(hidden=(7, 5), activation="relu"), CNN()])
 def test_gradients_that_are_written_out_have_the_bits_of_autograd(options):
     shape = (7, 7, 3) if isinstance(options, CNN) else (4,)

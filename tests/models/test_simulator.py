@@ -2,6 +2,7 @@
 
 import copy
 import math
+import weakref
 from typing import Any, ClassVar
 
 import gymnasium
@@ -344,6 +345,15 @@ def test_a_batch_of_calls_reads_no_generator_and_makes_as_many_tensors_as_one(co
     checks, tensors = counting(monkeypatch, stepper, "check_observation"), counting(monkeypatch, torch, "tensor")
     model.outcomes(root_B[1:])
     assert (len(states), len(seeds), len(checks), len(tensors)) == (0, 0, 2 * count, 3)
+
+
+def test_a_model_that_nobody_needs_is_gone_at_once():
+    # A cycle of references would keep all of its states until the garbage collector has looked through all objects.
+    model = SimulatorModel("CartPole-v1", gamma=0.9)
+    model.outcomes(torch.tensor([model.root(reset(gymnasium.make("CartPole-v1"), 0))]))
+    is_alive = weakref.ref(model)
+    del model
+    assert is_alive() is None
 
 
 class Gusty(Corridor):

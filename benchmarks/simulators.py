@@ -1,0 +1,117 @@
+"""What does a call of a simulator cost, beside the environment's own step?
+
+    python benchmarks/simulators.py [--json FILE] [--quick]
+
+A call is what a lookahead pays for one state and action: restore, step, check, take a snapshot, number it. The step
+alone is that of the bare environment, with and without its observation where the model makes none; it walks on by
+random actions and is reset where an episode ends. Full search without a critic, so that no observation of MiniGrid is
+drawn. CPU microseconds of one thread, medians of repeats in turns after a first one, which does not count. What is not
+installed is left out.
+"""
+
+import importlib.util
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import common
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
+
+from pgts_torch.models import SimulatorModel
+from pgts_torch.models.actions import all_actions, sampled_actions
+from pgts_torch.models.adapters import adapter_for
+from pgts_torch.models.environments import EnvSource
+from pgts_torch.search import Topology, expectimax
+
+STICKY = {"repeat_action_probability": 0.0}
+CASES: dict[str, tuple[str, Any, dict[str, Any], int, int]] = {
+    "CartPole": ("gymnasium", CartPoleEnv, {}, 8, 8),
+    "Acrobot": ("gymnasium", AcrobotEnv, {}, 5, 8),
+    "Taxi": ("gymnasium", "Taxi-v4", {}, 8, 8),
+    "DoorKey-5x5": ("minigrid", "MiniGrid-DoorKey-5x5-v0", {}, 5, 10),
+    "Breakout, RAM": ("ale_py", "ALE/Breakout-v5", STICKY | {"obs_type": "ram"}, 3, 2),
+    "Breakout": ("ale_py", "ALE/Breakout-v5", STICKY, 2, 2),
+    "InvertedPendulum": ("mujoco", "InvertedPendulum-v5", {}, 2, 4),
+    "Ant": ("mujoco", "Ant-v5", {}, 2, 2),
+}
+"""What must be installed, what is made with which arguments, the depth m and the number of roots."""
+
+ACTIONS = 4
+"""How many actions are taken of continuous ones."""
+
+STEPS = 400
+
+
+def made(case: tuple[str, Any, dict[str, Any], int, int]) -> Callable[[], gymnasium.Env]:
+    """What makes the bare environment."""
+    _, kind, kwargs, _, _ = case
+    return kind if callable(kind) else lambda: EnvSource.of(kind, kwargs=kwargs).make_one()
+
+
+def actions_of(env: gymnasium.Env) -> list[Any]:
+    space = env.action_space
+    return sampled_actions(space, ACTIONS, seed=0) if isinstance(space, gymnasium.spaces.Box) else [*all_actions(space)]
+
+
+def step_cost(env: Any, *, is_blind: bool) -> float:
+    """CPU microseconds of a step of the environment itself.
+
+    Args:
+        is_blind: its steps make no observation, if the model's do not.
+    """
+    if is_blind and adapter_for(env).skip_observations(env) is None:
+        return float("nan")
+    random, actions = np.random.default_rng(0), actions_of(env)
+    chosen = random.integers(len(actions), size=STEPS)
+    env.reset(seed=0)
+    spent = 0.0
+    for a in chosen:
+        begin = time.thread_time()
+        _, _, terminated, truncated, _ = env.step(actions[a])
+        spent += time.thread_time() - begin
+        if terminated or truncated:
+            env.reset()
+    return spent / STEPS * 1e6
+
+
+def call_cost(case: tuple[str, Any, dict[str, Any], int, int]) -> tuple[float, int]:
+    """CPU microseconds of a call in a full search that begins with a new model, and how many calls it made."""
+    make, (*_, depth, roots) = made(case), case
+    model, envs = SimulatorModel(make, gamma=0.99, actions=actions_of(make())), [make() for _ in range(roots)]
+    seen = [env.reset(seed=seed)[0] for seed, env in enumerate(envs)]
+    root_B = model.roots(envs, seen)
+    begin = time.thread_time()
+    expectimax(model, root_B, depth=depth, v_leaf=lambda state_N: torch.zeros(len(state_N)), topology=Topology(model))
+    return (time.thread_time() - begin) / model.simulator_steps * 1e6, model.simulator_steps
+
+
+def main(arguments: list[str] | None = None) -> None:
+    args = common.parser(__doc__).parse_args(arguments)
+    common.use_one_core()
+    report: dict[str, Any] = {"about": common.about(args)}
+    print(f"{'us':18}{'m':>3}{'calls':>8}{'a call':>10}{'a step':>10}{'blind':>10}{'call / step':>13}")
+    for name, case in CASES.items():
+        if not importlib.util.find_spec(case[0]):
+            print(f"{case[0]} is not installed: {name} is left out", file=sys.stderr)
+            continue
+        base = made(case)().unwrapped
+        blind = made(case)().unwrapped
+        rounds = [
+            (*call_cost(case), step_cost(base, is_blind=False), step_cost(blind, is_blind=True))
+            for _ in range(3 if args.quick else 6)
+        ][1:]
+        call, calls, step, unseen = (statistics.median(column) for column in zip(*rounds, strict=True))
+        report[name] = {"call": call, "calls": calls, "step": step, "blind": unseen}
+        text = "-" if unseen != unseen else f"{unseen:.1f}"
+        cheapest = step if unseen != unseen else unseen
+        print(f"{name:18}{case[3]:3}{calls:8.0f}{call:10.1f}{step:10.1f}{text:>10}{call / cheapest:13.1f}", flush=True)
+    common.write(report, args.json)
+
+
+if __name__ == "__main__":
+    main()
