@@ -38,8 +38,7 @@ class UniformReplay(Part):
     steep places of the value add up along the way to the goal."""
 
     search_every: Count | None = null(tables=1, vectors=4, images=1)
-    """The policy is updated by a lookahead from every so-manieth visit of an imagined episode; the critic learns from
-    all of them."""
+    """The lookahead starts from one visit of an imagined episode in so many; the critic learns from all of them."""
 
     polyak: Share = 0.5
     """The step of the slow copy of a network policy toward it after each update. Imagined episodes follow the copy, and
