@@ -14,6 +14,7 @@ from pgts_torch.search.lookahead import Leaves
 from pgts_torch.search.memory import check_memory, check_nodes, tree_nodes
 from pgts_torch.search.split import Rule
 from pgts_torch.search.topology import Topology
+from pgts_torch.search.tree_records import ARM, EDGE, LANE, NEW, NODE, SLOT, STATE, WANTED
 from pgts_torch.seeding import sample_keys
 
 _ROOM = 2**20
@@ -40,9 +41,10 @@ class Forest:
 
     def __init__(self, leaves: Leaves, topology: Topology, options: MCTS, root_B: Int[Tensor, "B"]) -> None:
         # Numba is imported with these.
-        from pgts_torch.search import tree_kernels
+        from pgts_torch.search import state_kernels, tree_kernels
 
-        self._kernels: Any = tree_kernels
+        self._tree_kernels: Any = tree_kernels
+        self._state_kernels: Any = state_kernels
         self._leaves, self._topology, self._options = leaves, topology, options
         self._root_B, self._table, self._A = root_B, topology.table, topology.model.num_actions
         self._trees: Any = None
@@ -50,7 +52,7 @@ class Forest:
         num_states, B, bottom = topology.model.num_states, len(root_B), leaves.expansions
         most = min(num_states, B * options.simulations)
         self._places = bottom + B * (5 * self._A + 4) + most
-        self._state_S = np.empty(0, tree_kernels.STATE)
+        self._state_S = np.empty(0, STATE)
         # One row if priors are uniform.
         self._prior_TA = torch.full((int(options.prior == "uniform"), self._A), 1 / self._A, dtype=torch.float64)
         self._check_memory(0)
@@ -61,9 +63,9 @@ class Forest:
         self._query(root_B)
         # The critic is called at once for what simulations may reach, as far as the outcomes are known.
         self._wanted_N[:B] = root_B
-        self._state_S["row"][root_B.numpy()] = tree_kernels.WANTED
+        self._state_S["row"][root_B.numpy()] = WANTED
         wanted_N, levels = self._wanted_N.numpy()[:most], min(bottom, options.simulations) - 1
-        reached = self._kernels.reach(*self._outcomes, self._state_S, wanted_N, B, levels)
+        reached = self._state_kernels.reach(*self._outcomes, self._state_S, wanted_N, B, levels)
         self._learn(self._wanted_N[:reached].sort().values)
         self._make_trees()
 
@@ -72,7 +74,7 @@ class Forest:
         preference_BA = self._prior_TA[torch.from_numpy(self._state_S["row"][self._root_B.numpy()])].log()
         if generator is not None:
             key = sample_keys(1, generator=generator).numpy().view(np.uint64)[0]
-            self._kernels.add_noise(key, self._root_B.numpy(), preference_BA.numpy())
+            self._state_kernels.add_noise(key, self._root_B.numpy(), preference_BA.numpy())
         return preference_BA
 
     @property
@@ -92,7 +94,7 @@ class Forest:
         begun, scratch = np.zeros(1, np.int64), (np.empty(A), np.empty(A, np.int64))
         given = [x.numpy() for x in (self._root_B, preference_BA.double(), *found, self._wanted_N)]
         while True:
-            count = self._kernels.search(
+            count = self._tree_kernels.search(
                 *(*self._outcomes, self._state_S, self._prior_TA.numpy(), *self._trees, self._rules),
                 *(*given, begun, self._valued_L.numpy(), np.empty(self._rules.room), *scratch),
             )
@@ -116,8 +118,8 @@ class Forest:
             self._topology.step(missing)
         more = len(self._table.row_S) - len(self._state_S)
         if more:
-            new_S = _records((more,), self._kernels.STATE)
-            new_S[...] = (math.nan, self._kernels.NEW)
+            new_S = _records((more,), STATE)
+            new_S[...] = (math.nan, NEW)
             self._state_S = np.concatenate([self._state_S, new_S])
 
     def _learn(self, state_N: Int[Tensor, "N"]) -> None:
@@ -125,7 +127,7 @@ class Forest:
         self._check_memory(len(state_N))
         edges = len(state_N) * self._A * self._table.num_outcomes
         child_C = torch.empty(min(edges, len(self._state_S)), dtype=torch.int64)
-        count = self._kernels.children(*self._outcomes, self._state_S, state_N.numpy(), child_C.numpy())
+        count = self._state_kernels.children(*self._outcomes, self._state_S, state_N.numpy(), child_C.numpy())
         if count:
             child_C = child_C[:count].sort().values
             self._state_S["v"][child_C.numpy()] = self._leaves.v(child_C).numpy(force=True)
@@ -146,13 +148,13 @@ class Forest:
     def _make_trees(self) -> None:
         """Room for the trees, and what is in them already: outcomes of an action may have become more."""
         options, A, B, K, before = self._options, self._A, len(self._root_B), self._table.num_outcomes, self._trees
-        bottom, kernels = self._leaves.expansions, self._kernels
+        bottom = self._leaves.expansions
         room = int(min(options.simulations, tree_nodes(1, A * K, bottom - 1)))
         W = min(B, max(1, _ROOM // (room * A * K))) if before is None else len(before[3])
         self._nodes = W * room
         self._check_memory(0)
         shapes = (W * room,), (W * room, A), (W * room, A, K), (W,), (W, A)
-        kinds = kernels.NODE, kernels.ARM, kernels.EDGE, kernels.SLOT, kernels.LANE
+        kinds = NODE, ARM, EDGE, SLOT, LANE
         self._trees = [_records(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
         if before is None:
             self._trees[3]["root"] = -1
@@ -165,7 +167,7 @@ class Forest:
                 rows[...] = old.reshape(W, -1, *old.shape[1:])
         phases = 0 if options.root == "rule" else max(1, math.ceil(math.log2(A)))
         exploration = 1.25 if options.exploration is None else options.exploration
-        self._rules = kernels.Rules(
+        self._rules = self._tree_kernels.Rules(
             room,
             bottom,
             options.simulations,

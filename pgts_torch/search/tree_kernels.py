@@ -14,9 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pgts_torch.compiled import inlined, jit
-
-NEW, WANTED = -1, -2
-"""The `row` of a state that no tree has reached, and of one that is to be made known."""
+from pgts_torch.search.tree_records import NEW, WANTED
 
 GUMBEL, PUCT, UCT = 0, 1, 2
 """The rules of `Selection`."""
@@ -26,35 +24,6 @@ _TIE = 1e-8
 _TINY = float(np.finfo(np.float64).tiny)
 _VISITS, _SCALE = 50.0, 0.1
 """As in `split`."""
-
-_ODD = np.uint64(0x9E3779B97F4A7C15)
-_FACTORS = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-_27, _30, _31, _11 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(11)
-"""Of SplitMix64, as in `seeding`. All numbers are unsigned: with others numba makes them floats."""
-
-STATE = np.dtype([("v", "f8"), ("row", "i8")])
-"""v: the critic's value; NaN where it is not known, infinite where the critic is to be called.
-row: of the prior, where the outcomes of the state and the values of its children are known too."""
-
-NODE = np.dtype([(name, "i8" if name == "row" else "i4") for name in ("row", "level", "open", "parent", "action", "k")])
-"""row: in the table of outcomes.   open: how many actions are.   parent, action, k: the edge that leads to the node;
-the parent of a root is -1."""
-
-ARM = np.dtype([("q", "f8"), ("reward", "f8"), ("prior", "f8"), ("visits", "i4"), ("open", "i4")])
-"""A node and an action.   open: how many outcomes have something below that is to be expanded."""
-
-EDGE = np.dtype([("value", "f8"), ("weight", "f8"), ("prob", "f8"), ("below", "i4"), ("visits", "i4")])
-"""A node, an action and an outcome.   value: what q is backed up from.   weight: p gamma, 0 for an outcome that does
-not count.   prob: -1 where nothing below is to be expanded.   below: the child."""
-
-SLOT = np.dtype([(name, "i4") for name in ("root", "nodes", "used", "phase", "width", "waves", "ranked", "waiting")])
-"""root: -1 where the slot is empty.   used: simulations.   phase, width, waves: of sequential halving, its round, how
-many actions it has and simulations of each are left.   ranked: `width` when the actions were last ranked.   waiting:
-simulations that are under way."""
-
-LANE = np.dtype([(name, "i4") for name in ("survives", "node", "action", "k")])
-"""One for each slot and action. survives: whether the action is left in sequential halving.   node, action, k: the edge
-where one of the simulations under way has ended."""
 
 
 class Rules(NamedTuple):
@@ -303,11 +272,13 @@ def search(  # type: ignore[no-untyped-def]
     q_BA, mass_BA, wanted, begun, valued_L, mass_N, score_A, class_A,
 ):  # fmt: skip
     """Go on with all searches. Return how many states are wanted, which are listed in `wanted`; -1 where the nodes are
-    too many. It is over when none is wanted.
+    too many. It is over when none is wanted. It is one function because parts of it as `inlined` ones cost a tenth of
+    its time.
 
     Args:
         reward, prob, discount, child, table_row: the columns of the `OutcomeTable`.
-        state, prior, node, arm, edge, slot, lane: see above.
+        state, prior: what is known of states, and rows of priors.   node, arm, edge, slot, lane: see `tree_records`.
+        preference: what is added to sigma(q) in sequential halving.
         root_B: states that are known.
         q_BA, mass_BA: what is found, as in `Lookahead`.
         begun: one number, how many roots have had a slot.
@@ -372,69 +343,3 @@ def search(  # type: ignore[no-untyped-def]
                     _open_mass(node, arm, edge, rules, root, x.nodes, mass_N, mass_BA, x.root)
                 x.root = -1
     return num_wanted
-
-
-@inlined
-def _avalanche(x):  # type: ignore[no-untyped-def]
-    """As in `seeding`."""
-    x = (x ^ (x >> _30)) * _FACTORS[0]
-    x = (x ^ (x >> _27)) * _FACTORS[1]
-    return x ^ (x >> _31)
-
-
-@jit
-def add_noise(key, state_B, noise_BA):  # type: ignore[no-untyped-def]
-    """Add standard Gumbel noise, the same for equal keys, states and actions: `seeding.uniform` of `seeding.mix`."""
-    for b in range(len(state_B)):
-        of_state = _avalanche(key * _ODD + np.uint64(state_B[b]))
-        for a in range(noise_BA.shape[1]):
-            bits = _avalanche(_avalanche(of_state * _ODD + np.uint64(a)) + _ODD) >> _11
-            noise_BA[b, a] -= math.log(-math.log(max(float(bits) * 2.0**-53, _TINY)))
-
-
-@inlined
-def _has_weight(reward, prob, discount, r, a, k):  # type: ignore[no-untyped-def]
-    """As `outcome_table.has_weight`, of one outcome."""
-    return prob[r, a, k] > 0 and discount[r, a, k] > 0 and reward[r, a] > -np.inf
-
-
-@jit
-def reach(reward, prob, discount, child, table_row, state, wanted, count, levels):  # type: ignore[no-untyped-def]
-    """Add the states that follow the first `count` wanted ones within so many levels, as far as their outcomes are
-    known and there is room; how many are wanted now."""
-    A, K = prob.shape[1:]
-    first, last = 0, count
-    for _ in range(levels):
-        for i in range(first, last):
-            r = table_row[wanted[i]]
-            for a in range(A):
-                for k in range(K):
-                    s = child[r, a, k]
-                    if not _has_weight(reward, prob, discount, r, a, k) or state[s].row != NEW or table_row[s] < 0:
-                        continue
-                    if count == len(wanted):
-                        return count
-                    state[s].row = WANTED
-                    wanted[count] = s
-                    count += 1
-        first, last = last, count
-        if first == last:
-            break
-    return count
-
-
-@jit
-def children(reward, prob, discount, child, table_row, state, state_N, child_C):  # type: ignore[no-untyped-def]
-    """List the children of these states of which the critic's values are not known, each once; how many there are."""
-    A, K = prob.shape[1:]
-    count = 0
-    for i in range(len(state_N)):
-        r = table_row[state_N[i]]
-        for a in range(A):
-            for k in range(K):
-                s = child[r, a, k]
-                if _has_weight(reward, prob, discount, r, a, k) and math.isnan(state[s].v):
-                    state[s].v = np.inf
-                    child_C[count] = s
-                    count += 1
-    return count

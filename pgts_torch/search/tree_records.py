@@ -1,0 +1,30 @@
+"""What `tree_kernels` and `state_kernels` know of states and nodes, as records."""
+
+import numpy as np
+
+NEW, WANTED = -1, -2
+"""The `row` of a state that no tree has reached, and of one that is to be made known."""
+
+STATE = np.dtype([("v", "f8"), ("row", "i8")])
+"""v: the critic's value; NaN where it is not known, infinite where the critic is to be called.
+row: of the prior, where the outcomes of the state and the values of its children are known too."""
+
+NODE = np.dtype([(name, "i8" if name == "row" else "i4") for name in ("row", "level", "open", "parent", "action", "k")])
+"""row: in the table of outcomes.   open: how many actions are.   parent, action, k: the edge that leads to the node;
+the parent of a root is -1."""
+
+ARM = np.dtype([("q", "f8"), ("reward", "f8"), ("prior", "f8"), ("visits", "i4"), ("open", "i4")])
+"""A node and an action.   open: how many outcomes have something below that is to be expanded."""
+
+EDGE = np.dtype([("value", "f8"), ("weight", "f8"), ("prob", "f8"), ("below", "i4"), ("visits", "i4")])
+"""A node, an action and an outcome.   value: what q is backed up from.   weight: p gamma, 0 for an outcome that does
+not count.   prob: -1 where nothing below is to be expanded.   below: the child."""
+
+SLOT = np.dtype([(name, "i4") for name in ("root", "nodes", "used", "phase", "width", "waves", "ranked", "waiting")])
+"""root: -1 where the slot is empty.   used: simulations.   phase, width, waves: of sequential halving, its round, how
+many actions it has and simulations of each are left.   ranked: `width` when the actions were last ranked.   waiting:
+simulations that are under way."""
+
+LANE = np.dtype([(name, "i4") for name in ("survives", "node", "action", "k")])
+"""One for each slot and action. survives: whether the action is left in sequential halving.   node, action, k: the edge
+where one of the simulations under way has ended."""
