@@ -36,7 +36,7 @@ print(sum(total.stats.cache_hits.values()))
 def call(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """In a new process: what it prints is how many compiled functions were found on disk."""
     code = CALL.format(folder=str(folder))
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=120)
 
 
 @pytest.fixture
