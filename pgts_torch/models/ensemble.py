@@ -1,7 +1,6 @@
 """Dynamics learned from the steps of an environment: an ensemble of networks."""
 
 import copy
-import itertools
 import math
 import warnings
 from typing import Any, final
@@ -12,6 +11,7 @@ from torch import Tensor, nn
 
 from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.models.base import Experience, FallibleModel, LearningModel, Transitions
+from pgts_torch.models.ensemble_networks import EnsembleNetworks
 from pgts_torch.models.held_out import BLOCK, held_out_rows, prediction_errors
 from pgts_torch.models.prediction import Prediction
 from pgts_torch.models.replay import ReplayBuffer
@@ -19,9 +19,6 @@ from pgts_torch.models.rewards import value_range
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options.models import Ensemble
 from pgts_torch.seeding import stream, uniform
-
-_CLIP = 8.0
-"""Standardised inputs are clipped to +- this."""
 
 _SELDOM = 0.02
 """Smaller probabilities of an end count as 0: a classifier never returns 0, and over many steps small ones add up."""
@@ -88,29 +85,17 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
             state=vectors, action=whole, reward=none, end=none, next_state=vectors, follows=flags, copies=copies
         )
         self._warned, self._end_share = False, 0.0
-        sizes = [state_size + num_actions, *options.hidden, state_size + 2]
-        generator = stream(seed, "model")
-        # the weight [E, inputs, outputs] and the bias [E, 1, outputs] of each layer
-        self._layers = [
-            (
-                self._parameter(torch.randn(options.members, a, b, generator=generator) / a**0.5),
-                self._parameter(torch.zeros(options.members, 1, b)),
-            )
-            for a, b in itertools.pairwise(sizes)
-        ]
-        self._layers[-1][0].data.mul_(0.1)  # at first all members predict little but the mean
-        self._weights = [weight for layer in self._layers for weight in layer]
-        self._optimiser = torch.optim.Adam(
-            self._weights, lr=options.learning_rate, weight_decay=options.weight_decay, fused=True
+        self._networks = EnsembleNetworks(
+            state_size,
+            num_actions,
+            options.members,
+            options.hidden,
+            generator=stream(seed, "model"),
+            device=self.device,
         )
-        # mean and standard deviation of states, of their changes and of rewards
-        self._moments = {
-            name: (torch.zeros(size, device=self.device), torch.ones(size, device=self.device))
-            for name, size in (("state", state_size), ("change", state_size), ("reward", 1))
-        }
-
-    def _parameter(self, value: Tensor) -> nn.Parameter:
-        return nn.Parameter(value.to(self.device))
+        self._optimiser = torch.optim.Adam(
+            self._networks.weights, lr=options.learning_rate, weight_decay=options.weight_decay, fused=True
+        )
 
     @torch.inference_mode(False)
     @torch.enable_grad()
@@ -176,34 +161,8 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
 
     def _measure_moments(self) -> None:
         state_ND, next_ND, reward_N = (self.replay.rows(name) for name in ("state", "next_state", "reward"))
-        for name, value in (("state", state_ND), ("change", next_ND - state_ND), ("reward", reward_N[:, None])):
-            mean, deviation = value.mean(0), value.std(0, correction=0)
-            if not bool((mean + deviation).isfinite().all()):
-                raise NotFinite(
-                    f"the mean of {name}s is {mean.tolist()}; what a model learns must be finite", what="model"
-                )
-            self._standardise(name, mean.to(self.device), deviation.to(self.device))
-
-    @torch.no_grad()
-    def _standardise(self, name: str, mean: Tensor, deviation: Tensor) -> None:
-        """Take a new mean and deviation, and rescale the weights so that what is predicted stays the same, but where
-        numbers were or are constant, or inputs clipped (as PopArt, van Hasselt et al. 2016)."""
-        old_mean, old_deviation = self._moments[name]
-        self._moments[name] = mean, deviation
-        if self.generation == 0:  # nothing is predicted yet
-            return
-        varies = (deviation > 0) & (old_deviation > 0)
-        ratio = torch.where(varies, deviation / old_deviation, 1.0)
-        shift = torch.where(varies, (mean - old_mean) / old_deviation, 0.0)
-        if name == "state":  # inputs x become (x - shift) / ratio
-            weight, bias = self._layers[0]
-            bias.add_((shift @ weight[:, : self.state_size])[:, None])
-            weight[:, : self.state_size] *= ratio[:, None]
-            return
-        weight, bias = self._layers[-1]  # outputs, and what they are aimed at
-        of = slice(0, self.state_size) if name == "change" else slice(self.state_size, self.state_size + 1)
-        weight[..., of] /= ratio
-        bias[..., of] = (bias[..., of] - shift) / ratio
+        seen = {"state": state_ND, "change": next_ND - state_ND, "reward": reward_N[:, None]}
+        self._networks.measure(seen, rescale=self.generation > 0)  # before nothing is predicted
 
     def _fit(self, trained: Int[Tensor, "R"], ended: Int[Tensor, "Q"], generator: torch.Generator) -> float:
         """Take one gradient step, with a minibatch for each member. Return the loss.
@@ -225,8 +184,9 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         # of ends has no such weight: their log odds are corrected by `_log_odds_added`.
         copies = self.replay.rows("copies")[at, torch.arange(E)[:, None]].flatten().to(self.device)
         weight = copies / (1 - _ENDS + _ENDS * end / self._end_share) if extra else copies
-        output = self._outputs(self._inputs(state, action).view(E, N, -1)).reshape(E * N, -1)
-        aimed = torch.cat([self._scaled("change", after - state), self._scaled("reward", reward[:, None])], -1)
+        output = self._networks.outputs(self._networks.inputs(state, action).view(E, N, -1)).reshape(E * N, -1)
+        scaled = self._networks.scaled
+        aimed = torch.cat([scaled("change", after - state), scaled("reward", reward[:, None])], -1)
         changes, rewards, logits = output.split([self.state_size, 1, 1], -1)
         loss = (
             weight @ nn.functional.smooth_l1_loss(changes, aimed[:, :-1], reduction="none").mean(-1) / len(weight)
@@ -241,35 +201,21 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         self._optimiser.step()
         return value
 
-    def _scaled(self, name: str, value: Tensor) -> Tensor:
-        """The standardised value: (value - mean) / deviation; 0 where it has been constant."""
-        mean, deviation = self._moments[name]
-        return torch.where(deviation > 0, (value - mean) / deviation, 0.0)
-
-    def _inputs(self, state_ND: Tensor, action_N: Tensor) -> Tensor:
-        one_hot_NA = nn.functional.one_hot(action_N, self.num_actions).float()
-        return torch.cat([self._scaled("state", state_ND).clamp(-_CLIP, _CLIP), one_hot_NA], -1)
-
-    def _outputs(self, x: Float[Tensor, "E N I"]) -> Float[Tensor, "E N O"]:
-        for weight, bias in self._layers[:-1]:
-            x = nn.functional.silu(torch.baddbmm(bias, x, weight))
-        return torch.baddbmm(self._layers[-1][1], x, self._layers[-1][0])
-
     @torch.no_grad()
     def members(self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]) -> Prediction:
         """The predictions of all members."""
-        output = self._outputs(self._inputs(state_ND, action_N).expand(self.options.members, -1, -1))
-        (change_mean, change_scale), (reward_mean, reward_scale) = self._moments["change"], self._moments["reward"]
-        next_END = state_ND + change_mean + change_scale * output[..., : self.state_size]
-        end_EN = (output[..., -1] - self._log_odds_added).sigmoid()
-        return Prediction(
-            next_END, reward_mean + reward_scale * output[..., -2], torch.where(end_EN < _SELDOM, 0.0, end_EN)
-        )
+        said = self._networks.predict(state_ND, action_N, self._log_odds_added)
+        return said._replace(end_EN=torch.where(said.end_EN < _SELDOM, 0.0, said.end_EN))
 
     @property
     def _log_odds_added(self) -> float:
         """By how much the log odds of an end are larger in minibatches than among all steps (King and Zeng 2001)."""
         return math.log1p(_ENDS / ((1 - _ENDS) * self._end_share)) if self._end_share else 0.0
+
+    @property
+    def _deviations(self) -> dict[str, Tensor]:
+        """Standard deviations of states, of their changes and of rewards."""
+        return {name: deviation for name, (_, deviation) in self._networks.moments.items()}
 
     def step(
         self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
@@ -288,7 +234,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
             return super().sample(state_N, action_N, key_N=key_N)
         self.simulator_steps += len(state_N)
         said = self.members(self.states(state_N), action_N)
-        trusted_N = said.disagreement(self._moments["state"][1]) <= self.options.max_disagreement
+        trusted_N = said.disagreement(self._deviations["state"]) <= self.options.max_disagreement
         reward_N, discount_N, next_ND = self._means(said)
         goes_on_N = uniform(key_N) * self.gamma < discount_N
         return Transitions(reward_N, self.gamma * goes_on_N.double(), self.number(next_ND), trusted_N)
@@ -302,13 +248,12 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         said = self.members(self.states(state_N).repeat_interleave(self.num_actions, 0), action_N)
         rewards = self.replay.rows("reward")
         low, high = value_range((float(rewards.min()), float(rewards.max())), self.gamma)
-        spread_N = said.spread(self._moments["state"][1], self.gamma * (high - low))
+        spread_N = said.spread(self._deviations["state"], self.gamma * (high - low))
         return spread_N.double().view(-1, self.num_actions)
 
     def _errors(self, held_out: Tensor) -> dict[str, float]:
         """The errors on held-out steps, by name (`learn`)."""
-        deviations = {name: deviation for name, (_, deviation) in self._moments.items()}
-        errors = prediction_errors(self.replay, held_out, self.step, deviations)
+        errors = prediction_errors(self.replay, held_out, self.step, self._deviations)
         if errors.get("unexplained", 0.0) > _UNEXPLAINED and len(self.replay) >= _ENOUGH_STEPS and not self._warned:
             self._warned = True
             warnings.warn(
@@ -320,36 +265,26 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         return errors
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights, optimiser, moments and replay."""
+        """Weights, moments, optimiser and replay."""
         return {
-            "weights": [weight.detach().cpu().clone() for weight in self._weights],
+            **self._networks.state_dict(),
             "optimiser": {
                 number: {name: value.cpu().clone() for name, value in each.items()}
                 for number, each in self._optimiser.state_dict()["state"].items()
             },
-            "moments": {name: [value.cpu() for value in pair] for name, pair in self._moments.items()},
             "replay": self.replay.state_dict(),
             "end_share": self._end_share,
             "warned": self._warned,
             "generation": self.generation,
         }
 
-    @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        shapes = [tuple(weight.shape) for weight in self._weights]
-        if (found := [tuple(weight.shape) for weight in state["weights"]]) != shapes:
-            raise PgtsError(f"the weights have shapes {found}; they must have {shapes}")
         check_count("generation", state["generation"], least=0)
-        for weight, value in zip(self._weights, state["weights"], strict=True):
-            weight.copy_(value)
-        groups = self._optimiser.state_dict()["param_groups"]
-        self._optimiser.load_state_dict({"state": copy.deepcopy(state["optimiser"]), "param_groups": groups})
-        self._moments = {
-            name: (mean.to(self.device), deviation.to(self.device))
-            for name, (mean, deviation) in state["moments"].items()
-        }
-        self.replay.load_state_dict(state["replay"])
         if not (isinstance(state["end_share"], float) and 0 <= state["end_share"] <= 1):
             raise PgtsError(f"end_share is {state['end_share']!r}; it must be a share")
+        self._networks.load_state_dict(state)
+        groups = self._optimiser.state_dict()["param_groups"]
+        self._optimiser.load_state_dict({"state": copy.deepcopy(state["optimiser"]), "param_groups": groups})
+        self.replay.load_state_dict(state["replay"])
         self._end_share = state["end_share"]
         self._warned, self.generation = bool(state["warned"]), state["generation"]

@@ -11,6 +11,7 @@ from torch import nn
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import Experience
 from pgts_torch.models.ensemble import EnsembleModel
+from pgts_torch.models.ensemble_networks import EnsembleNetworks
 from pgts_torch.models.rewards import value_range
 from pgts_torch.options import Ensemble
 from pgts_torch.search import expectimax
@@ -115,24 +116,23 @@ def test_steps_on_which_members_differ_are_not_trusted():
 
 
 def test_new_moments_change_no_prediction():
-    model, fresh = trained(), swing(50, seed=1)
-    asked = fresh.observation_N.float(), fresh.action_N
-    said, moments = model.step(*asked), dict(model._moments)
-    wide = swing(300, seed=2)
-    model.replay.add(
-        state=3 * wide.observation_N + 1,
-        action=wide.action_N,
-        reward=5 * wide.reward_N + 2,
-        end=0 * wide.reward_N,
-        next_state=4 * wide.next_observation_N,
-        follows=wide.follows_N,
-        copies=torch.ones(300, 2),
-    )
-    model._measure_moments()
-    for now, before in zip(model.step(*asked), said, strict=True):
+    torch.manual_seed(0)
+    networks = EnsembleNetworks(3, 2, 2, [8], generator=torch.Generator().manual_seed(1), device=torch.device("cpu"))
+
+    def seen(times: float, more: float) -> dict[str, torch.Tensor]:
+        return {
+            name: times * torch.randn(300, size) + more for name, size in zip(networks.moments, (3, 3, 1), strict=True)
+        }
+
+    networks.measure(seen(1.0, 0.0), rescale=False)
+    asked = torch.randn(50, 3), torch.randint(2, (50,))
+    said = networks.predict(*asked, 0.0)
+    others = seen(3.0, 1.0)
+    networks.measure(others, rescale=True)
+    for now, before in zip(networks.predict(*asked, 0.0), said, strict=True):
         torch.testing.assert_close(now, before, rtol=1e-4, atol=1e-4)
-    model._moments = moments  # with other moments the same weights say something else
-    assert float((model.step(*asked)[2] - said[2]).abs().mean()) > 0.1
+    networks.measure(seen(1.0, 0.0), rescale=False)  # with other moments the same weights say something else
+    assert float((networks.predict(*asked, 0.0).next_END - said.next_END).abs().mean()) > 0.1
 
 
 def test_each_member_has_a_bootstrap_sample_of_the_steps_and_all_ends():
