@@ -68,6 +68,7 @@ class Evaluator:
         check_count("episodes", episodes)
         self.episodes = episodes
         self._env: VectorEnv | None = None
+        self._limit: int | None = None
         self._source: EnvSource | None = None
 
     def __enter__(self) -> Self:
@@ -88,10 +89,11 @@ class Evaluator:
                 naming step and seeds.
         """
         names = ("evaluate", "deterministic" if deterministic else "sampled")
+        env, limit = self._environments(algorithm.source, seed)
         made = rollout(
-            algorithm.world.of(self._environments(algorithm.source, seed)),
+            algorithm.world.of(env),
             Greedy(algorithm.policy) if deterministic else algorithm.policy,
-            FixedHorizon(length=algorithm.source.time_limit or UNLIMITED_LENGTH),
+            FixedHorizon(length=limit or UNLIMITED_LENGTH),
             seed=seed,
             names=names,
             generator=stream(seed, *names, device=algorithm.device),
@@ -109,14 +111,15 @@ class Evaluator:
             close_environments(self._env)
             self._env = None
 
-    def _environments(self, source: EnvSource, seed: int) -> VectorEnv:
+    def _environments(self, source: EnvSource, seed: int) -> tuple[VectorEnv, int | None]:
+        """The environments, and the time limit of their episodes."""
         if source is not self._source:
             self.close()
             self._source = source
         if self._env is None:
             with SharedGenerators(seed, "evaluate", "construction"):
-                self._env = source.make(self.episodes)
-        return self._env
+                self._env, self._limit = source.make(self.episodes), source.time_limit
+        return self._env, self._limit
 
 
 def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed: int = 0) -> Evaluation:

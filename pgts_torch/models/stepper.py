@@ -87,7 +87,7 @@ class Stepper:
             # Where the adapter cannot tell whether chance decides, the generator does: it moves if it is drawn from.
             # The key seeds it for the first draw only; later draws of the same outcome go on from there.
             known = adapter.is_random(env, taken)
-            if known or (known is None and key is not None and not random):
+            if not random and (known or (known is None and key is not None)):
                 self.chance.seed(key or 0)
             observation, reward, terminated, truncated, info = env.step(taken)
             self.steps += 1

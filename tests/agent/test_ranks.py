@@ -13,7 +13,7 @@ from gymnasium import spaces
 from torch import distributed
 
 from pgts_torch import PGTS
-from pgts_torch.agent import callbacks, visit
+from pgts_torch.agent import visit
 from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.ranks import Draws, Ranks, checksum, joined_ranks, present_ranks
 from pgts_torch.agent.rollout import Rollout
@@ -284,8 +284,8 @@ def test_an_evaluation_is_made_once_for_all(tmp_path):
         noise = float(torch.rand(()))
         model = PGTS("pgts/Ladder-v0", num_envs=2, horizon={"type": "fixed", "length": 5})
         watch = EvalCallback(every=1, episodes=1, best_path=tmp_path / "best.pt")
-        score = callbacks.evaluate
-        callbacks.evaluate = lambda *args, **options: replace(score(*args, **options), episodes=int(1e6 * noise))
+        score = watch.evaluator
+        watch.evaluator = lambda *args, **options: replace(score(*args, **options), episodes=int(1e6 * noise))
         model.learn(30, callback=watch)
         return watch.history[-1].evaluation.episodes, (tmp_path / "best.pt").exists()
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pgts_torch.agent.evaluate import Evaluator
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.cli.main import main
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import ModelMismatch, NotFinite
-from pgts_torch.experiment import recorder
 from pgts_torch.experiment.evaluate import last_checkpoint
 
 ROOT = Path(__file__).parents[2]
@@ -72,7 +72,7 @@ def test_what_is_not_finite_in_the_last_evaluation_is_written_down_too(tmp_path,
     def fails(*args, **kwargs):
         raise NotFinite("the rewards are [nan]; they must be finite", what="reward")
 
-    monkeypatch.setattr(recorder, "evaluate", fails)
+    monkeypatch.setattr(Evaluator, "__call__", fails)
     assert train(tmp_path / "run") == 1
     record = json.loads((tmp_path / "run" / "failure.json").read_text())
     assert (record["env_step"], record["tensor"]) == (600, "reward")

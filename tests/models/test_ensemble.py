@@ -132,7 +132,7 @@ def test_new_moments_change_no_prediction():
     for now, before in zip(networks.predict(*asked, 0.0), said, strict=True):
         torch.testing.assert_close(now, before, rtol=1e-4, atol=1e-4)
     networks.measure(seen(1.0, 0.0), rescale=False)  # with other moments the same weights say something else
-    assert float((networks.predict(*asked, 0.0).next_END - said.next_END).abs().mean()) > 0.1
+    assert bool((networks.predict(*asked, 0.0).next_END - said.next_END).abs().mean() > 0.1)
 
 
 def test_each_member_has_a_bootstrap_sample_of_the_steps_and_all_ends():
