@@ -29,6 +29,11 @@ _NONE = frozenset[str]()
 _NOT_COMPARED = frozenset({"env", "spec", "_cached_spec", "_np_random", "_np_random_seed", "np_random"})
 """Attributes that differ between instances that are alike: the wrapped environment, its spec and its generator."""
 
+_CONTAINERS = (list, tuple, dict)
+
+_MOST_MIXED = 200
+"""After so many containers with parts that are not plain values, the others are looked into part by part."""
+
 _PARTS = object()
 
 _COMPARED_BY_EQUALITY = (type, types.ModuleType, types.CodeType, enum.Enum)
@@ -191,11 +196,13 @@ def _inside(value: Any, known: Sequence[Any], *, left_out: Set[str]) -> Iterator
     """
     met = {id(each): -1 - k for k, each in enumerate(known)}
     waiting: list[tuple[str, Any]] = [("", value)]
+    mixed = 0  # containers that hold more than plain values: of many in each other each would be read to the end
     for _ in range(_MOST_PARTS):
         if not waiting:
             return
         where, part = waiting.pop()
-        look = _look_of(part)
+        look = _look_of(part, as_one=mixed < _MOST_MIXED)
+        mixed += look is _PARTS and type(part) in _CONTAINERS
         if look is _PARTS and id(part) in met:
             look = "=", met[id(part)]
         elif look is _PARTS:
@@ -207,8 +214,12 @@ def _inside(value: Any, known: Sequence[Any], *, left_out: Set[str]) -> Iterator
         yield where, part, look
 
 
-def _look_of(value: Any) -> Any:
-    """What a value looks like that needs no look into its parts; else `_PARTS`."""
+def _look_of(value: Any, *, as_one: bool) -> Any:
+    """What a value looks like that needs no look into its parts; else `_PARTS`.
+
+    Args:
+        as_one: take a container of plain values as one of them.
+    """
     kind = type(value)
     if value is None or kind in (bool, int, str, bytes) or isinstance(value, _COMPARED_BY_EQUALITY):
         return value
@@ -224,7 +235,7 @@ def _look_of(value: Any) -> Any:
         return kind
     if isinstance(value, set | frozenset):
         return kind, sorted(map(repr, value))
-    if kind in (list, tuple, dict):
+    if kind in _CONTAINERS and as_one:
         try:
             return marshal.dumps(value, 2)  # a large table takes a millisecond; entry by entry twenty
         except ValueError:

@@ -37,7 +37,7 @@ def gap(training: PGTS) -> float:
 
 @pytest.mark.parametrize(
     ("runs", "may_fail", "stop_at"),
-    [(6, 2, 4.0), pytest.param(200, 18, 2.0, marks=pytest.mark.long)],
+    [(3, 1, 4.0), pytest.param(200, 18, 2.0, marks=pytest.mark.long)],
 )
 def test_a_training_that_ends_by_its_certificate_is_as_good_as_that_says(runs, may_fail, stop_at):
     true, ended = [], []
