@@ -16,7 +16,6 @@ On vectors evaluations are 20 greedy episodes. On numbered states they are exact
 policy, which must be within 1 % of the optimum; they begin at 100 steps. Seconds are CPU seconds without evaluations.
 """
 
-import importlib.util
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
@@ -50,8 +49,6 @@ METHODS = {
 }
 TABULAR = ("r-max", "psrl", "q-learning")
 VECTORS = {name: tasks.TASKS[name] for name in ("cartpole", "acrobot", "mountain_car")}
-if importlib.util.find_spec("Box2D") is not None:
-    VECTORS["lunar_lander"] = Task(200, 100_000, 20)
 TABLES = {
     "cliff_walking": 20_000,
     "deep_sea": 20_000,
@@ -83,7 +80,7 @@ def configured(task: str, method: str, seed: int) -> Config:
     size = []
     if task == "deep_sea_50":
         task, size = "deep_sea", ["--env.kwargs.n", "50", "--rollout.horizon.length", "50"]
-    folder = "configs/learned" if method in ("learned", "given") or task == "lunar_lander" else "configs"
+    folder = "configs/learned" if method in ("learned", "given") else "configs"
     given = ["--model", "given", "--replay.type", "uniform"] if method == "given" else []
     return load(str(ROOT / folder / f"{task}.yaml"), ["--seed", str(seed), *given, *size])
 

@@ -10,7 +10,7 @@
 4. Depth 32 and depth 64 on known states: how the time grows, and how many calls the model gets.
 5. Depth 1 to 64 from one root: nodes, model calls and time with merging, and without it as far as that fits.
 6. DeepSea(50): deeper and deeper from the start until another action looks best than at depth 0.
-7. One backup over 10^6 nodes: which share of the memory bandwidth it reaches.
+7. One sweep over 10^6 nodes: which share of the memory bandwidth it reaches.
 
 One thread on one core for both sides. Each time is the median of several repeats in which all forms take turns, and a
 ratio is the median of theirs. Without mctx (the extra `bench`) the peer's lines are missing.
@@ -38,7 +38,7 @@ from common import (
 from merging import COLD, DEPTH, WARM, searcher
 from peers import POLICIES, mctx_searcher
 
-from pgts_torch.bellman import Outcomes, backup
+from pgts_torch.bellman import Outcomes, sweep
 from pgts_torch.models import TabularModel
 from pgts_torch.search import Topology, mcts
 from pgts_torch.seeding import stream
@@ -158,9 +158,9 @@ def print_mcts_throughput(table: dict[str, Any]) -> None:
 
 
 def bandwidth(repeats: int, device: str, num_nodes: int) -> list[dict[str, Any]]:
-    """One backup with its maximum over many nodes, 4 actions, 5 outcomes, and a copy of as many bytes.
+    """One sweep over many nodes, 4 actions, 5 outcomes, and a copy of as many bytes.
 
-    The bytes of a sweep are what it must move at least: each weight, index, reward, q and v once.
+    The bytes of a sweep are what it must move at least: each weight, index, reward and value once, before and after.
     """
     A, K = 4, 5
     generator = stream(0, "bandwidth")
@@ -176,11 +176,11 @@ def bandwidth(repeats: int, device: str, num_nodes: int) -> list[dict[str, Any]]
             reward_NA = torch.rand(num_nodes, A, generator=generator).to(device, dtype)
             outcomes = Outcomes(reward_NA, prob_NAK, discount, child_NAK.to(device), num_nodes)
             v_N = torch.rand(num_nodes, generator=generator).to(device, dtype)
-            moved = num_nodes * (A * K * (size + 4) + A * 4 + 3 * A * size + 2 * size)
+            moved = num_nodes * (A * K * (size + 4) + A * size + 2 * size)
             source = torch.zeros(moved // 16, dtype=torch.float64, device=device)
             target = torch.empty_like(source)
             forms: dict[str, Form] = {
-                "sweep": partial(_sweep, outcomes, v_N),
+                "sweep": partial(sweep, outcomes, v_N, 1),
                 "copy": partial(target.copy_, source),
             }
             times = take_turns(forms, repeats)
@@ -198,12 +198,8 @@ def bandwidth(repeats: int, device: str, num_nodes: int) -> list[dict[str, Any]]
     return rows
 
 
-def _sweep(outcomes: Outcomes, v_N: torch.Tensor) -> torch.Tensor:
-    return backup(outcomes, v_N).amax(-1)
-
-
 def print_bandwidth(rows: list[dict[str, Any]]) -> None:
-    print(f"\nOne backup with its maximum over {rows[0]['nodes']:.0e} nodes, 4 actions, 5 outcomes, beside a copy")
+    print(f"\nOne sweep over {rows[0]['nodes']:.0e} nodes, 4 actions, 5 outcomes, beside a copy")
     print(f"{'children':<14}{'dtype':<10}{'sweep ms':>10}{'MB':>8}{'GB/s':>8}{'copy GB/s':>12}{'share':>8}")
     for row in rows:
         rates = [row["bytes"] / row[f"{form}_milliseconds"] / 1e6 for form in ("sweep", "copy")]
