@@ -35,6 +35,7 @@ def gap(training: PGTS) -> float:
     return exact.optimal(mdp).J - exact.evaluate(mdp, training.policy_table()).J
 
 
+@pytest.mark.usefixtures("unchecked_shapes")  # for speed
 @pytest.mark.parametrize(
     ("runs", "may_fail", "stop_at"),
     [(3, 1, 4.0), pytest.param(200, 18, 2.0, marks=pytest.mark.long)],
