@@ -85,7 +85,8 @@ def softmax_policy(pi_SA: Float[Tensor, "S A"]) -> SoftmaxPolicy:
 
 def columns(episodes: Rollout, chosen: slice) -> Rollout:
     """Some of the episodes."""
-    return replace(episodes, **{name: value[:, chosen] for name, value in vars(episodes).items()})
+    given = {name: value for name, value in vars(episodes).items() if value is not None}
+    return replace(episodes, **{name: value[:, chosen] for name, value in given.items()})
 
 
 @dataclass(frozen=True)
