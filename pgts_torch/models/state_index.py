@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Int, Num
 from torch import Tensor
 
+from pgts_torch.compiled import can_compile
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.seeding import mix
 
@@ -36,9 +37,15 @@ def hash_rows(bits_ND: Int[Tensor, "N D"]) -> Int[Tensor, "N"]:
 
     Multilinear hashing (Lemire and Kaser 2014) with SplitMix64 as finaliser: one round however long the row.
     """
+    if can_compile(bits_ND.device):
+        from pgts_torch.models import index_kernels
+
+        hash_N = torch.empty(len(bits_ND), dtype=torch.int64)
+        index_kernels.hash_rows(bits_ND.contiguous().numpy(), hash_N.numpy())
+        return hash_N
     # Odd factors, so that no bit of a number is lost modulo 2**64.
     odd_D = mix(torch.arange(bits_ND.shape[1], device=bits_ND.device), 0) | 1
-    return mix((bits_ND * odd_D).sum(-1), 0)
+    return mix((bits_ND.long() * odd_D).sum(-1), 0)
 
 
 @final
@@ -48,7 +55,8 @@ class StateIndex:
     An open-addressing hash table with linear probing (Knuth, TAOCP 6.4), at most half full, that takes a whole tensor
     at once: in each round every row that is still looking visits one slot, and of those that find it empty the first
     one takes it. Rows are compared in full, so a collision of hashes costs a round and never an error. A call costs
-    O(N) for N rows however many are known; the cost of growth is spread over the calls that cause it.
+    O(N) for N rows however many are known; the cost of growth is spread over the calls that cause it. On the CPU a
+    compiled loop (`index_kernels`) takes one row after another and gives the same numbers.
 
     Where rows do not recur, lookups are a waste. With `merge` "auto" each row gets a number of its own, without a
     lookup, once a few thousand of them have recurred less than 1.01 times on average. One row in 16 is still looked up,
@@ -126,27 +134,51 @@ class StateIndex:
         if self._merge is False:
             self._count = last
             return fresh_N
-        hash_N = self._hashed(row_ND)
-        # looking_L: the L rows that are looked up; found_L: the first row equal to each, which may be itself.
-        looking_L = fresh_N
+        hash_N = self._hashed(self._rows[first:last])
+        # looks_N: which rows are looked up.
+        looks_N = torch.ones_like(fresh_N, dtype=torch.bool)
         if not self._merging:
-            looking_L = fresh_N[hash_N >> (64 - _SAMPLE_BITS) == 0]
-        found_L, slot_L = self._look_up(looking_L, hash_N[looking_L - first])
-        new_N = torch.ones_like(fresh_N, dtype=torch.bool)
-        new_N[looking_L - first] = found_L == looking_L
+            looks_N = hash_N >> (64 - _SAMPLE_BITS) == 0
+        looked_up = int(looks_N.sum())
+        # At most half of the slots are full even if all these rows are new.
+        needed = 2 * (self._entered + looked_up)
+        if needed > len(self._slots):
+            self._enter(self._slots[self._slots != _EMPTY], needed)
+        if can_compile(self.device):
+            from pgts_torch.models import index_kernels
+
+            number_N = fresh_N
+            new, entered = index_kernels.number(
+                self._bits(self._rows).numpy(),
+                self._slots.numpy(),
+                first,
+                *(x.numpy() for x in (hash_N, looks_N, number_N)),
+            )
+        else:
+            number_N, new, entered = self._numbered(fresh_N, hash_N, looks_N)
+        self._count, self._entered = first + new, self._entered + entered
+        if self._merge == "auto":
+            self._judge(looked_up, entered)
+        return number_N
+
+    def _numbered(self, fresh_N: Tensor, hash_N: Tensor, looks_N: Tensor) -> tuple[Tensor, int, int]:
+        """The numbers of the rows behind the known ones, how many are new, and how many of these are entered."""
+        first = self._count
+        # looking_L: the L rows that are looked up; found_L: the first row equal to each, which may be itself.
+        looking_L = fresh_N[looks_N]
+        found_L, slot_L = self._look_up(looking_L, hash_N[looks_N])
+        new_N = torch.ones_like(looks_N)
+        new_N[looks_N] = found_L == looking_L
         # New rows move together: their numbers are `first` and the next ones, and the table gets them.
         number_N = first - 1 + new_N.cumsum(0)
         own = torch.nonzero(found_L == looking_L).flatten()
         self._slots[slot_L[own]] = number_N[looking_L[own] - first]
         new = torch.nonzero(new_N).flatten()
-        self._rows[first : first + len(new)] = row_ND[new]
-        self._count, self._entered = first + len(new), self._entered + len(own)
+        self._rows[first : first + len(new)] = self._rows[first + new]
         # The others take the number of what was found: an old row's own, or the one that a row of this call just got.
         at_L = (found_L - first).clamp(min=0)
         number_N[looking_L - first] = torch.where(found_L < first, found_L, number_N[at_L])
-        if self._merge == "auto":
-            self._judge(len(looking_L), len(own))
-        return number_N
+        return number_N, len(new), len(own)
 
     def _judge(self, looked_up: int, new: int) -> None:
         """Give up lookups, or resume them, by how often the rows that were looked up have recurred."""
@@ -170,15 +202,17 @@ class StateIndex:
             raise PgtsError(f"the rows are {row_ND.dtype} {tuple(row_ND.shape)}; they must be {dtype} [N, {D}]")
         if not dtype.is_floating_point:
             return row_ND
-        # NaN equals nothing, not even itself: such a row would be new each time.
-        bad_N = row_ND.isnan().any(-1)
-        if bool(bad_N.any()):
+        # NaN equals nothing, not even itself: such a row would be new each time. The sum is one cheap call.
+        if bool(row_ND.sum().isnan()) and bool((bad_N := row_ND.isnan().any(-1)).any()):
             n = int(torch.nonzero(bad_N)[0, 0])
             raise NotFinite(f"row {n} is {row_ND[n].tolist()}; what is not a number equals nothing", what="state")
         return row_ND + 0.0  # -0.0 becomes 0.0, so that equal rows have equal bits
 
+    def _bits(self, row_ND: Tensor) -> Tensor:
+        return row_ND.view(_BITS[row_ND.dtype]) if row_ND.dtype in _BITS else row_ND
+
     def _hashed(self, row_ND: Tensor) -> Int[Tensor, "N"]:
-        return hash_rows((row_ND.view(_BITS[row_ND.dtype]) if row_ND.dtype in _BITS else row_ND).long())
+        return hash_rows(self._bits(row_ND))
 
     def _empty_slots(self, count: int) -> Tensor:
         return torch.full((count,), _EMPTY, dtype=torch.int64, device=self.device)
@@ -193,17 +227,18 @@ class StateIndex:
     def _enter(self, number_L: Tensor, num_slots: int) -> None:
         """A new table of at least so many slots, with these rows."""
         self._slots = self._empty_slots(max(_LEAST_SLOTS, 1 << (num_slots - 1).bit_length()))
-        self._entered = 0
-        found_L, _ = self._look_up(number_L, self._hashed(self._rows[number_L]))
-        self._entered = int((found_L == number_L).sum())
+        hash_L = self._hashed(self._rows[number_L])
+        if can_compile(self.device):
+            from pgts_torch.models import index_kernels
+
+            given = self._bits(self._rows), self._slots, number_L, hash_L
+            self._entered = index_kernels.enter(*(x.numpy() for x in given))
+        else:
+            self._entered = int((self._look_up(number_L, hash_L)[0] == number_L).sum())
 
     def _look_up(self, looking_L: Tensor, hash_L: Tensor) -> tuple[Tensor, Tensor]:
         """For each of these rows the number of the first one that equals it, and its slot; rows that equal none before
         them are entered. The caller counts them."""
-        # At most half of the slots are full even if all these rows are new.
-        needed = 2 * (self._entered + len(looking_L))
-        if needed > len(self._slots):
-            self._enter(self._slots[self._slots != _EMPTY], needed)
         last_slot = len(self._slots) - 1
         found_L, at_L = torch.empty_like(looking_L), torch.empty_like(looking_L)
         # index: which of the rows are still looking. In each round they compare themselves with the row in their slot,

@@ -1,5 +1,6 @@
 """Vectors as states: numbered like a dictionary would, and searched like any other model."""
 
+import contextlib
 import math
 
 import pytest
@@ -8,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from pgts_torch.compiled import torch_only
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import StateIndex, TensorModel, state_index
 from pgts_torch.models.state_index import hash_rows
@@ -42,6 +44,15 @@ def set_hash(monkeypatch):
     return lambda hash: monkeypatch.setattr(state_index, "hash_rows", hash)
 
 
+@pytest.fixture(params=[False, True], ids=["torch", "compiled"])
+def either_way(request):
+    """Compiled where numba is installed, and by torch."""
+    if request.param:
+        pytest.importorskip("numba")
+    with contextlib.nullcontext() if request.param else torch_only():
+        yield
+
+
 HASHES = {
     "good": hash_rows,
     "of three values": lambda bits_ND: bits_ND.sum(-1) % 3,
@@ -52,6 +63,7 @@ HASHES = {
 # StateIndex
 
 
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("name", HASHES)
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_rows_are_numbered_as_a_dictionary_would_whatever_the_hash(name, dtype, set_hash):
@@ -74,6 +86,7 @@ def test_any_batches_of_rows_are_numbered_as_a_dictionary_would(batches):
             assert torch.equal(ours.number(rows), naive.number(rows))
 
 
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_rows_that_differ_in_their_last_bit_alone_are_different(dtype, set_hash):
     one = torch.ones(1, 3, dtype=dtype)
@@ -85,11 +98,13 @@ def test_rows_that_differ_in_their_last_bit_alone_are_different(dtype, set_hash)
         assert ours.number(torch.cat([one, other, one])).tolist() == [0, 1, 0]
 
 
+@pytest.mark.usefixtures("either_way")
 def test_large_integers_that_no_float_tells_apart_are_different():
     ours = StateIndex(1, dtype=torch.int64)
     assert ours.number(torch.tensor([[2**60], [2**60 + 1], [-(2**63)], [2**60]])).tolist() == [0, 1, 2, 0]
 
 
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_minus_0_equals_0_and_infinities_equal_themselves(dtype):
     rows = torch.tensor([[0.0], [-0.0], [math.inf], [-math.inf], [math.inf], [-0.0]], dtype=dtype)
@@ -143,6 +158,7 @@ def test_a_call_hashes_its_own_rows_and_not_the_whole_table_except_when_that_dou
 # Merging while it pays
 
 
+@pytest.mark.usefixtures("either_way")
 def test_rows_that_do_not_recur_are_no_longer_looked_up_and_rows_that_recur_are_again():
     ours = StateIndex(2, dtype=torch.float64)
     assert ours.merging
@@ -159,6 +175,7 @@ def test_rows_that_do_not_recur_are_no_longer_looked_up_and_rows_that_recur_are_
     assert torch.equal(ours.number(unseen), number_N)
 
 
+@pytest.mark.usefixtures("either_way")
 def test_rows_that_recur_are_looked_up_for_ever():
     ours, naive = StateIndex(2, dtype=torch.int64), Naive()
     for seed in range(8):
@@ -167,6 +184,7 @@ def test_rows_that_recur_are_looked_up_for_ever():
     assert ours.merging
 
 
+@pytest.mark.usefixtures("either_way")
 def test_whether_merged_or_not_a_number_leads_back_to_its_row():
     recurring = real_rows(3_000, 99)
     for merge in ("auto", True, False):
@@ -186,6 +204,30 @@ def test_without_merging_every_row_is_new():
     ours = StateIndex(2, dtype=torch.float64, merge=False)
     assert ours.number(torch.zeros(5, 2, dtype=torch.float64)).tolist() == [0, 1, 2, 3, 4]
     assert not ours.merging
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64, torch.int32, torch.int64])
+def test_compiled_and_torch_give_the_same_hashes_and_numbers_and_may_take_turns(dtype):
+    """Also where lookups are given up and resumed, which hashes decide."""
+    pytest.importorskip("numba")
+    row_ND = (real_rows(20_000, 1) * 2**12).to(dtype)
+    batches = [row_ND[:6_000], row_ND[6_000:9_000], row_ND[:3_000], row_ND[:8_000], row_ND.flip(0), -row_ND[:9_000]]
+    compiled, plain, mixed = (StateIndex(2, dtype=dtype) for _ in range(3))
+    merging = []
+    for i, batch in enumerate(batches):
+        number_N = compiled.number(batch)
+        with torch_only():
+            assert torch.equal(plain.number(batch), number_N)
+        with torch_only() if i % 2 else contextlib.nullcontext():
+            assert torch.equal(mixed.number(batch), number_N)
+        merging.append((compiled.merging, plain.merging, mixed.merging))
+    assert all(len(set(each)) == 1 for each in merging)
+    assert dtype.itemsize < 4 or {each[0] for each in merging} == {True, False}
+    bits_ND = row_ND.view(state_index._BITS.get(dtype, dtype))
+    with torch_only():
+        plain_N = hash_rows(bits_ND)
+    assert torch.equal(hash_rows(bits_ND), plain_N)
+    assert len(plain_N.unique()) > 0.9 * len(row_ND.unique(dim=0))
 
 
 # A model of vectors
