@@ -7,6 +7,7 @@ of an action in a state, and its number depends on nothing else: a batch may be 
 
 import pickle
 import random
+import secrets
 import zlib
 from types import TracebackType
 from typing import Any, Self, final
@@ -40,6 +41,11 @@ def seed_sequence(seed: int, *names: str | int) -> np.random.SeedSequence:
             raise ValueError(f"stream name {name} must be at least 0 and below 2**32")
     key = tuple(name if isinstance(name, int) else zlib.crc32(name.encode()) for name in names)
     return np.random.SeedSequence(seed, spawn_key=key)
+
+
+def drawn_seed() -> int:
+    """A seed from the entropy of the operating system."""
+    return secrets.randbelow(2**31)
 
 
 def numpy_stream(seed: int, *names: str | int) -> np.random.Generator:

@@ -1,13 +1,34 @@
-"""Names of modules in saved files: importing a module runs its code, so it needs the caller's consent."""
+"""Modules that a user names. Importing one runs its code, so in saved files they need the caller's consent."""
 
+import importlib
+import os
 import re
+import sys
 from collections.abc import Iterator, Mapping
+from types import ModuleType
 from typing import Any
 
 from pgts_torch.errors import PgtsError
 
 _NAMES_MODULE = re.compile(r"\s*([^\W\d]\w*(?:\.[^\W\d]\w*)*)\s*:\s*[^\W\d]")
 """MODULE:ID, as in ids of Gymnasium and entry points; it does not match a URL or a time."""
+
+
+def import_named(module: str) -> ModuleType:
+    """Import a module that the user has named. It may lie in the working folder, which is looked at last, so that
+    nothing in there takes the place of what is installed; ModuleNotFoundError if there is none."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        here = os.getcwd()
+        if error.name != module.partition(".")[0] or here in sys.path:
+            raise
+    sys.path.append(here)  # for good: it may import its neighbours later
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError:
+        sys.path.remove(here)
+        raise
 
 
 def check_imports(source: object, env: Any, kwargs: Any, model: Any = None) -> None:

@@ -3,7 +3,6 @@
 Their states are what is observed: numbers or vectors; those of images are vectors that represent them.
 """
 
-import importlib
 from typing import Any, final
 
 import torch
@@ -22,6 +21,7 @@ from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options.models import Counts, Ensemble, Latent, OwnModel
+from pgts_torch.trust import import_named
 
 
 @final
@@ -115,7 +115,7 @@ def own_model(options: OwnModel) -> Model:
     assert options.make is not None
     module, _, name = options.make.partition(":")
     try:
-        made = getattr(importlib.import_module(module), name)(**options.arguments)
+        made = getattr(import_named(module), name)(**options.arguments)
     except BaseException as error:
         raise failure(f"model.make is {options.make}, which cannot be made", error) from error
     if not isinstance(made, Model):

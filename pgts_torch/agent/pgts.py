@@ -1,5 +1,6 @@
 """Policy gradient with tree search, from rollouts.        [PGTS Alg. 1]"""
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +24,12 @@ from pgts_torch.agent.ranks import Draws, present_ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
-from pgts_torch.agent.world import TabularWorld
+from pgts_torch.agent.world import SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
-from pgts_torch.models.environments import Given
+from pgts_torch.models.environments import Given, close_environments
 from pgts_torch.search.lookahead import Lookahead
-from pgts_torch.seeding import stream
+from pgts_torch.seeding import drawn_seed, stream
 from pgts_torch.tabular.mdp import TabularMDP
 
 Callback = Callable[["PGTS", Iteration], bool | None]
@@ -72,7 +73,7 @@ class PGTS:
         reward_range: the lowest and the highest reward of a single step; a reward outside of it is an error. `stop_at`
             and an adaptive depth need it where the model has no largest reward (simulators).
         gamma: discount. Default: the environment's own (pgts/*), else 0.99. A VectorEnv of pgts/* has its own.
-        seed: of all random numbers.   device: of policy, critic and model.
+        seed: of all random numbers; None: one is drawn and printed.   device: of policy, critic and model.
         env_kwargs: for gymnasium.make, if the environment is given by its id.
 
     Raises:
@@ -106,13 +107,18 @@ class PGTS:
         observation_key: str | None = None,
         reward_range: Sequence[float] | None = None,
         gamma: float | None = None,
-        seed: int = 0,
+        seed: int | None = 0,
         device: torch.device | str = "cpu",
         env_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
         given = {name: value for name, value in locals().items() if name != "self"}
         arguments = {name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()}
-        self.seed, self.device, self.ranks = seed, make_device(device), present_ranks()
+        self.device, self.ranks = make_device(device), present_ranks()
+        if seed is None:
+            seed = arguments["seed"] = self.ranks.first("a seed", drawn_seed)
+            if self.ranks.leads:
+                print(f"note: seed is None; this training has the seed {seed}", file=sys.stderr)
+        self.seed = seed
         parts = self._parts = make_parts(arguments, self.ranks)
         self.options, self.source, self.world = parts.options, parts.source, parts.world
         self.policy, self.critic, self.update = parts.policy, parts.critic, parts.update
@@ -129,6 +135,8 @@ class PGTS:
     @torch.enable_grad()
     def iterate(self) -> Iteration:
         """Run one iteration: visit states, estimate Q^pi, look m steps ahead, update pi.        [PGTS Alg. 1]"""
+        if self.world.env.closed:
+            raise PgtsError("the environments of this training are closed; make it anew, or load a saved one")
         draws = self.ranks.draws(self.seed, self.num_iterations, self.device)
         calls_before = self._parts.model_calls
 
@@ -172,6 +180,19 @@ class PGTS:
         if not batch.is_enough:
             losses |= self.update(self.policy, batch, generator=draws.common)
         return batch, losses
+
+    def close(self) -> None:
+        """Close the environments, but not a VectorEnv that was given, which is its owner's. The policy remains."""
+        if self.source.given is None and not self.world.env.closed:
+            close_environments(self.world.env)
+            if isinstance(self.world, SimulatedWorld):
+                self.world.model.env.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     @property
     def mdp(self) -> TabularMDP:

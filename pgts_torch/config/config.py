@@ -18,8 +18,8 @@ class General(Part):
     name: Name = "run"
     """The beginning of the name of the run's folder."""
 
-    seed: Natural = 0
-    """The seed of all random numbers."""
+    seed: Natural | None = 0
+    """The seed of all random numbers; null: one is drawn, which stands in the run folder."""
 
     total_steps: Count = 50_000
     """Environment steps to train for."""

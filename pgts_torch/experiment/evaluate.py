@@ -17,8 +17,8 @@ KINDS = {"deterministic": True, "sampled": False}
 def evaluate_run(run: str | Path, *, episodes: int, seed: int, trust_imports: bool = False) -> dict[str, Evaluation]:
     """Evaluate the last checkpoint of a run, with greedy and with sampled actions."""
     torch.set_num_threads(1)
-    algorithm = PGTS.load(last_checkpoint(Path(run)), trust_imports=trust_imports)
-    with Evaluator(episodes) as evaluator:
+    loaded = PGTS.load(last_checkpoint(Path(run)), trust_imports=trust_imports)
+    with loaded as algorithm, Evaluator(episodes) as evaluator:
         return {kind: evaluator(algorithm, deterministic=greedy, seed=seed) for kind, greedy in KINDS.items()}
 
 

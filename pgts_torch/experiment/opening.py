@@ -29,13 +29,32 @@ from pgts_torch.experiment.ownership import (
 )
 from pgts_torch.experiment.resume import Start
 from pgts_torch.experiment.tracking import RunFolder, versions
+from pgts_torch.seeding import drawn_seed
 
 RUNS = Path("runs")
 """The parent of run folders where a configuration names none."""
 
 
-def check_dir(config: Config) -> None:
-    """PgtsError if the configured folder cannot be used as a run folder. Writes nothing."""
+def seeded(config: Config) -> Config:
+    """The configuration with a seed: that of the run in its folder, or a new one, where it has none. Writes nothing.
+
+    Raises:
+        PgtsError: the configured folder cannot be used as a run folder.
+    """
+    _check_dir(config)
+    if config.seed is not None:
+        return config
+    run = None if config.run.dir is None or config.run.overwrite else Path(config.run.dir)
+    goes_on = run is not None and files.kind(run / CONFIG_FILE) is not None
+    seed = load(run / CONFIG_FILE).seed if run is not None and goes_on else drawn_seed()
+    print(
+        f"note: seed is null; {'the run in the folder' if goes_on else 'this run'} has the seed {seed}", file=sys.stderr
+    )
+    return config.model_copy(update={"seed": seed})
+
+
+def _check_dir(config: Config) -> None:
+    """PgtsError if the configured folder cannot be used as a run folder."""
     if config.run.dir:
         with files.named(f"run.dir {config.run.dir!a}"):
             config.run.dir.encode()  # it is written down in config.yaml

@@ -64,7 +64,7 @@ class Recorder:
         self._saved_at = -1
         self._pi_SA = self._table()
         self._evaluator = Evaluator(config.eval.episodes)
-        self._evaluations = _evaluations(config.eval, config.seed, path, self._evaluator)
+        self._evaluations = _evaluations(config.eval, algorithm.seed, path, self._evaluator)
 
     @property
     def finished(self) -> bool:
@@ -189,7 +189,7 @@ class Recorder:
             span = float(span_of(self.truth.optimum.q_SA.reshape(1, -1)))
             missing, stationary_gap = ((J_optimal - J) / span, gap / span) if span > 0 else (0.0, 0.0)
         deterministic, sampled = (
-            self._evaluator(algorithm, deterministic=kind, seed=config.seed) for kind in KINDS.values()
+            self._evaluator(algorithm, deterministic=kind, seed=algorithm.seed) for kind in KINDS.values()
         )
         self._evaluator.close()
         advice = [
@@ -200,7 +200,7 @@ class Recorder:
         ]
         return Summary(
             run=str(self.path),
-            seed=config.seed,
+            seed=algorithm.seed,
             depth=depth,
             search="none" if algorithm.search is None else str(algorithm.search),
             J=J,

@@ -14,7 +14,7 @@ from pgts_torch.config import Config
 from pgts_torch.errors import Failed, ModelMismatch, NotFinite, Stopped, failure
 from pgts_torch.experiment.advice import Movement
 from pgts_torch.experiment.locking import RunLock
-from pgts_torch.experiment.opening import check_dir, claimed, opened
+from pgts_torch.experiment.opening import claimed, opened, seeded
 from pgts_torch.experiment.ownership import FAILURE_FILE, SUMMARY_FILE
 from pgts_torch.experiment.recorder import Recorder
 from pgts_torch.experiment.resume import Start, find, names_modules, resuming
@@ -56,8 +56,8 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
     if config.run.tensorboard:
         event_writer()
     with joined_ranks(config.device) as ranks, StopFlag() as stop, ExitStack() as held:
-        ranks.first("the run folder", lambda: check_dir(config))
-        algorithm = ranks.together("the algorithm", lambda: build(config))
+        config = ranks.first("the run folder", lambda: seeded(config))
+        algorithm = held.enter_context(ranks.together("the algorithm", lambda: build(config)))
         algorithm.content()  # what cannot be saved is refused now, not at the first checkpoint
         movement = Movement(copy.deepcopy(algorithm.policy))
         locks: list[RunLock] = []  # of the first process

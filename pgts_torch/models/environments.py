@@ -2,6 +2,7 @@
 
 import copy
 import importlib
+import importlib.util
 import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +14,7 @@ from typing import Any, final
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, find_highest_version, get_env_id, parse_env_id
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
@@ -23,6 +24,7 @@ from pgts_torch.models.attributes import Unlike, own_to_each, unlike
 from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.wrappers import wrappers_of
 from pgts_torch.seeding import numpy_stream
+from pgts_torch.trust import import_named
 
 Given = str | EnvSpec | gymnasium.Env | VectorEnv | Callable[[], gymnasium.Env]
 """What a user may give as an environment."""
@@ -101,7 +103,8 @@ class EnvSource:
     @classmethod
     def _of_id(cls, env_id: str, kwargs: dict[str, Any], gamma: float | None, count: int | None) -> "EnvSource":
         _import(env_id)
-        spec = gymnasium.registry.get(env_id.rpartition(":")[2])
+        if (spec := _spec(env_id)) is not None:
+            env_id = f"{env_id[: env_id.rfind(':') + 1]}{spec.id}"  # with its version, so that it means the same later
         ours = spec is not None and spec.namespace == "pgts"
         if ours and count is not None:
             raise PgtsError(f"actions_per_dimension is {count}; {env_id} has discrete actions")
@@ -158,6 +161,9 @@ class EnvSource:
             made = self.makers[k % len(self.makers)](**options)
         if not isinstance(made, gymnasium.Env):
             raise PgtsError(f"{self.name} gave {made!r}; it must be a Gymnasium environment")
+        for name in ("observation_space", "action_space"):
+            if not isinstance(getattr(made, name, None), spaces.Space):
+                raise PgtsError(f"{self.name} has no {name}; an environment sets it to one of gymnasium.spaces")
         self._check_new(made)
         return made
 
@@ -294,7 +300,21 @@ def _import(env_id: str) -> None:
     needed = [(own, "")] if colon else []
     for module, extra in needed + [needs for start, needs in _MODULES.items() if env_id.startswith(start)]:
         try:
-            importlib.import_module(module)
+            import_named(module)
         except ModuleNotFoundError as error:
             why = f"needs {module}: pip install 'pgts_torch[{extra}]'" if extra else f"cannot be made: {error}"
             raise PgtsError(f"{env_id} {why}") from error
+
+
+def _spec(env_id: str) -> EnvSpec | None:
+    """The spec of an id; that of the latest version where the id has none, as gymnasium.make takes it."""
+    name = env_id.rpartition(":")[2]
+    if name not in gymnasium.registry and importlib.util.find_spec("ale_py"):
+        importlib.import_module("ale_py")  # Atari has ids without a namespace, too
+    try:
+        namespace, short, version = parse_env_id(name)
+    except gymnasium.error.Error:
+        return None
+    if version is None and name not in gymnasium.registry:
+        name = get_env_id(namespace, short, find_highest_version(namespace, short))
+    return gymnasium.registry.get(name)

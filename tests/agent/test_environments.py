@@ -225,3 +225,67 @@ def test_a_time_limit_around_an_environment_of_ones_own_is_that_of_its_evaluatio
     assert model.source.time_limit == 1200
     assert evaluate(model, episodes=1).episodic_length.mean == 1200
     assert PGTS(Field, **SHORT, actions_per_dimension=2).source.time_limit is None
+
+
+class Spaceless(gymnasium.Env):
+    """It says what it observes, and not which actions it takes."""
+
+    observation_space = spaces.Discrete(2)
+
+
+@pytest.mark.parametrize(
+    ("given", "name"), [(gymnasium.Env, "Env has no observation_space"), (Spaceless, "action_space")]
+)
+def test_an_environment_without_spaces_is_refused_by_their_name(given, name):
+    with pytest.raises(PgtsError, match=name):
+        PGTS(given, **SHORT)
+
+
+def test_an_id_without_a_version_is_its_latest_version(tmp_path):
+    model = PGTS("CartPole", **SHORT)
+    assert (model.source.name, model.source.time_limit) == ("CartPole-v1", 500)
+    assert PGTS("gymnasium:CartPole", **SHORT).source.name == "gymnasium:CartPole-v1"
+    with pytest.raises(
+        PgtsError, match=r"Cartpole cannot be made: Environment `Cartpole` doesn't exist\. Did you mean"
+    ):
+        PGTS("Cartpole", **SHORT)
+    with pytest.raises(PgtsError, match="cannot be made: Malformed environment ID"):
+        PGTS("no id at all!", **SHORT)
+    model.save(tmp_path / "m.pt")
+    assert PGTS.load(tmp_path / "m.pt").source.name == "CartPole-v1"
+
+
+def test_atari_is_found_under_all_its_ids():
+    pytest.importorskip("ale_py")
+    for name in ("BreakoutNoFrameskip-v4", "ALE/Breakout-v5", "Breakout"):
+        assert EnvSource.of(name, kwargs={"obs_type": "ram"}).make(1).single_observation_space.shape == (128,)
+
+
+class Counted(Field):
+    """It counts how many are open."""
+
+    num_open = 0
+    action_space = spaces.Discrete(2)
+
+    def __init__(self):
+        Counted.num_open += 1
+
+    def step(self, action):
+        return self.place, 0.0, False, False, {}
+
+    def close(self):
+        Counted.num_open -= 1
+
+
+def test_a_training_closes_its_environments_and_not_those_that_were_given():
+    with PGTS(Counted, **SHORT) as model:
+        model.iterate()
+        assert Counted.num_open > 0
+    assert model.predict(np.zeros(2)) in (0, 1)
+    with pytest.raises(PgtsError, match="the environments of this training are closed"):
+        model.iterate()
+    model.close()  # twice is once
+    envs = EnvSource.of(Counted).make(2)
+    with PGTS(envs, **{name: value for name, value in SHORT.items() if name != "num_envs"}) as model:
+        model.iterate()
+    assert not envs.closed

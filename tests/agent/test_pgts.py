@@ -278,7 +278,7 @@ def test_an_environment_without_a_model_is_refused_with_what_is_missing():
         ({"policy": SoftmaxPolicy(4, 2)}, r"\(4, 2\); the environment has \(5, 2\)"),
         ({"gamma": 1.5}, "gamma is 1.5"),
         ({"seed": -1}, "seed is -1"),
-        ({"seed": None}, "seed is None; it must be a whole number"),
+        ({"seed": "any"}, "seed is any; it must be a whole number"),
         ({"device": "auto"}, "device is 'auto', where torch cannot compute: Expected one of cpu"),
         ({"num_envs": 0}, "num_envs is 0; it must be a whole number >= 1"),
         ({"env_kwargs": {"length": 3}}, "no argument 'length'"),
@@ -335,3 +335,15 @@ def test_the_device_and_max_nodes_are_passed_on():
     assert make(device="cpu").world.model.device == torch.device("cpu")
     with pytest.raises(PgtsError, match="max_nodes is 3"):
         make(search={"type": "expectimax", "max_nodes": 3}).iterate()
+
+
+def test_without_a_seed_one_is_drawn_and_said(capsys, tmp_path):
+    first, second = (PGTS("pgts/Ladder-v0", seed=None, num_envs=2) for _ in range(2))
+    assert first.seed != second.seed
+    assert capsys.readouterr().err.splitlines()[1] == f"note: seed is None; this training has the seed {second.seed}"
+    again = PGTS("pgts/Ladder-v0", seed=first.seed, num_envs=2)
+    first.iterate()
+    again.iterate()
+    assert torch.equal(first.policy_table(), again.policy_table())
+    first.save(tmp_path / "model.pt")
+    assert PGTS.load(tmp_path / "model.pt").seed == first.seed

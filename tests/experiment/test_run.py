@@ -246,3 +246,17 @@ def always_right() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     pi_SA = torch.full((5, 2), 0.5, dtype=torch.float64)
     q_SA = torch.tensor([0.0, math.log(19)], dtype=torch.float64).expand(5, 2)
     return pi_SA, q_SA, torch.ones(5, dtype=torch.float64)
+
+
+def test_a_run_without_a_seed_draws_one_says_it_and_goes_on_with_it(tmp_path, capsys):
+    config = few_iterations(tmp_path, "--seed", "null")
+    assert config.seed is None
+    summary = run.train(config)
+    assert f"note: seed is null; this run has the seed {summary.seed}\n" in capsys.readouterr().err
+    assert load(tmp_path / "run" / "config.yaml").seed == summary.seed
+    same = run.train(few_iterations(tmp_path / "other", "--seed", str(summary.seed)))
+    assert same.J == summary.J
+    (tmp_path / "run" / "summary.json").unlink()
+    with pytest.raises(PgtsError, match="finished"):
+        run.train(few_iterations(tmp_path / "other", "--seed", "null"))
+    assert f"the run in the folder has the seed {summary.seed}" in capsys.readouterr().err
