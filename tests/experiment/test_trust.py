@@ -177,14 +177,14 @@ def test_a_module_in_the_working_folder_is_found_and_hides_no_installed_one(here
     for name in ("zipapp.py", "game_of_mine.py"):
         (here / name).write_text(
             "import gymnasium\nfrom gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv\n"
-            "gymnasium.register('Mine-v0', FrozenLakeEnv, max_episode_steps=50)\n"
+            "gymnasium.register('Pond-v0', FrozenLakeEnv, max_episode_steps=50)\n"
         )
     try:
-        for env_id, code in (("zipapp:Mine-v0", 2), ("game_of_mine:Mine", 0)):
+        for env_id, code in (("zipapp:Pond-v0", 2), ("game_of_mine:Pond", 0)):
             assert main(["train", "--env.id", env_id, "--total_steps", "20", "--run.dir", "run"]) == code
         (here / "neighbour.py").write_text("import no_such_module")
-        assert main(["train", "--env.id", "neighbour:Mine-v0", "--total_steps", "20"]) == 2
-        assert "neighbour:Mine-v0 cannot be made: No module named 'no_such_module'" in capsys.readouterr().err
+        assert main(["train", "--env.id", "neighbour:Pond-v0", "--total_steps", "20"]) == 2
+        assert "neighbour:Pond-v0 cannot be made: No module named 'no_such_module'" in capsys.readouterr().err
     finally:
-        gymnasium.registry.pop("Mine-v0", None)
+        gymnasium.registry.pop("Pond-v0", None)
         sys.modules.pop("game_of_mine", None)
