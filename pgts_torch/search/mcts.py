@@ -139,7 +139,7 @@ def _grow_compiled(
 ) -> tuple[Tensor, Tensor, tuple[int, ...]]:
     """q and pruned mass of the roots, and the nodes of each level."""
     forest = Forest(leaves, topology, options, state_B)
-    values = forest.search(forest.preference(generator))
+    values = forest.search(generator)
     q_BA, pruned_BA = (value_BA.to(topology.model.dtype) for value_BA in values)
     return q_BA, pruned_BA, forest.nodes_per_level
 

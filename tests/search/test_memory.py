@@ -10,8 +10,8 @@ from pgts_torch.models.tabular import TabularModel
 from pgts_torch.options import MCTS, Auto, Expectimax, Sampled
 from pgts_torch.options.search import MAX_BYTES
 from pgts_torch.search import expectimax, mcts, sampled
-from pgts_torch.search import forest as forest_module
 from pgts_torch.search import known as known_module
+from pgts_torch.search import state_records as records_module
 from pgts_torch.search import topology as topology_module
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
@@ -55,7 +55,7 @@ def least_bytes(kind: str, model: EnumeratingModel, monkeypatch: pytest.MonkeyPa
     """The smallest limit under which the search is made."""
     told = [0]
     with monkeypatch.context() as patch:
-        for module in (topology_module, known_module, forest_module):
+        for module in (topology_module, known_module, records_module):
             patch.setattr(module, "check_memory", lambda needed, most, what: told.append(needed))
         look_of(kind, model, MAX_BYTES)
     return max(told)
