@@ -25,7 +25,8 @@ from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, Ta
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError
 from pgts_torch.models.actions import base_actions
-from pgts_torch.models.adapters import adapter_for
+from pgts_torch.models.adapters import known_adapter, not_restored
+from pgts_torch.models.adapters_generic import PickledAttributes
 from pgts_torch.models.attributes import attributes, own_to_each, unlike
 from pgts_torch.models.classic import CLASSIC
 from pgts_torch.models.environments import EnvSource, kinds_of
@@ -233,17 +234,28 @@ def _dynamics(request: _Request) -> DynamicsWorld | None:
 def _simulator(request: _Request) -> SimulatedWorld:
     """The world of a simulator that is restored from snapshots; MissingModel where it cannot be."""
     key, env = request.observation_key, request.envs.envs[0]
-    adapter = adapter_for(env)
+    known = known_adapter(env)
+    adapter = known or PickledAttributes()
     if adapter.restored is not None and (why := _own(request, request.own_to_each)):
         raise MissingModel(f"{request.name} cannot be restored: {why}, which is in no snapshot")
     numbers, alike = itertools.count(), not request.own_to_each
     make: Callable[[], gymnasium.Env] = lambda: request.fresh(next(numbers)).unwrapped  # noqa: E731
+    setup = Setup(make, adapter, base_actions(env), request.random, alike=alike)
     try:
-        check_snapshots(Setup(make, adapter, base_actions(env), request.random, alike=alike))
-    except MissingModel as missing:
-        raise MissingModel(f"{request.name} cannot serve as a model: {missing}") from missing
-    except PgtsError:
-        pass  # an error of the environment is reported when it stops a training
+        seconds = check_snapshots(setup)
+        if known is None:
+            size = len(setup.snapshot(setup.fresh()).key)
+            warnings.warn(
+                f"{request.name} has no get_state: its attributes are pickled, {size} bytes and "
+                f"{1e6 * seconds:.0f} us a call; get_state and set_state of its own could take less",
+                stacklevel=5,
+            )
+    except PgtsError as error:
+        if known is None:
+            raise MissingModel(f"{not_restored(env)}; its attributes, pickled, are not enough: {error}") from error
+        if isinstance(error, MissingModel):
+            raise MissingModel(f"{request.name} cannot serve as a model: {error}") from error
+        # an error of the environment is reported when it stops a training
     model = SimulatorModel(
         request.fresh,
         gamma=request.gamma,

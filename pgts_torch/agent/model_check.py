@@ -11,8 +11,10 @@ import torch
 from pgts_torch.agent.frequencies import MARGINS, Frequencies
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.world import DynamicsWorld, TabularWorld, World
+from pgts_torch.agent.world import DynamicsWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.errors import ModelMismatch, PgtsError
+from pgts_torch.models.adapters import methods_for
+from pgts_torch.models.adapters_generic import PickledAttributes
 from pgts_torch.models.exact_model import CONTRADICTED, RANDOM, ExactModel, Happened
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
@@ -75,6 +77,8 @@ class ModelCheck:
             raise PgtsError(f"model_check is {mode!r}; it must be one of {', '.join(map(repr, get_args(Mode)))}")
         self.mode, self.contradictions, self.model_calls = mode, 0, 0
         self._world, self._seed, self._ranks = world, seed, ranks
+        if is_queried and mode == "off" and isinstance(world, SimulatedWorld):
+            _check_known(world)
         model = world.model if is_queried and mode != "off" else None
         self._model = model if isinstance(model, ExactModel) else None
         self._warned: list[str] = []
@@ -266,3 +270,12 @@ def _steps(experience: Rollout, *, follows: str) -> Happened:
     columns = [getattr(experience, name).cpu().numpy().reshape(-1) for name in (*_COLUMNS, follows)]
     at = np.flatnonzero(alive_V)
     return Happened(*(columns if len(at) == len(alive_V) else [column_V[at] for column_V in columns]))
+
+
+def _check_known(world: SimulatedWorld) -> None:
+    """PgtsError if only the check tells whether the simulator's snapshots are its whole state."""
+    if isinstance(world.model.adapter, PickledAttributes):
+        raise PgtsError(
+            f"model_check is off, but it alone tells whether the attributes of {env_name(world.env)} are its whole "
+            f"state: leave it on, or {methods_for(world.model.env)}"
+        )

@@ -40,7 +40,7 @@ class OwnState(SnapshotAdapter):
         """Pickles of one state may differ, as where a number is of Python here and of numpy there, or an object is met
         twice; so what they hold is compared."""
         contents = [_content(snapshot.data[1]) for snapshot in (one, other)]
-        return one.key == other.key or (None not in contents and _same(*contents))
+        return one.key == other.key or (None not in contents and same_content(*contents))
 
 
 def _content(pickled: bytes) -> tuple[Any] | None:
@@ -51,19 +51,19 @@ def _content(pickled: bytes) -> tuple[Any] | None:
         return None
 
 
-def _same(one: Any, other: Any) -> bool:
+def same_content(one: Any, other: Any) -> bool:
     """Whether two values hold the same, however numbers are typed."""
     if isinstance(one, np.ndarray | np.generic) or isinstance(other, np.ndarray | np.generic):
         first, second = np.asarray(one), np.asarray(other)
         if first.dtype.hasobject or second.dtype.hasobject:
-            return first.shape == second.shape and all(map(_same, first.ravel(), second.ravel()))
+            return first.shape == second.shape and all(map(same_content, first.ravel(), second.ravel()))
         return first.shape == second.shape and bool(((first == second) | ((first != first) & (second != second))).all())
     if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(_same(one[name], other[name]) for name in one)
+        return one.keys() == other.keys() and all(same_content(one[name], other[name]) for name in one)
     if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        return len(one) == len(other) and all(map(_same, one, other))
+        return len(one) == len(other) and all(map(same_content, one, other))
     if type(one) is type(other) and type(one).__eq__ is object.__eq__ and hasattr(one, "__dict__"):
-        return _same(vars(one), vars(other))
+        return same_content(vars(one), vars(other))
     return bool(one == other) or (one != one and other != other)
 
 
@@ -177,6 +177,18 @@ def adapter_for(env: gymnasium.Env) -> SnapshotAdapter:
     Raises:
         MissingModel: it has neither; the message says what to implement.
     """
+    if (known := known_adapter(env)) is None:
+        raise MissingModel(not_restored(env))
+    return known
+
+
+def not_restored(env: gymnasium.Env) -> str:
+    """Why an environment without adapter has no model, and what to write."""
+    return f"{env_name(env)} cannot be restored: {methods_for(env.unwrapped)}"
+
+
+def known_adapter(env: gymnasium.Env) -> SnapshotAdapter | None:
+    """`adapter_for`, or None; MissingModel where its family has one that this instance cannot be restored by."""
     base = env.unwrapped
     if callable(getattr(base, "get_state", None)) and _takes_one(getattr(base, "set_state", None)):
         return OwnState()
@@ -186,7 +198,7 @@ def adapter_for(env: gymnasium.Env) -> SnapshotAdapter:
             if why := adapter.obstacle(base):
                 raise MissingModel(f"{env_name(env)} cannot be restored: {why}")
             return adapter
-    raise MissingModel(f"{env_name(env)} cannot be restored: {methods_for(base)}")
+    return None
 
 
 def methods_for(base: Any) -> str:

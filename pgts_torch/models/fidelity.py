@@ -13,7 +13,8 @@ from gymnasium import spaces
 
 from pgts_torch.errors import MissingModel, PgtsError, failure
 from pgts_torch.models.actions import all_actions, sampled_actions
-from pgts_torch.models.adapters import adapter_for
+from pgts_torch.models.adapters import known_adapter, not_restored
+from pgts_torch.models.adapters_generic import PickledAttributes
 from pgts_torch.models.attributes import own_to_each
 from pgts_torch.models.classic import dynamics_of
 from pgts_torch.models.environments import EnvSource, Given
@@ -95,9 +96,14 @@ class Report:
         return all(check.passed or not check.needed for check in self.checks)
 
     @property
+    def missing(self) -> str:
+        """What the checks that failed have found."""
+        return "; ".join(check.detail for check in self.checks if not check.passed)
+
+    @property
     def verdict(self) -> str:
         """One line: by which searches it can be used, or what is missing."""
-        missing = "; ".join(check.detail for check in self.checks if not check.passed)
+        missing = self.missing
         if not self.usable:
             return f"{self.env} cannot serve as a model: {missing}"
         if self.num_states is not None:
@@ -130,8 +136,8 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
         What was found. A check that fails says what is missing; an error of the environment fails its check.
 
     Raises:
-        MissingModel: the environment publishes no table, and no adapter knows it: the message says what to implement;
-            or a wrapper may change more than single answers.
+        MissingModel: the environment publishes no table, no adapter knows it, and its attributes are not its whole
+            state: the message says what to implement; or a wrapper may change more than single answers.
         PgtsError: it cannot be made, or raises in random walks.
     """
     if min(continuations, length) < 1:
@@ -139,13 +145,16 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
     make = EnvSource.of(env).make_one
     first, claims = make(), tuple(_claims(make(), seed=seed))
     name, space = env_name(first), first.action_space
+    known, mdp = None, published_table(first, gamma=_GAMMA)
     try:
-        adapter = adapter_for(first)
+        known = known_adapter(first)
     except MissingModel:
-        if (mdp := published_table(first, gamma=_GAMMA)) is None:
+        if mdp is None:
             raise
+    if known is None and mdp is not None:
         share = float(((TabularModel(mdp).frequencies() > 0).sum(-1) > 1).double().mean())
         return Report(name, "table", mdp.num_states, mdp.num_actions, share, claims, cost=None)
+    adapter = known or PickledAttributes()
     is_box = isinstance(space, spaces.Box)
     outer = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if is_box else all_actions(space)
     actions = [*map(transforms_of(first).action, outer)]
@@ -170,6 +179,8 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
         *claims,
     )
     report = Report(name, adapter.name, None, len(actions), shares[-1], checks, cost=None)
+    if known is None and not report.usable:
+        raise MissingModel(f"{not_restored(first)}; its attributes, pickled, are not enough: {report.missing}")
     try:
         return replace(report, cost=_cost(setup, walks))
     except PgtsError as error:

@@ -93,9 +93,9 @@ class Walk:
     states: tuple[bytes, ...]
 
 
-def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> None:
+def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> float:
     """The checks `chance`, `restore` and `untouched` with a few short walks and a long one; their length is such that
-    all takes about these seconds, and at least two steps.
+    all takes about these seconds, and at least two steps. Return the seconds that a step takes with its snapshot.
 
     Raises:
         MissingModel: snapshots of the environment cannot be trusted; the message says why.
@@ -105,7 +105,7 @@ def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> None:
     take_turns = itertools.cycle([setup.make() for _ in range(3)]).__next__ if setup.alike else setup.make
     turns = replace(setup, make=take_turns)
     beside_snapshots(turns)
-    longest = int(np.clip(seconds / (_STEPS_IN_ALL * _seconds_of_a_step(turns)), 2, _LONG_LENGTH))
+    longest = int(np.clip(seconds / (_STEPS_IN_ALL * (each := _seconds_of_a_step(turns))), 2, _LONG_LENGTH))
     turns = replace(turns, longest=longest, actions=setup.actions[: max(2, min(longest, ACTIONS_TRIED))])
     many = _SHORT_WALKS if setup.alike else _WALKS_APART
     for count, length in ((many, min(longest, _SHORT_LENGTH)), (1, longest)):
@@ -115,6 +115,7 @@ def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> None:
     # Real environments have not been in other states.
     new = replace(turns, make=setup.make)
     untouched(new, min(longest, _SHORT_LENGTH), width=max(1, min(_WIDTH, longest // _WIDTH)))
+    return each
 
 
 def _seconds_of_a_step(setup: Setup) -> float:

@@ -1,5 +1,6 @@
 """A user's environment that fails: one error names the environment, the step and the seeds of its episodes."""
 
+import itertools
 import re
 
 import gymnasium
@@ -172,6 +173,10 @@ def test_an_environment_without_a_model_is_refused_where_a_lookahead_needs_one_a
     class Unknown(Clock):
         get_state = set_state = None
 
+        def shown(self):
+            return super().shown() + next(steps) % 2
+
+    steps = itertools.count()
     with pytest.raises(MissingModel, match="Unknown cannot be restored: give Unknown the methods get_state"):
         make(Unknown, depth=1, estimator="lookahead")
     with pytest.raises(MissingModel, match=r"or take depth 0 and the estimator 'sampled', which need no model"):

@@ -12,8 +12,12 @@ from pgts_torch.cli.main import main
 HELP = "(see pgts check-model --help)"
 
 OWN = """\
-import gymnasium
+import gymnasium, itertools
 from tests.models.corridors import Bare, Corridor, Forgetful
+steps = itertools.count()
+class Hidden(Bare):
+    def look(self):
+        return super().look() + next(steps)
 from gymnasium.envs.toy_text import CliffWalkingEnv
 class Liar(CliffWalkingEnv):
     def step(self, action):
@@ -24,7 +28,7 @@ class Liar(CliffWalkingEnv):
         for rows in self.P.values():
             for a, [(p, t, _, end)] in rows.items():
                 rows[a] = [(p, t, 0.0, end)]
-for kind in (Bare, Corridor, Forgetful, Liar):
+for kind in (Hidden, Corridor, Forgetful, Liar):
     gymnasium.register(f"{kind.__name__}-v0", kind)
 """
 
@@ -121,7 +125,7 @@ MISTAKES = {
     "": f"the following arguments are required: ENV_ID {HELP}",
     "Nope-v0": "Nope-v0 cannot be made: Environment `Nope` doesn't exist",
     "nope:Nope-v0": "nope:Nope-v0 cannot be made: No module named 'nope'",
-    "corridors_of_mine:Bare-v0": "Bare-v0 cannot be restored: give Bare the methods get_state(self), which returns",
+    "corridors_of_mine:Hidden-v0": "Hidden-v0 cannot be restored: give Hidden the methods get_state(self), which",
     "FrozenLake-v1 --kwargs [1]": f"argument --kwargs: '[1]' is not a JSON object {HELP}",
     "FrozenLake-v1 --kwargs {": f"argument --kwargs: '{{' is not a JSON object {HELP}",
     'FrozenLake-v1 --kwargs {"slip":1}': "FrozenLake-v1 cannot be made: FrozenLakeEnv.__init__() got an unexpected",

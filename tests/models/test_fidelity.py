@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.errors import PgtsError
 from pgts_torch.models import check_model
 from tests.models.corridors import (
-    Bare,
     Broken,
     Clairvoyant,
     Corridor,
@@ -124,9 +123,7 @@ def test_an_environment_that_raises_fails_the_walks_by_name_and_seed():
         assert error.value.__cause__ is not None
 
 
-def test_without_an_adapter_there_is_nothing_to_check():
-    with pytest.raises(MissingModel, match="Bare cannot be restored: give Bare the methods get_state"):
-        check_model(Bare)
+def test_without_continuations_there_is_nothing_to_check():
     with pytest.raises(PgtsError, match="continuations is 0"):
         check_model(Corridor, continuations=0)
 

@@ -1,0 +1,147 @@
+"""Environments without get_state: their attributes are pickled, where that is enough and as long as it is."""
+
+import itertools
+import threading
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from pgts_torch import PGTS
+from pgts_torch.errors import MissingModel, ModelMismatch, PgtsError
+from pgts_torch.models import SimulatorModel, check_model
+from pgts_torch.models.adapters_generic import PickledAttributes
+from tests.models.corridors import Bare, Corridor
+
+pytestmark = [
+    pytest.mark.usefixtures("unchecked_shapes"),
+    pytest.mark.filterwarnings("ignore:.*has no get_state. its attributes are pickled"),
+]
+
+SHORT = {"depth": 2, "num_envs": 2, "horizon": {"type": "fixed", "length": 30}, "seed": 3}
+
+
+class Board:
+    """What an environment may be made of: parts that know each other, the environment and its generator."""
+
+    def __init__(self, env):
+        self.env, self.cells, self.random = env, np.zeros(4, np.int64), env.np_random
+        self.first, self.space = self, env.action_space
+
+
+class Parts(gymnasium.Env):
+    """Pieces fall on a board, at random or as chosen. It holds a window that no pickle takes."""
+
+    observation_space = spaces.Box(-9, 9, (4,), np.float64)
+
+    def __init__(self):
+        self.action_space, self.window = spaces.Discrete(3), threading.Lock()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.board, self.late = Board(self), None
+        return self.board.cells.astype(float), {}
+
+    def step(self, action):
+        cells = self.board.first.cells
+        cells[action if action < 2 else int(self.board.env.board.random.integers(4))] += 1
+        if cells.sum() == 3:
+            self.late = [cells]
+        if self.late:
+            self.late[0][3] = cells.sum()
+        return cells.astype(float), float(cells[0]), bool(cells.max() > 5), False, {}
+
+
+def test_a_lookahead_from_pickled_attributes_is_that_of_methods_of_its_own():
+    own, pickled = (PGTS(lambda kind=kind: kind(slip=0), **SHORT) for kind in (Corridor, Bare))
+    assert isinstance(pickled.world.model.adapter, PickledAttributes)
+    for _ in range(2):
+        one, other = own.iterate(), pickled.iterate()
+        assert torch.equal(one.look.q_BA, other.look.q_BA)
+        assert one.look.nodes_per_level == other.look.nodes_per_level  # states merge as well
+        assert torch.equal(own.policy.probs(one.observation_N), pickled.policy.probs(other.observation_N))
+
+
+def test_parts_that_refer_to_each_other_to_the_environment_and_to_its_generator_are_restored():
+    report = check_model(Parts)
+    assert report.usable
+    assert report.family == "its attributes, pickled"
+    assert 0 < report.random_share < 1
+    adapter, one, other = PickledAttributes(), Parts(), Parts()
+    for env in (one, other):
+        env.reset(seed=1)
+    for action in (0, 0, 1, 1):
+        one.step(action)
+    adapter.set_state(other, adapter.get_state(one).data)
+    assert adapter.left_out == {"window"}
+    assert other.board.env is other
+    assert other.board.random is other.np_random
+    assert other.board.space is other.action_space
+    assert other.late[0] is other.board.cells is not one.board.cells
+    assert PGTS(Parts, **SHORT).iterate().model_calls > 0
+
+
+def test_its_cost_is_said():
+    with pytest.warns(UserWarning, match=r"Bare has no get_state: its attributes are pickled, \d+ bytes and \d+ us a"):
+        PGTS(Bare, **SHORT)
+
+
+class Elsewhere(Bare):
+    """A part of its state is in no attribute."""
+
+    steps = itertools.count()
+
+    def step(self, action):
+        look, reward, *rest = super().step(action)
+        return look, reward + next(self.steps) % 2, *rest
+
+
+class OwnDice(Bare):
+    """It has a generator of its own, which a restored state would foresee."""
+
+    def __init__(self):
+        super().__init__()
+        self.dice = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("env", "why"),
+    [(Elsewhere, "a restored state goes on differently"), (OwnDice, "attribute dice is a generator of its own")],
+)
+def test_where_attributes_are_not_enough_the_two_methods_are_named_as_before(env, why):
+    for use in (lambda: PGTS(env, **SHORT), lambda: check_model(env)):
+        with pytest.raises(MissingModel, match=rf"give {env.__name__} the methods get_state.*are not enough: {why}"):
+            use()
+
+
+class Late(Bare):
+    """After some thousand steps of all instances it pays otherwise."""
+
+    steps = 0
+
+    def __init__(self):
+        super().__init__(slip=0)
+
+    def step(self, action):
+        look, reward, *rest = super().step(action)
+        Late.steps += 1
+        return look, reward + 5 * (Late.steps > 20_000), *rest
+
+
+def test_an_environment_whose_attributes_turn_out_not_to_be_its_state_is_found_in_training():
+    model = PGTS(Late, **SHORT | {"depth": 0})
+    model.iterate()
+    Late.steps = 20_000
+    with pytest.raises(ModelMismatch):
+        model.learn(5_000)
+
+
+def test_without_the_model_check_nothing_is_guessed():
+    with pytest.raises(
+        PgtsError, match=r"model_check is off, but it alone tells.*leave it on, or give Bare the methods"
+    ):
+        PGTS(Bare, **SHORT, model_check="off")
+    with pytest.raises(MissingModel, match="give Bare the methods get_state"):
+        SimulatorModel(Bare, gamma=0.9)
