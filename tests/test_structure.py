@@ -20,6 +20,7 @@ ROOMS = [
     "files",
     "trust",
     "compiled",
+    "readings",
     "options",
     "bellman_kernels",
     "bellman",

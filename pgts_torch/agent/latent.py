@@ -179,35 +179,40 @@ class LatentModel(TensorModel, LearningModel):
         trained = torch.nonzero(~held_out).flatten()
         ended = trained[self.replay.rows("end", trained) > 0]
         weights, num_counted = self._representation.weights + self._dynamics.weights, 0
-        totals: dict[str, float] = {}
 
         def sampled(rows: Tensor, number: int) -> Tensor:
             return rows[torch.randint(len(rows), (number,), generator=generator, device=generator.device).cpu()]
 
         extra = round(_ENDS * self.options.minibatch_size * self.options.unroll) if len(ended) else 0
-        for _ in range(count):
-            at_KN, counts_KN = sequences(
-                self.replay, held_out, sampled(trained, self.options.minibatch_size), self.options.unroll
-            )
-            steps, output_C3 = self._unrolled(at_KN, counts_KN)
-            at_C, num_counted = at_KN[counts_KN], num_counted + int(counts_KN.sum())
-            if extra:
-                more = sampled(ended, extra)
-                last_N3 = self._advanced(self._represented(self._rows("state", more)), self._rows("action", more))[1]
-                at_C, output_C3 = torch.cat([at_C, more]), torch.cat([output_C3, last_N3])
-            reward_C, end_C = self._rows("reward", at_C) - self._reward_mean, self._rows("end", at_C)
-            losses = outcome_losses(output_C3, reward_C / (self._reward_scale or 1.0), end_C)
-            losses["consistency"] = consistency_loss(steps)
-            losses |= equivalence_losses(steps, self._values, self._logits)
-            loss = torch.stack(list(losses.values())).sum()
-            self._optimiser.step(weights, torch.autograd.grad(loss, weights), loss, "model")
-            for name, value in losses.items():
-                totals[name] = totals.get(name, 0.0) + float(value.detach()) / count
+        with self._optimiser.attempt(self._representation.tensors + self._dynamics.tensors) as readings:
+            for _ in range(count):
+                starts = sampled(trained, self.options.minibatch_size)
+                at_KN, counts_KN = sequences(self.replay, held_out, starts, self.options.unroll)
+                losses = self._losses(at_KN, counts_KN, sampled(ended, extra) if extra else starts[:0])
+                loss = torch.stack(list(losses.values())).sum()
+                self._optimiser.step(weights, torch.autograd.grad(loss, weights), loss, "model")
+                readings.add(**losses)
+                num_counted += int(counts_KN.sum())
         if extra and count:
             # By how much the log odds of an end are larger than among all steps (King and Zeng 2001).
             share = len(ended) / len(trained)
             self._log_odds_added = min(_MOST_ADDED, math.log1p(extra * count / (num_counted * share)))
-        return totals
+        return readings.means
+
+    def _losses(
+        self, at_KN: Int[Tensor, "K N"], counts_KN: Bool[Tensor, "K N"], ended_M: Int[Tensor, "M"]
+    ) -> dict[str, Tensor]:
+        """The losses of sequences of rows, and of M more rows with ends, by name."""
+        steps, output_C3 = self._unrolled(at_KN, counts_KN)
+        at_C = at_KN[counts_KN]
+        if len(ended_M):
+            latent_MD = self._represented(self._rows("state", ended_M))
+            output_M3 = self._advanced(latent_MD, self._rows("action", ended_M))[1]
+            at_C, output_C3 = torch.cat([at_C, ended_M]), torch.cat([output_C3, output_M3])
+        reward_C, end_C = self._rows("reward", at_C) - self._reward_mean, self._rows("end", at_C)
+        losses = outcome_losses(output_C3, reward_C / (self._reward_scale or 1.0), end_C)
+        losses["consistency"] = consistency_loss(steps)
+        return losses | equivalence_losses(steps, self._values, self._logits)
 
     def _rows(self, name: str, at_N: Int[Tensor, "N"]) -> Tensor:
         rows: Tensor = self.replay.rows(name, at_N)
@@ -239,8 +244,9 @@ class LatentModel(TensorModel, LearningModel):
             outputs.append(output_N3)
         goes_on_KN = counts_KN & (self.replay.rows("end", at_KN.flatten()).view(K, N) == 0)
         hash_KN = hash_rows(image_M.flatten(1).double().view(torch.int64)).view(K, N)
-        steps = Unrolled(torch.stack(predicted), latent_MD[N:].view(K, N, -1), hash_KN, goes_on_KN.to(self.device))
-        return steps, torch.stack(outputs)[counts_KN.to(self.device)]
+        # The masks stay in host memory, as the replay: with one on a GPU, an index would wait for its count.
+        steps = Unrolled(torch.stack(predicted), latent_MD[N:].view(K, N, -1), hash_KN, goes_on_KN)
+        return steps, torch.stack(outputs)[counts_KN]
 
     @torch.no_grad()
     def step(

@@ -18,7 +18,7 @@ class Unrolled(NamedTuple):
     predicted_KND: the vectors after each step, from the first image and the actions alone.
     seen_KND: those that represent the images after each step.
     image_KN: a hash of each of these images.
-    goes_on_KN: whether the step counts, and the episode goes on after it.
+    goes_on_KN: whether the step counts, and the episode goes on after it; in host memory.
     """
 
     predicted_KND: Float[Tensor, "K N D"]

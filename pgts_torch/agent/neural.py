@@ -1,7 +1,6 @@
 """Policies and critics that are networks."""
 
 import copy
-import math
 from typing import Any, final
 
 import torch
@@ -22,6 +21,7 @@ from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.options.critics import NetworkValues
 from pgts_torch.options.fields import limit
 from pgts_torch.options.policies import CNN, MLP
+from pgts_torch.readings import Readings
 from pgts_torch.seeding import stream
 
 _ROUNDING = torch.finfo(torch.float32).eps
@@ -114,7 +114,8 @@ class NetworkCritic(Critic):
         self._optimiser = Optimiser(learning_rate=filled.learning_rate, max_grad_norm=limit(options.max_grad_norm))
         self._policy: Policy | None = None
         self._queried: tuple[Rollout, tuple[Tensor, Tensor]] | None = None
-        self._mean, self._scale, self._num_fits = 0.0, 1.0, 0
+        self._mean, self._scale = (torch.tensor(x, dtype=torch.float64, device=device) for x in (0.0, 1.0))
+        self._num_fits = 0
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
         """Fit the network to the targets of all visits.
@@ -138,20 +139,36 @@ class NetworkCritic(Critic):
         else:
             error_V = target_V - v_TB[alive_TB]
 
-        encoder = self.network.trunk.encoder
-        if encoder.fresh or not _shares_trunk(policy, self.network):
+        num_fits, tensors = self._num_fits, [*self.network.tensors, self._mean, self._scale]
+        tensors += self._target_network.tensors if self._lags else []
+        try:
+            with self._optimiser.attempt(tensors) as readings:
+                readings.add(value=error_V.square().mean())
+                readings.add(spread=target_V.var(correction=0), unexplained=error_V.var(correction=0))
+                self._fit_all(rollout, target_V, generator, readings)
+        except PgtsError:
+            self._num_fits = num_fits
+            raise
+        found = readings.means
+        return {
+            "value": found["value"],
+            "explained_variance": 1 - found["unexplained"] / found["spread"] if found["spread"] else 0.0,
+            "value_grad_norm": found["value_grad_norm"],
+        }
+
+    def _fit_all(
+        self, rollout: Rollout, target_V: Float[Tensor, "V"], generator: torch.Generator, readings: Readings
+    ) -> None:
+        """Fit the network to these targets, and to those that it makes itself then, as often as the options say."""
+        alive_TB, encoder = rollout.alive_TB, self.network.trunk.encoder
+        observation_V, action_V = rollout.observation_V, rollout.action_TB[alive_TB]
+        if encoder.fresh or not _shares_trunk(self._policy, self.network):
             encoder.absorb(observation_V)
         input_V = self.network.encode(observation_V)
         fits, passes = (self.options.num_epochs, 1) if self.options.fresh_targets else (1, self.options.num_epochs)
-        norms = self._fit(input_V, action_V, target_V, passes, generator)
+        self._fit(input_V, action_V, target_V, passes, generator, readings)
         for _ in range(fits - 1):
-            norms += self._fit(input_V, action_V, self._targets(rollout)[1][alive_TB], passes, generator)
-        spread, unexplained = float(target_V.var(correction=0)), float(error_V.var(correction=0))
-        return {
-            "value": float(error_V.square().mean()),
-            "explained_variance": 1 - unexplained / spread if spread else 0.0,
-            "value_grad_norm": sum(norms) / len(norms),
-        }
+            self._fit(input_V, action_V, self._targets(rollout)[1][alive_TB], passes, generator, readings)
 
     def _fit(
         self,
@@ -160,12 +177,13 @@ class NetworkCritic(Critic):
         target_V: Float[Tensor, "V"],
         num_passes: int,
         generator: torch.Generator,
-    ) -> list[float]:
-        """Fit the network to given targets. Return the norms of the gradients."""
+        readings: Readings,
+    ) -> None:
+        """Fit the network to given targets."""
         if self.options.normalize_returns:
             self._rescale(target_V)
-        y_V = (target_V - self._mean) / self._scale if self._scale else torch.zeros_like(target_V)
-        columns, norms = (input_V, action_V, y_V.float()), []
+        y_V = torch.where(self._scale == 0, 0.0, (target_V - self._mean) / self._scale)
+        columns = input_V, action_V, y_V.float()
         for _ in range(num_passes):
             for input_N, action_N, y_N in minibatches(columns, self.options.minibatch_size, generator=generator):
                 made = Forward(self.network, input_N)
@@ -177,10 +195,9 @@ class NetworkCritic(Critic):
                 else:
                     down_ND = torch.zeros_like(made.output_ND).scatter_(-1, action_N[:, None], down_N1)
                 gradients, loss = made.gradients(down_ND), off_N.square().mean()
-                norms.append(self._optimiser.step(self.network.weights, gradients, loss, "value"))
+                readings.add(value_grad_norm=self._optimiser.step(self.network.weights, gradients, loss, "value"))
         self._num_fits += 1
         self._move_target_network()
-        return norms
 
     def v(self, observation_N: Tensor) -> Float[Tensor, "N"]:
         """The network's value; for a network of Q, sum_a pi(a|o) Q(o, a)."""
@@ -200,8 +217,8 @@ class NetworkCritic(Critic):
         state = {
             "network": self.network.plain_state(),
             "optimiser": self._optimiser.state_dict(),
-            "mean": self._mean,
-            "scale": self._scale,
+            "mean": float(self._mean),
+            "scale": float(self._scale),
             "num_fits": self._num_fits,
         }
         return state | ({"target_network": self._target_network.plain_state()} if self._lags else {})
@@ -221,8 +238,9 @@ class NetworkCritic(Critic):
             self._target_network.load_plain_state(state["target_network"])
         self._optimiser.load_state_dict(state["optimiser"])
         self._optimiser.check_fits(self.network.weights)
-        self._queried = None
-        self._mean, self._scale, self._num_fits = state["mean"], state["scale"], state["num_fits"]
+        self._queried, self._num_fits = None, state["num_fits"]
+        self._mean.fill_(state["mean"])
+        self._scale.fill_(state["scale"])
 
     def _values(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N D"]:
         """The network's outputs in reward units."""
@@ -254,16 +272,19 @@ class NetworkCritic(Critic):
     def _rescale(self, target_V: Float[Tensor, "V"]) -> None:
         """Update mean and scale by the targets, and rescale the heads so that values in reward units stay the same."""
         rate = max(1 / (self._num_fits + 1), _SLOWEST_RATE)
-        old_mean, old_scale = self._mean, self._scale
-        new_mean, new_var = float(target_V.mean()), float(target_V.var(correction=0))
+        old_mean, old_scale = self._mean.clone(), self._scale.clone()
+        new_mean, new_var = target_V.mean().double(), target_V.var(correction=0).double()
         mean = old_mean + rate * (new_mean - old_mean)
         spread = (1 - rate) * (old_scale**2 + (old_mean - mean) ** 2) + rate * (new_var + (new_mean - mean) ** 2)
         # A deviation below the rounding error of the targets is replaced by it. If all targets are 0, so is the scale.
-        self._mean, self._scale = mean, max(math.sqrt(spread), _ROUNDING * float(target_V.abs().max()))
-        if self._num_fits and self._scale:
+        self._mean.copy_(mean)
+        self._scale.copy_(torch.maximum(spread.sqrt(), _ROUNDING * target_V.abs().max()))
+        if self._num_fits:
+            factor = torch.where(self._scale == 0, 1.0, old_scale / self._scale)
+            shift = torch.where(self._scale == 0, 0.0, (old_mean - mean) / self._scale)
             for network in {self.network, self._target_network}:
-                network.head.weight.mul_(old_scale / self._scale)
-                network.head.bias.mul_(old_scale / self._scale).add_((old_mean - self._mean) / self._scale)
+                network.head.weight.mul_(factor)
+                network.head.bias.mul_(factor).add_(shift)
 
     @torch.no_grad()
     def _move_target_network(self) -> None:
@@ -272,5 +293,5 @@ class NetworkCritic(Critic):
         self._target_network.follow(self.network, self.options.polyak)
 
 
-def _shares_trunk(policy: Policy, network: Network) -> bool:
+def _shares_trunk(policy: Policy | None, network: Network) -> bool:
     return isinstance(policy, NetworkPolicy) and policy.network.trunk is network.trunk

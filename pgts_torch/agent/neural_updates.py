@@ -8,12 +8,10 @@ from the action taken, A_t / pi(a_t|s_t) for it and 0 for the others, a row for 
     sum_a pi_old(a|s) min(rho_a adv, clip(rho_a) adv)           is                    min(rho A_t, clip(rho) A_t)
 """
 
-import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import torch
 from jaxtyping import Float
@@ -23,24 +21,14 @@ from pgts_torch.agent.gradients import Forward, through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural import NetworkPolicy
-from pgts_torch.agent.optimisers import Optimiser, Undo, minibatches
+from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.updates import Update
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.options.fields import limit
 from pgts_torch.options.updates import PPO, Gradient
+from pgts_torch.readings import Readings
 from pgts_torch.search.lookahead import check_finite
-
-
-class Move(NamedTuple):
-    """The result of the steps of an update.
-
-    old_NA, new_NA: log pi before and after them, without gradient.   losses: losses and diagnostics, by name.
-    """
-
-    old_NA: Float[Tensor, "N A"]
-    new_NA: Float[Tensor, "N A"]
-    losses: dict[str, float]
 
 
 class NetworkUpdate(Update):
@@ -59,7 +47,6 @@ class NetworkUpdate(Update):
             max_grad_norm=limit(options.max_grad_norm),
             method=options.optimizer,
         )
-        self._undo = Undo()
 
     def __call__(self, policy: Policy, batch: Batch, *, generator: torch.Generator) -> dict[str, float]:
         """Take the gradient steps.
@@ -74,31 +61,20 @@ class NetworkUpdate(Update):
             PgtsError: all weights are 0.
         """
         assert isinstance(policy, NetworkPolicy)
-        _check_numbers(batch.advantage_NA, batch.weight_N)
-        with self._restored_unless_finite(policy):
-            network, encoder = policy.network, policy.network.trunk.encoder
+        network, encoder = policy.network, policy.network.trunk.encoder
+        with self._optimiser.attempt(network.tensors) as readings:
+            _check_numbers(batch.advantage_NA, batch.weight_N, readings)
             if fresh := encoder.fresh:
                 encoder.absorb(batch.observation_N)
             weight_N = batch.weight_N.float()
             input_N = network.encode(batch.observation_N)
-            old_NA, new_NA, losses = self.move(network, input_N, replace(batch, weight_N=weight_N), generator)
-            check_finite("probability", "the next policy", new_NA, None)
+            old_NA, new_NA = self.move(network, input_N, replace(batch, weight_N=weight_N), generator, readings)
+            readings.check(new_NA.sum(), lambda _: check_finite("probability", "the next policy", new_NA, None))
             weight_N = weight_N / weight_N.sum()
-            losses["entropy"] = float(weight_N @ entropy(new_NA))
-            losses["kl"] = float(weight_N @ divergence(old_NA, new_NA))
+            readings.add(entropy=weight_N @ entropy(new_NA), kl=weight_N @ divergence(old_NA, new_NA))
             if not fresh:
                 encoder.absorb(batch.observation_N)
-        return losses
-
-    @contextmanager
-    def _restored_unless_finite(self, policy: NetworkPolicy) -> Iterator[None]:
-        """A context that restores policy and optimiser where it is left by NotFinite."""
-        self._undo.keep(policy.network.tensors, self._optimiser)
-        try:
-            yield
-        except NotFinite:
-            self._undo.restore(self._optimiser)
-            raise
+        return readings.means
 
     def state_dict(self) -> dict[str, Any]:
         return self._optimiser.state_dict()
@@ -112,10 +88,19 @@ class NetworkUpdate(Update):
             self._optimiser.check_fits(policy.network.weights)
 
     @abstractmethod
-    def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
-        """Take the gradient steps of this kind of update; `input_N` are the encoded observations of the batch."""
+    def move(
+        self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator, readings: Readings
+    ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
+        """Take the gradient steps of this kind of update, and add losses and diagnostics to the readings.
 
-    def step(self, network: Network, made: Forward, loss: Tensor, down_NA: Float[Tensor, "N A"]) -> float:
+        Args:
+            input_N: the encoded observations of the batch.
+
+        Returns:
+            log pi before and after the steps, without gradient.
+        """
+
+    def step(self, network: Network, made: Forward, loss: Tensor, down_NA: Float[Tensor, "N A"]) -> Tensor:
         """Take one step down a loss (see `Optimiser.step`), whose gradient in the logits of `made` is given. Return the
         norm of its gradient."""
         return self._optimiser.step(network.weights, made.gradients(down_NA), loss, "policy")
@@ -135,7 +120,9 @@ class GradientUpdate(NetworkUpdate):
     def __init__(self, options: Gradient = Gradient()) -> None:  # noqa: B008 - frozen
         super().__init__(options)
 
-    def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
+    def move(
+        self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator, readings: Readings
+    ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
         """Losses: policy, minus the objective without entropy, before the step; grad_norm, before clipping."""
         made, coef = Forward(network, input_N), self.options.entropy_coef
         log_NA, slope_NA = made.output_ND.log_softmax(-1), batch.advantage_NA.float()
@@ -146,7 +133,8 @@ class GradientUpdate(NetworkUpdate):
             loss, slope_NA = loss - coef * (batch.weight_N @ entropy(log_NA)), slope_NA - coef * (log_NA + 1)
         down_NA = -batch.weight_N[:, None] * slope_NA * pi_NA
         norm = self.step(network, made, loss, through_log_softmax(log_NA, down_NA))
-        return Move(log_NA, log_probs(network, input_N), {"policy": float(policy_loss), "grad_norm": norm})
+        readings.add(policy=policy_loss, grad_norm=norm)
+        return log_NA, log_probs(network, input_N)
 
 
 @final
@@ -167,14 +155,16 @@ class PPOUpdate(NetworkUpdate):
     def __init__(self, options: PPO = PPO()) -> None:  # noqa: B008 - frozen
         super().__init__(options)
 
-    def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
+    def move(
+        self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator, readings: Readings
+    ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
         """Losses: policy, minus the objective without entropy, mean over the steps; grad_norm, mean, before clipping;
         clip_fraction, the probability of actions whose rho is out of range after the steps; num_steps."""
         old_NA, advantage_NA = log_probs_before(network, input_N, batch), batch.advantage_NA.float()
         weight_N = batch.weight_N / batch.weight_N.mean()
         if self.options.normalize_advantage:
             advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N)
-        columns, policy_losses, norms = (input_N, old_NA, advantage_NA, weight_N), [], []
+        columns, num_steps = (input_N, old_NA, advantage_NA, weight_N), 0
         made = passes(network, columns, self.options.num_epochs, self.options.minibatch_size, generator)
         for forward, log_NA, (_, before_NA, part_NA, part_N) in made:
             if (
@@ -185,17 +175,15 @@ class PPOUpdate(NetworkUpdate):
             gain_NA, push_NA = self.objective(log_NA, before_NA, part_NA)
             policy_loss = -mean(part_N, (before_NA.exp() * gain_NA).sum(-1))
             down_NA = through_log_softmax(log_NA, -push_NA * (part_N / len(part_N))[:, None])
-            norms.append(self.step(network, forward, policy_loss, down_NA))
-            policy_losses.append(float(policy_loss))
+            readings.add(policy=policy_loss, grad_norm=self.step(network, forward, policy_loss, down_NA))
+            num_steps += 1
         new_NA = log_probs(network, input_N)
         outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.options.clip_range
-        losses = {
-            "policy": sum(policy_losses) / len(policy_losses),
-            "grad_norm": sum(norms) / len(norms),
-            "clip_fraction": float(mean(weight_N, (old_NA.exp() * outside_NA).sum(-1))),
-            "num_steps": len(norms),
-        }
-        return Move(old_NA, new_NA, losses)
+        readings.add(
+            clip_fraction=mean(weight_N, (old_NA.exp() * outside_NA).sum(-1)),
+            num_steps=num_steps,
+        )
+        return old_NA, new_NA
 
     def objective(
         self, log_NA: Float[Tensor, "N A"], old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"]
@@ -260,13 +248,20 @@ def _scale(
     return mean(weight_N, size_N.square()).sqrt() + 1e-8
 
 
-def _check_numbers(advantage_NA: Tensor, weight_N: Tensor) -> None:
-    for name, value in (("advantage_NA", advantage_NA), ("weight_N", weight_N)):
-        if math.isfinite(value.sum()):
-            continue
-        off = torch.nonzero(~value.isfinite())
-        if len(off):
-            number = float(value[tuple(off[0])])
-            raise NotFinite(f"{name}{off[0].tolist()} is {number}; it must be finite", what=name.partition("_")[0])
+def _check_numbers(advantage_NA: Tensor, weight_N: Tensor, readings: Readings) -> None:
+    total = weight_N.sum()
+    is_weight = (total > 0) & (weight_N.min() >= 0)
+    readings.check(advantage_NA.sum(), lambda _: _refuse_off("advantage", "advantage_NA", advantage_NA))
+    readings.check(torch.where(is_weight, total, torch.nan), lambda _: _refuse_weights(weight_N))
+
+
+def _refuse_off(what: str, name: str, value: Tensor) -> None:
+    off = torch.nonzero(~value.isfinite())
+    if len(off):
+        raise NotFinite(f"{name}{off[0].tolist()} is {float(value[tuple(off[0])])}; it must be finite", what=what)
+
+
+def _refuse_weights(weight_N: Tensor) -> None:
+    _refuse_off("weight", "weight_N", weight_N)
     if not float(weight_N.sum()) > 0 or float(weight_N.min()) < 0:
         raise PgtsError(f"weight_N is {weight_N.tolist()[:8]}; weights are at least 0, and one must be positive")

@@ -1,7 +1,9 @@
-"""Gradient steps on networks, which raise NotFinite before a parameter would change by infinity or NaN."""
+"""Gradient steps on networks, which are taken back where one of them meets infinity or NaN."""
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from typing import Any, Literal, final
 
 import torch
@@ -9,6 +11,7 @@ from torch import Tensor, nn
 
 from pgts_torch.agent.policies import fitting
 from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.readings import Readings
 
 _BETAS = 0.9, 0.999
 _EPSILON = 1e-8
@@ -22,6 +25,7 @@ class Optimiser:
         sgd:    theta <- theta - learning_rate g
 
     All gradients are concatenated into one vector, because for a small network the calls cost more than the numbers.
+    A step reads nothing back from the device; what is not finite is found when the steps of an `attempt` are over.
 
     Args:
         learning_rate: above 0.
@@ -36,6 +40,29 @@ class Optimiser:
         self.num_steps = 0
         self._first_D: Tensor | None = None
         self._second_D: Tensor | None = None
+        self._undo, self._readings = Undo(), Readings()
+
+    @contextmanager
+    def attempt(self, tensors: Sequence[Tensor]) -> Iterator[Readings]:
+        """A context of steps, at the end of which their numbers are read, with all others that were added.
+
+        Args:
+            tensors: what is changed in the context. They and the optimiser are as before where it raises PgtsError.
+
+        Raises:
+            NotFinite: the loss of a step, its gradient or the step is not finite. It is raised in place of an error
+                that such a step has led to in the context.
+        """
+        self._readings = readings = Readings()
+        self._undo.keep(tensors, self)
+        try:
+            try:
+                yield readings
+            finally:
+                readings.read()
+        except PgtsError:
+            self._undo.restore(self)
+            raise
 
     def step(
         self,
@@ -43,8 +70,9 @@ class Optimiser:
         gradients: Sequence[Tensor],
         loss: Tensor,
         name: str,
-    ) -> float:
-        """Take a step; the parameters must be the same in each call. Return the norm of the gradient before clipping.
+    ) -> Tensor:
+        """Take a step, inside an `attempt`; the parameters must be the same in each call. Return the norm of the
+        gradient before clipping.
 
         Args:
             gradients: of the loss, one for each parameter.
@@ -52,18 +80,18 @@ class Optimiser:
             name: of the loss, in errors.
 
         Raises:
-            NotFinite: the loss, its gradient or the step is not finite. No parameter has changed then.
             PgtsError: the moments are those of other parameters.
         """
         with torch.no_grad():
             gradient_D = torch.cat([piece.reshape(-1) for piece in gradients])
-            norm = float(torch.linalg.vector_norm(gradient_D))
-            _check_finite("loss", f"the {name} loss", float(loss.detach()))
-            _check_finite("gradient", f"the gradient of the {name} loss", norm)
-            if self.max_grad_norm is not None and norm > self.max_grad_norm:
-                gradient_D *= self.max_grad_norm / norm
+            norm = torch.linalg.vector_norm(gradient_D)
+            if self.max_grad_norm is not None:
+                limit = torch.full_like(norm, self.max_grad_norm, dtype=torch.float64)
+                gradient_D *= limit.div_(norm).clamp_(max=1)
             step_D = self._adam(gradient_D) if self.method == "adam" else gradient_D.mul_(-self.learning_rate)
-            _check_finite("gradient", f"the step down the {name} loss", float(step_D.sum()))
+            self._readings.check(loss, partial(_refuse, "loss", f"the {name} loss"))
+            self._readings.check(norm, partial(_refuse, "gradient", f"the gradient of the {name} loss"))
+            self._readings.check(step_D.sum(), partial(_refuse, "gradient", f"the step down the {name} loss"))
             moved: list[Tensor] = list(parameters)
             pieces = step_D.split([parameter.numel() for parameter in moved])
             torch._foreach_add_(moved, [piece.view_as(like) for piece, like in zip(pieces, moved, strict=True)])
@@ -152,9 +180,8 @@ class Undo:
         optimiser.rewind(self._num_steps)
 
 
-def _check_finite(what: str, name: str, value: float) -> None:
-    if not math.isfinite(value):
-        raise NotFinite(f"{name} is {value}; no parameter was changed", what=what)
+def _refuse(what: str, name: str, value: float) -> None:
+    raise NotFinite(f"{name} is {value}; no parameter was changed", what=what)
 
 
 def minibatches(columns: Sequence[Tensor], size: int, *, generator: torch.Generator) -> Iterator[tuple[Tensor, ...]]:

@@ -10,8 +10,9 @@ from torch import Tensor
 from pgts_torch.agent.gradients import through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
-from pgts_torch.agent.neural_updates import Move, NetworkUpdate, divergence, log_probs, log_probs_before, mean, passes
+from pgts_torch.agent.neural_updates import NetworkUpdate, divergence, log_probs, log_probs_before, mean, passes
 from pgts_torch.options.updates import CMPO, Mirror
+from pgts_torch.readings import Readings
 
 
 class TargetUpdate(NetworkUpdate):
@@ -29,26 +30,29 @@ class TargetUpdate(NetworkUpdate):
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
         """Return step(s, a)."""
 
-    def move(self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator) -> Move:
+    def move(
+        self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator, readings: Readings
+    ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
         """Losses: policy, mean_s w(s) KL(target || pi) after the steps; grad_norm, mean over the steps, unclipped.
 
         Where step(s, a) is 0 everywhere no gradient step is taken, because Adam would turn rounding errors into one.
         """
         old_NA, exponent_NA = log_probs_before(network, input_N, batch), self.exponent(batch)
         if not bool(exponent_NA.any()):
-            return Move(old_NA, old_NA, {"policy": 0.0, "grad_norm": 0.0})
+            readings.add(policy=0.0, grad_norm=0.0)
+            return old_NA, old_NA
         target_NA = (old_NA + exponent_NA).log_softmax(-1)
         weight_N = batch.weight_N / batch.weight_N.mean()
-        columns, norms = (input_N, target_NA, weight_N), []
+        columns = input_N, target_NA, weight_N
         made = passes(network, columns, self.options.num_epochs, self.options.minibatch_size, generator)
         for forward, log_NA, (_, part_NA, part_N) in made:
             # Of KL(target || pi) in log pi it is -target, and so in the logits pi - target.
             down_NA = -(part_N * (1 / len(part_N)))[:, None] * part_NA.exp()
             loss = mean(part_N, divergence(part_NA, log_NA))
-            norms.append(self.step(network, forward, loss, through_log_softmax(log_NA, down_NA)))
+            readings.add(grad_norm=self.step(network, forward, loss, through_log_softmax(log_NA, down_NA)))
         new_NA = log_probs(network, input_N)
-        after = float(mean(weight_N, divergence(target_NA, new_NA)))
-        return Move(old_NA, new_NA, {"policy": after, "grad_norm": sum(norms) / len(norms)})
+        readings.add(policy=mean(weight_N, divergence(target_NA, new_NA)))
+        return old_NA, new_NA
 
 
 @final
@@ -84,15 +88,13 @@ class CMPOUpdate(TargetUpdate):
         super().__init__(options)
 
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
-        scale = max(advantage_scale(batch.advantage_NA, batch.weight_N), batch.noise)
-        if scale == 0:  # all actions have the same advantage
-            return torch.zeros_like(batch.advantage_NA, dtype=torch.float32)
-        return (
-            (batch.advantage_NA / scale / self.options.temperature).clamp(-self.options.clip, self.options.clip).float()
-        )
+        scale = advantage_scale(batch.advantage_NA, batch.weight_N).clamp(min=batch.noise)
+        step_NA = batch.advantage_NA / scale / self.options.temperature
+        # if all actions have the same advantage, scale is 0
+        return torch.where(scale == 0, 0.0, step_NA.clamp(-self.options.clip, self.options.clip)).float()
 
 
-def advantage_scale(advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]) -> float:
+def advantage_scale(advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]) -> Float[Tensor, ""]:
     """mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|: the mean size of advantages, in reward units."""
     size_N = (advantage_NA - advantage_NA.mean(-1, keepdim=True)).abs().mean(-1).double()
-    return float((weight_N.double() / weight_N.double().sum()) @ size_N)
+    return (weight_N.double() / weight_N.double().sum()) @ size_N

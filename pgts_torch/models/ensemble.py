@@ -131,9 +131,13 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         ended = trained[self.replay.rows("end", trained) > 0]
         self._end_share = len(ended) / len(trained)
         count = self.options.first_updates if is_first else round(self.options.updates_per_step * len(states))
-        loss = sum(self._fit(trained, ended, generator) for _ in range(count)) / max(count, 1)
+        losses = [self._fit(trained, ended, generator) for _ in range(count)]
+        found = torch.stack(losses).tolist() if losses else []
+        for value in found:
+            if not math.isfinite(value):
+                raise NotFinite(f"the loss of the learned model is {value}", what="model")
         self.generation += 1
-        return {"loss": loss, **self._errors(held_out)}
+        return {"loss": sum(found) / max(count, 1), **self._errors(held_out)}
 
     def _checked(self, experience: Experience) -> Float[Tensor, "N D"]:
         observation_N, discount_N = experience.observation_N, experience.discount_N
@@ -164,8 +168,9 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         seen = {"state": state_ND, "change": next_ND - state_ND, "reward": reward_N[:, None]}
         self._networks.measure(seen, rescale=self.generation > 0)  # before nothing is predicted
 
-    def _fit(self, trained: Int[Tensor, "R"], ended: Int[Tensor, "Q"], generator: torch.Generator) -> float:
-        """Take one gradient step, with a minibatch for each member. Return the loss.
+    def _fit(self, trained: Int[Tensor, "R"], ended: Int[Tensor, "Q"], generator: torch.Generator) -> Tensor:
+        """Take one gradient step, with a minibatch for each member, but none where the loss is not finite. Return the
+        loss; nothing is read back from the device.
 
         Args:
             trained: the rows that are not held out.
@@ -195,11 +200,10 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         )
         self._optimiser.zero_grad()
         loss.backward()
-        value = float(loss.detach())
-        if not value < float("inf"):
-            raise NotFinite(f"the loss of the learned model is {value}", what="model")
+        # What torch's gradient scaler sets: a step with it is left out, without a branch on the host.
+        self._optimiser.found_inf = (~loss.detach().isfinite()).float()  # type: ignore[attr-defined]  # Adam reads it
         self._optimiser.step()
-        return value
+        return loss.detach()
 
     @torch.no_grad()
     def members(self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]) -> Prediction:

@@ -36,7 +36,7 @@ def test_the_scale_is_the_usual_difference_between_actions():
     advantage_NA, weight_N = question()
     rows = zip(advantage_NA.tolist(), weight_N.tolist(), strict=True)
     by_hand = sum(w * sum(abs(x - sum(row) / 3) for x in row) / 3 for row, w in rows) / float(weight_N.sum())
-    assert advantage_scale(advantage_NA, weight_N) == pytest.approx(by_hand, rel=1e-12)
+    assert float(advantage_scale(advantage_NA, weight_N)) == pytest.approx(by_hand, rel=1e-12)
 
 
 def test_a_network_that_can_be_any_policy_ends_at_the_clipped_target():

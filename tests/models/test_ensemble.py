@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -217,6 +218,24 @@ def test_a_loaded_model_goes_on_bit_for_bit():
     state_ND, action_N = torch.randn(8, 2, generator=stream(0, "test")), torch.arange(8) % 2
     for mine, its in zip(one.step(state_ND, action_N), other.step(state_ND, action_N), strict=True):
         assert mine.equal(its)
+
+
+@pytest.mark.parametrize("spoiled", [False, True])
+def test_steps_down_a_loss_that_is_not_finite_are_left_out_and_refused_when_all_losses_are_read(spoiled, monkeypatch):
+    model = EnsembleModel(2, 2, gamma=GAMMA, options=Ensemble(members=2, hidden=[32], first_updates=20))
+    plain, calls = EnsembleNetworks.outputs, iter(range(10**6))
+
+    def outputs(networks: EnsembleNetworks, x: torch.Tensor) -> torch.Tensor:
+        return plain(networks, x) * (math.nan if spoiled and next(calls) >= 3 else 1.0)
+
+    monkeypatch.setattr(EnsembleNetworks, "outputs", outputs)
+    before = model.state_dict()["weights"]
+    with pytest.raises(NotFinite, match="the loss of the learned model is nan") if spoiled else nullcontext():
+        model.learn(swing(50), generator=stream(0, "learn"))
+    after = model.state_dict()["weights"]
+    assert all(weight.isfinite().all() for weight in after)
+    assert not torch.equal(before[0], after[0])
+    assert all(int(each["step"]) == (3 if spoiled else 20) for each in model.state_dict()["optimiser"].values())
 
 
 def test_what_cannot_be_learned_is_refused():
