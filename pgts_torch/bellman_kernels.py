@@ -18,6 +18,9 @@ from pgts_torch.compiled import jit
 _AHEAD = 64
 """How many outcomes ahead a value is fetched from memory."""
 
+_CACHE, _NEAR = 2**20, 2**17
+"""Bytes of values that a cache near the processor holds, and within which values are near each other."""
+
 
 @intrinsic
 def _fetch(context: Any, values: Any, index: Any) -> Any:
@@ -39,29 +42,43 @@ def _fetch(context: Any, values: Any, index: Any) -> Any:
 
 
 @jit
+def is_scattered(child, outcomes, v):  # type: ignore[no-untyped-def]
+    """Whether most of 64 neighbouring states have children that are not near each other, and no cache holds them all."""
+    if v.nbytes <= _CACHE:
+        return False
+    N, balance = len(child) // outcomes, 0
+    for k in range(1, 65):
+        n = k * (N - 1) // 64
+        one, other = np.int64(child[n * outcomes]), np.int64(child[max(n - 1, 0) * outcomes])
+        balance += 1 if abs(one - other) * v.itemsize > _NEAR else -1
+    return balance > 0
+
+
+@jit
 def back_up(reward, weight, child, A, K, v, times, q):  # type: ignore[no-untyped-def]
     """v after `times` sweeps v <- max_a q; with the last of them q is written too, unless it is empty."""
     N, size = len(reward) // A, weight.dtype.type(1)
-    # Values are fetched ahead where a cache near the processor does not hold them all, as far as there are outcomes.
-    far = max(0, N - _AHEAD // (A * K) - 1) if v.nbytes > 2**20 else 0
+    # Values are fetched ahead where a cache near the processor does not hold them, as far as there are outcomes.
+    far = max(0, N - _AHEAD // (A * K) - 1) if is_scattered(child, A * K, v) else 0
     fours, all_k, none = np.uint64(K // 4 * 4), np.uint64(K), np.uint64(0)
     one, two, three, four = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)  # a signed step is looked after too
-    zero = size - size
+    zero, ahead = size - size, np.uint64(_AHEAD)
     old, new = v, np.empty(N, v.dtype)
     for sweep in range(times):
         i, m = none, none  # counts outcomes, and pairs of state and action
         for n in range(N):
-            ahead, highest = np.uint64(_AHEAD) if n < far else none, -np.inf * size
+            fetches, highest = n < far, -np.inf * size
             for _ in range(A):
                 # The order of the sum is that of torch's product in float64: of four at a time, the even and the odd
                 # ones by themselves; then those that are left, one after another.
                 even, odd = zero, zero
                 end, end_of_fours = i + all_k, i + fours
                 while i < end_of_fours:
-                    _fetch(old, child[i + ahead])
-                    _fetch(old, child[i + one + ahead])
-                    _fetch(old, child[i + two + ahead])
-                    _fetch(old, child[i + three + ahead])
+                    if fetches:
+                        _fetch(old, child[i + ahead])
+                        _fetch(old, child[i + one + ahead])
+                        _fetch(old, child[i + two + ahead])
+                        _fetch(old, child[i + three + ahead])
                     even += weight[i] * old[child[i]]
                     odd += weight[i + one] * old[child[i + one]]
                     even += weight[i + two] * old[child[i + two]]
@@ -69,7 +86,8 @@ def back_up(reward, weight, child, A, K, v, times, q):  # type: ignore[no-untype
                     i += four
                 total = even + odd
                 while i < end:
-                    _fetch(old, child[i + ahead])
+                    if fetches:
+                        _fetch(old, child[i + ahead])
                     total += weight[i] * old[child[i]]
                     i += one
                 total += reward[m]

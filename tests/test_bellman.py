@@ -109,6 +109,20 @@ def test_compiled_backups_are_those_of_torch(shape, unit, dtype, monkeypatch):
         assert shape[2] > 3 or torch.equal(got, wanted)
 
 
+@pytest.mark.parametrize("apart", [1000, 140_000])
+def test_values_are_fetched_ahead_where_children_are_scattered_and_no_value_depends_on_it(apart):
+    kernels = pytest.importorskip("pgts_torch.bellman_kernels", exc_type=ImportError)
+    few = some_outcomes(200_000, 2, 5)
+    near_N = torch.arange(200_000)[:, None, None] + few.child_NAK % apart - apart // 2
+    outcomes = Outcomes(few.reward_NA, few.prob_NAK, few.discount_NAK, near_N.clamp(0, 199_999), 200_000)
+    v_S = torch.randn(200_000, dtype=torch.float64, generator=stream(0, "v"))
+    assert kernels.is_scattered(outcomes.arrays[2], 10, v_S.numpy()) == (apart > 1000)
+    assert not kernels.is_scattered(outcomes.arrays[2], 10, v_S.numpy()[:1000])  # a cache holds them all
+    with compiled.torch_only():
+        expected = sweep(outcomes, v_S, 2)
+    torch.testing.assert_close(sweep(outcomes, v_S, 2), expected, rtol=1e-12, atol=1e-12)
+
+
 def test_what_is_not_a_number_comes_out_as_that(form):
     outcomes = some_outcomes(20, 3, 2)
     v_S = torch.zeros(20, dtype=torch.float64)
