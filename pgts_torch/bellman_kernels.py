@@ -43,7 +43,7 @@ def _fetch(context: Any, values: Any, index: Any) -> Any:
 
 @jit
 def is_scattered(child, outcomes, v):  # type: ignore[no-untyped-def]
-    """Whether most of 64 neighbouring states have children that are not near each other, and no cache holds them all."""
+    """Whether most of 64 neighbouring states have children far from each other, and no cache holds all values."""
     if v.nbytes <= _CACHE:
         return False
     N, balance = len(child) // outcomes, 0
