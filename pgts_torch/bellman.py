@@ -189,9 +189,8 @@ def swept_backup(outcomes: Outcomes, v_C: Float[Tensor, "C"], sweeps: int) -> Fl
         _compiled(arrays, v_C, sweeps + 1, q_NA.reshape(-1))
         return torch.from_numpy(q_NA)
     with torch.no_grad():
-        v_C = sweep(outcomes, v_C, sweeps) if sweeps else v_C.detach()
-        # In place: a second table of N * A fresh numbers would cost as much as the product itself.
-        return outcomes.expected(v_C).add_(outcomes.reward_NA)
+        v_C = sweep(outcomes, v_C, sweeps) if sweeps else v_C
+        return torch.addmv(outcomes.reward_NA.reshape(-1), outcomes.weight, v_C).view(outcomes.reward_NA.shape)
 
 
 def sweep(
@@ -213,10 +212,13 @@ def sweep(
         if outcomes.is_compiled and times:
             arrays = outcomes.arrays if action_S is None else _arrays(reward_NA, weight, outcomes.num_outcomes)
             return torch.from_numpy(_compiled(arrays, v_S, times, None))
+        if times == 0:
+            return v_S.clone()
         reward = reward_NA.reshape(-1)
-        q, v_S = torch.empty_like(reward), v_S.clone()
+        q = torch.addmv(reward, weight, v_S)
         q_NA = q.view(reward_NA.shape)
-        for _ in range(times):
+        v_S = q_NA.amax(-1)
+        for _ in range(times - 1):
             torch.addmv(reward, weight, v_S, out=q)
             torch.amax(q_NA, -1, out=v_S)
         return v_S

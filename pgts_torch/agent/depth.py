@@ -11,6 +11,7 @@ from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.ranks import Draws
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.bellman import policy_mean
+from pgts_torch.readings import Readings
 from pgts_torch.search.lookahead import Lookahead, check_finite
 
 
@@ -74,15 +75,22 @@ class DepthChoice:
             NotFinite: v(s) = <pi(.|s), Q(s, .)> is not finite.
         """
         state_N, occupancy_N = experience.visits("occupancy")
-        shallow = self.look.in_parts(state_N, 0, draws.search())
+        readings = Readings()
+        shallow = self.look.in_parts(state_N, 0, draws.search(), readings)
         v_N = policy_mean(pi_NA, shallow.q_BA)
-        check_finite("value", "the policy's value", v_N, state_N)
+        check_finite("value", "the policy's value", v_N, state_N, readings)
+        readings.read()
         starts = self._certificates.starts(experience, state_N, v_N)
         for depth in self.depths:
-            look = self.look.in_parts(state_N, depth, draws.search()) if depth else shallow
+            look = self.look.in_parts(state_N, depth, draws.search(), readings) if depth else shallow
+            readings.read()
             gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
             bound = self._certificates.bound(starts, (state_N, v_N, occupancy_N), look, depth, draws.number + 1)
             is_enough = self.stop_at is not None and bound.certificate <= self.stop_at
-            if is_enough or float(gap_N.double() @ occupancy_N) > self.tolerance * bound.visited:
+            if (
+                is_enough
+                or depth == self.depths[-1]
+                or float(gap_N.double() @ occupancy_N) > self.tolerance * bound.visited
+            ):
                 break
         return Chosen(depth, look, gap_N, bound.certificate, is_enough)

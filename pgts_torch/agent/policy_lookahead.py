@@ -14,6 +14,7 @@ from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.world import ModelWorld
+from pgts_torch.readings import Readings
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Lookahead
 
@@ -40,14 +41,19 @@ class PolicyLookahead:
         leaves: dict[str, Any] = {f"{critic.target}_leaf": self._leaf, "prior": self._prior}
         self.alone: Callable[..., Lookahead] = partial(search, **leaves)
 
-    def in_parts(self, state_N: Int[Tensor, "N"], depth: int, generator: torch.Generator) -> Lookahead:
+    def in_parts(
+        self, state_N: Int[Tensor, "N"], depth: int, generator: torch.Generator, readings: Readings | None = None
+    ) -> Lookahead:
         """Return the lookahead from states that all ranks have; each rank computes its part of them.
+
+        Args:
+            readings: where the checks of values wait in a single process; of several ranks all must fail together.
 
         Raises:
             PgtsError, RankLost: as `Ranks.gather`.
         """
         if self._ranks.size == 1:
-            return self.alone(state_N, depth=depth, generator=generator)
+            return self.alone(state_N, depth=depth, generator=generator, readings=readings)
         mine = self._ranks.part(state_N)
         looks = self._ranks.gather(
             "lookahead",

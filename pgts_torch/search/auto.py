@@ -41,6 +41,7 @@ class AutoSearch(Search):
         NodeBudgetExceeded: from a search, where even one state a level, or one sample of each action, is too much.
     """
 
+    defers_checks = True
     choices = ("_width", "_too_much", "_samples", "_most_asked", "_picked")
 
     def __init__(self, model: Model, options: Auto = Auto()) -> None:  # noqa: B008 - frozen

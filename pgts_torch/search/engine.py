@@ -12,6 +12,7 @@ from torch import Tensor
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import EnumeratingModel, FallibleModel, Model, SamplingModel
 from pgts_torch.options.search import MCTS, Expectimax, Sampled
+from pgts_torch.readings import Readings
 from pgts_torch.search.empirical import FixedSamples
 from pgts_torch.search.expectimax import search_levels
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_finite
@@ -32,12 +33,14 @@ class Search(ABC):
     topology: what it remembers of a model that enumerates outcomes; None: it remembers no outcomes.
     choices: the names of the attributes by which earlier searches decide how later ones are made.
     uses_prior: whether it starts from the probabilities of the current policy.
+    defers_checks: whether it goes on without harm from values that are not finite.
     leaf_error: the error of the critic from which the doubt of the lookahead is computed; None: it is not.
     """
 
     topology: Topology | None = None
     choices: tuple[str, ...] = ()
     uses_prior: bool = False
+    defers_checks: bool = False
     leaf_error: float | None = None
 
     def __init__(self, model: Model) -> None:
@@ -53,12 +56,14 @@ class Search(ABC):
         v_leaf: Leaf | None = None,
         prior: Leaf | None = None,
         generator: torch.Generator,
+        readings: Readings | None = None,
     ) -> Lookahead:
         """One search; the arguments are those of `expectimax`.
 
         Args:
             prior: the current policy, states [N] to probabilities [N, A]; for a search that `uses_prior`.
             generator: used only by searches that sample outcomes or noise; equal states of it give equal searches.
+            readings: where the checks wait whether values are finite; None: they are made at once.
 
         Raises:
             NotFinite: the value of the best action of a root is not finite.
@@ -66,9 +71,10 @@ class Search(ABC):
         """
         if self.uses_prior and prior is None:
             raise PgtsError("the prior of the search is that of the policy: give prior")
-        leaves = Leaves(self.model, depth, q_leaf, v_leaf, prior if self.uses_prior else None, self.leaf_error)
+        own_prior, waiting = prior if self.uses_prior else None, readings if self.defers_checks else None
+        leaves = Leaves(self.model, depth, q_leaf, v_leaf, own_prior, self.leaf_error, waiting)
         look = self.look_ahead(leaves, root_B, generator)
-        check_finite("lookahead", "the lookahead", look.q_BA, root_B)
+        check_finite("lookahead", "the lookahead", look.q_BA, root_B, readings)
         self.model_calls += look.model_calls
         return look
 
@@ -130,6 +136,8 @@ class ExpectimaxSearch(Search):
     Args:
         model: enumerates outcomes.
     """
+
+    defers_checks = True
 
     def __init__(self, model: Model, options: Expectimax = Expectimax()) -> None:  # noqa: B008 - frozen
         super().__init__(model)

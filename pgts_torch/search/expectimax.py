@@ -6,6 +6,7 @@ from torch import Tensor
 
 from pgts_torch.models.base import EnumeratingModel, FallibleModel
 from pgts_torch.options.search import MAX_NODES, Expectimax
+from pgts_torch.readings import Readings
 from pgts_torch.search.levels import Levels
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, checked_errors
 from pgts_torch.search.pruned import pruned
@@ -23,6 +24,7 @@ def expectimax(
     max_nodes: int = MAX_NODES,
     max_width: int | None = None,
     leaf_error: float | Leaf | None = None,
+    readings: Readings | None = None,
 ) -> Lookahead:
     """(T^m Q)(s, .) at the roots for m = depth.        [PGTS Sec. 3]
 
@@ -47,6 +49,8 @@ def expectimax(
         leaf_error: a bound of the critic's error, against its policy's values in the environment: one number, or states
             to the shape of the critic's values; 0: it makes none. With it, and where the model is exact or says its own
             error (`FallibleModel`), the result has `doubt_BA`, at no further model call. None: it has none.
+        readings: where the check of the leaf values waits, so that a search from the roots of an earlier one, in the
+            same tensor, reads nothing back from a GPU. None: it is made at once.
 
     Raises:
         PgtsError: a bad depth or width, leaf_error with max_width, roots that are no states, leaf values of a wrong
@@ -55,7 +59,7 @@ def expectimax(
     """
     if max_width is not None or max_nodes is not MAX_NODES:  # checked, which takes longer than a small search
         Expectimax(max_width=max_width, max_nodes=max_nodes, doubt=leaf_error is not None)
-    leaves = Leaves(model, depth, q_leaf, v_leaf, leaf_error=leaf_error)
+    leaves = Leaves(model, depth, q_leaf, v_leaf, leaf_error=leaf_error, readings=readings)
     topology = topology_of(model, topology)
     return search_levels(leaves, topology, root_B, max_nodes=max_nodes, max_width=max_width)
 
@@ -68,7 +72,7 @@ def search_levels(
     if max_width is not None:
         return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
     calls_before, expansions = topology.table.model_calls, leaves.expansions
-    levels = topology.levels(root_B, expansions, max_nodes=max_nodes)
+    levels = topology.levels(root_B, expansions, max_nodes=max_nodes, readings=leaves.readings)
     bottom = levels.bottom(expansions)
     q_NA = levels.back_up(leaves.v(bottom), expansions) if expansions else leaves.q(bottom).clone()
     doubt_NA = None if leaves.leaf_error is None else _doubt(leaves, levels, topology.model, bottom)

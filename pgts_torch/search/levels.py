@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes, backup, sweep, swept_backup
@@ -20,12 +20,14 @@ class Levels:
     closed: outcomes of the closed set, with positions in it as children; None until a level brings no new state.
     closed_states: every state met so far, in the order of `closed`; all there are once there is a closed set.
     root_row_B: the position of each root in frontier 0.
+    given_B: the tensor in which the roots were given last.
     """
 
     frontiers: list[Int[Tensor, "N"]]
     root_row_B: Int[Tensor, "B"]
     outcomes: list[Outcomes] = field(default_factory=list)
     closed: Outcomes | None = None
+    given_B: Int[Tensor, "B"] | None = None
     closed_states: Int[Tensor, "N"] = field(init=False)
 
     _in_order: bool = field(init=False)
@@ -34,7 +36,7 @@ class Levels:
         roots = self.closed_states = self.frontiers[0]
         self._in_order = torch.equal(self.root_row_B, torch.arange(len(roots), device=roots.device))
 
-    def of_roots(self, q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "B A"]:
+    def of_roots(self, q_NA: Shaped[Tensor, "N ..."]) -> Shaped[Tensor, "B ..."]:
         """The rows of the roots, of those of frontier 0."""
         return q_NA if self._in_order else q_NA.index_select(0, self.root_row_B)
 

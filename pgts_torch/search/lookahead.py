@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.models.base import Model
+from pgts_torch.readings import Readings
 
 Leaf = Callable[[Tensor], Tensor]
 """A critic or a policy as a search calls it: states [N] to values of Q^pi [N, A] or of v^pi [N], or to pi [N, A]."""
@@ -136,6 +137,7 @@ class Leaves:
     """The critic's values of the states of one search, and the policy it may start from, both checked.
 
     calls: how often the critic was called.
+    readings: where the check of values waits that they are finite; None: it is made at once.
     expansions: how many levels are expanded: with Q at the bottom m, with v one more, for Q = r + gamma P v.
 
     Args:
@@ -158,13 +160,14 @@ class Leaves:
         v_leaf: Leaf | None,
         prior: Leaf | None = None,
         leaf_error: float | Leaf | None = None,
+        readings: Readings | None = None,
     ) -> None:
         if (q_leaf is None) == (v_leaf is None):
             raise PgtsError("give exactly one of q_leaf and v_leaf")
         self.calls = 0
         self.expansions = check_count("depth", depth, least=0) + (v_leaf is not None)
         self._model, self._q_leaf, self._v_leaf, self._prior = model, q_leaf, v_leaf, prior
-        self.leaf_error = leaf_error
+        self.leaf_error, self.readings = leaf_error, readings
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         """v, or max_a Q(s, a); PgtsError, with the state, if the critic's values are of a wrong shape or not finite."""
@@ -207,7 +210,7 @@ class Leaves:
             values = values.to(self._model.dtype)
         if values.shape != shape:
             raise PgtsError(f"the critic's values have shape {tuple(values.shape)}; of {len(state_N)} leaves: {shape}")
-        check_finite("value", "the critic's value", values, state_N)
+        check_finite("value", "the critic's value", values, state_N, self.readings)
         return values
 
 
@@ -239,10 +242,20 @@ def unexpanded(leaves: Leaves, root_B: Int[Tensor, "B"]) -> Lookahead:
     return Lookahead.enumerated(q_BA, model_calls=0, critic_calls=leaves.calls, nodes_per_level=(len(state_N),))
 
 
-def check_finite(what: str, name: str, value_N: Float[Tensor, "N ..."], state_N: Int[Tensor, "N"] | None) -> None:
+def check_finite(
+    what: str,
+    name: str,
+    value_N: Float[Tensor, "N ..."],
+    state_N: Int[Tensor, "N"] | None,
+    readings: Readings | None = None,
+) -> None:
     """NotFinite if a value is, naming its state, or else its row. Of several values of a state the best must be finite,
-    the others may be -inf: an action that is not allowed."""
-    if math.isfinite(value_N.sum()):  # one cheap call; only a sum that overflows makes it look closer in vain
+    the others may be -inf: an action that is not allowed. With readings it is raised when these are read."""
+    total = value_N.sum()  # one cheap call; only a sum that overflows makes it look closer in vain
+    if readings is not None:
+        readings.check(total, lambda _: check_finite(what, name, value_N, state_N))
+        return
+    if math.isfinite(total):
         return
     best_N = value_N if value_N.ndim == 1 else value_N.amax(-1)
     off = torch.nonzero(~best_N.isfinite())

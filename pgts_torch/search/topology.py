@@ -14,6 +14,7 @@ from pgts_torch.compiled import can_compile
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.options.search import MAX_BYTES
+from pgts_torch.readings import Readings
 from pgts_torch.search.levels import Levels
 from pgts_torch.search.lookahead import check_roots
 from pgts_torch.search.memory import Sizes, check_memory, check_nodes, search_bytes, tree_nodes
@@ -50,13 +51,17 @@ class Topology:
         """An empty one of the same model and limits."""
         return Topology(self.model, max_bytes=self.max_bytes)
 
-    def levels(self, root_B: Int[Tensor, "B"], expansions: int, *, max_nodes: int) -> Levels:
+    def levels(
+        self, root_B: Int[Tensor, "B"], expansions: int, *, max_nodes: int, readings: Readings | None = None
+    ) -> Levels:
         """The levels below `root_B`, at least `expansions` of them or a closed set.
 
         Args:
             root_B: states of the model, in any order, repeated or not.
             expansions: how many levels are to be expanded.
             max_nodes: the most nodes, summed over levels 0 .. expansions.
+            readings: with them roots in the tensor of an earlier search are taken to be the same without being read,
+                and the check of that waits.
 
         Raises:
             PgtsError: no roots, or one that is not a state of the model; the model has been reset since.
@@ -64,17 +69,29 @@ class Topology:
                 `max_bytes`; the model has not been queried for them.
         """
         self._check_generation()
-        key = root_B.dtype, root_B.shape, root_B.cpu().numpy().tobytes()
+        key = None if readings is None else self._recognised(root_B, readings)
+        if key is None:
+            key = root_B.dtype, root_B.shape, root_B.cpu().numpy().tobytes()
         levels = self._levels.get(key)
         if levels is None:
             levels = self._levels[key] = self._start(root_B)
             if len(self._levels) > _REMEMBERED_ROOTS:
                 self._levels.popitem(last=False)
+        levels.given_B = root_B
         self._levels.move_to_end(key)
         if levels.closed is None and len(levels.outcomes) < expansions:
             self._grow(levels, expansions, max_nodes)
         self._check_nodes(levels, expansions, expansions, max_nodes)
         return levels
+
+    def _recognised(self, root_B: Int[Tensor, "B"], readings: Readings) -> Hashable | None:
+        """The key of the levels whose roots were given in this tensor; None where there are none."""
+        for key, levels in self._levels.items():
+            if levels.given_B is root_B:
+                differ = torch.ne(root_B, levels.of_roots(levels.frontiers[0])).any()
+                readings.check(differ, _refuse_roots, is_good=lambda number: number == 0)
+                return key
+        return None
 
     # What these methods make outlives the call: ordinary tensors, also where the caller is in inference mode.
     @torch.inference_mode(False)
@@ -260,6 +277,10 @@ def _children_in(table: Outcomes, state_N: Int[Tensor, "N"]) -> Int[Tensor, "chi
     )
     count = level_kernels.children(state_N.numpy(), *table.arrays, met_S.numpy(), found.numpy())
     return found[:count].sort().values if count <= len(found) else torch.nonzero(met_S).flatten()
+
+
+def _refuse_roots(_: float) -> None:
+    raise PgtsError("the tensor of the roots has been written to since an earlier search: give each search its own")
 
 
 def topology_of(model: EnumeratingModel, topology: Topology | None) -> Topology:
