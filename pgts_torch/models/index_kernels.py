@@ -65,12 +65,12 @@ def enter(bits_RD, slots, number_L, hash_L):  # type: ignore[no-untyped-def]
 
 @jit
 def number(bits_RD, slots, first, hash_N, looks_N, number_N):  # type: ignore[no-untyped-def]
-    """Number the rows from the row `first` on: those that `looks_N` marks are looked up, and entered where they are
-    new. New rows move together behind `first`. How many are new, and how many are entered."""
-    count, entered = first, 0
+    """Number the rows from the row `first` on: those that `looks_N` marks (all if it is empty) are looked up, and
+    entered where they are new. New rows move together behind `first`. How many are new, and how many are entered."""
+    count, entered, all_look = first, 0, len(looks_N) == 0
     for i in range(len(number_N)):
         n = first + i
-        if looks_N[i]:
+        if all_look or looks_N[i]:
             slot = _slot(bits_RD, slots, n, hash_N[i])
             if slots[slot] != _EMPTY:
                 number_N[i] = slots[slot]

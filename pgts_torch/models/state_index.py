@@ -2,6 +2,7 @@
 
 from typing import Literal, final
 
+import numpy as np
 import torch
 from jaxtyping import Int, Num
 from torch import Tensor
@@ -30,6 +31,9 @@ _PAYS, _PAYS_AGAIN = 1.01, 1.05
 
 _SAMPLE_BITS = 4
 """While lookups are given up, rows whose hash begins with so many zeros are still looked up, as a sample."""
+
+_ALL = np.empty(0, np.bool_)
+"""No marks: all rows are looked up."""
 
 
 def hash_rows(bits_ND: Int[Tensor, "N D"]) -> Int[Tensor, "N"]:
@@ -114,7 +118,7 @@ class StateIndex:
 
     def rows(self, number_N: Int[Tensor, "N"]) -> Num[Tensor, "N D"]:
         """The rows with these numbers."""
-        return self._rows[number_N]
+        return self._rows.index_select(0, number_N)
 
     @torch.inference_mode(False)
     @torch.no_grad()
@@ -135,11 +139,9 @@ class StateIndex:
             self._count = last
             return fresh_N
         hash_N = self._hashed(self._rows[first:last])
-        # looks_N: which rows are looked up.
-        looks_N = torch.ones_like(fresh_N, dtype=torch.bool)
-        if not self._merging:
-            looks_N = hash_N >> (64 - _SAMPLE_BITS) == 0
-        looked_up = int(looks_N.sum())
+        # looks_N: which rows are looked up; None: all.
+        looks_N = None if self._merging else hash_N >> (64 - _SAMPLE_BITS) == 0
+        looked_up = row_ND.shape[0] if looks_N is None else int(looks_N.sum())
         # At most half of the slots are full even if all these rows are new.
         needed = 2 * (self._entered + looked_up)
         if needed > len(self._slots):
@@ -152,10 +154,13 @@ class StateIndex:
                 self._bits(self._rows).numpy(),
                 self._slots.numpy(),
                 first,
-                *(x.numpy() for x in (hash_N, looks_N, number_N)),
+                hash_N.numpy(),
+                _ALL if looks_N is None else looks_N.numpy(),
+                number_N.numpy(),
             )
         else:
-            number_N, new, entered = self._numbered(fresh_N, hash_N, looks_N)
+            everywhere_N = torch.ones_like(fresh_N, dtype=torch.bool)
+            number_N, new, entered = self._numbered(fresh_N, hash_N, everywhere_N if looks_N is None else looks_N)
         self._count, self._entered = first + new, self._entered + entered
         if self._merge == "auto":
             self._judge(looked_up, entered)

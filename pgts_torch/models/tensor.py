@@ -70,6 +70,9 @@ class TensorModel(EnumeratingModel, SamplingModel):
         self.dtype = dtype
         self.action_repeat = action_repeat
         self.is_certain = True
+        # All actions again and again, and a probability.
+        self._action_N = torch.empty(0, dtype=torch.int64, device=self.device)
+        self._one = torch.ones((), dtype=dtype, device=self.device)
         self.simulator_steps = 0
         """For how many (state, action) `step` was called."""
 
@@ -113,10 +116,11 @@ class TensorModel(EnumeratingModel, SamplingModel):
             PgtsError: `step` returns a wrong shape or dtype, a discount outside [0, 1], or NaN in a state that counts.
         """
         # Rows n * A + a: every action in the first state, then in the second, ...
-        A = self.num_actions
-        action_NA = torch.arange(A, device=self.device).expand(len(state_N), A)
-        reward_N, discount_N, next_N = self._followed(state_N.repeat_interleave(A), action_NA.reshape(-1))
-        certain_NAK = torch.ones((), dtype=self.dtype, device=self.device).expand(len(state_N), A, 1)
+        N, A = state_N.shape[0], self.num_actions
+        if N * A > self._action_N.shape[0]:
+            self._action_N = torch.arange(A, device=self.device).repeat(2 * N)
+        reward_N, discount_N, next_N = self._followed(state_N.repeat_interleave(A), self._action_N[: N * A])
+        certain_NAK = self._one.expand(N, A, 1)
         return Outcomes(
             reward_N.view(-1, A), certain_NAK, discount_N.view(-1, A, 1), next_N.view(-1, A, 1), self.num_states
         )
@@ -161,8 +165,10 @@ class TensorModel(EnumeratingModel, SamplingModel):
             discount_N = discount_N.index_copy(0, on, weight_N * then_N[allowed_N])
             next_ND = next_ND.index_copy(0, on, ahead_ND[allowed_N])
         # Next states that count get a number; a terminal one may be anything, and is no state of the model.
-        next_N = state_N.clone()
         counts_N = (discount_N > 0) & (reward_N > -torch.inf)
+        if bool(counts_N.all()):
+            return reward_N, discount_N, self.number(next_ND)
+        next_N = state_N.clone()
         next_N[counts_N] = self.number(next_ND[counts_N])
         return reward_N, discount_N, next_N
 
@@ -181,14 +187,18 @@ class TensorModel(EnumeratingModel, SamplingModel):
                 f"step returned rewards in {reward_N.dtype} and discounts in {discount_N.dtype}; "
                 f"the dtype of the model is {self.dtype}"
             )
-        if bool((off_N := ~((discount_N >= 0) & (discount_N <= 1))).any()):
-            n = int(torch.nonzero(off_N)[0, 0])
+        in_range = len(discount_N) == 0 or all(0 <= float(end) <= 1 for end in discount_N.aminmax())
+        if not in_range:
+            n = int(torch.nonzero(~((discount_N >= 0) & (discount_N <= 1)))[0, 0])
             raise PgtsError(
                 f"step returned the discount {float(discount_N[n])} for state {state_ND[n].tolist()} and action "
                 f"{int(action_N[n])}; it must be in [0, 1]"
             )
         if self.reward_range is not None:
             self.reward_range.check(reward_N.cpu())
+        # A sum is one cheap call; only where it is not a number single ones are looked at.
+        if not bool(next_ND.sum().isnan()):
+            return reward_N, discount_N, next_ND
         counts_N = (discount_N > 0) & (reward_N > -torch.inf)
         if bool((bad_N := next_ND.isnan().any(-1) & counts_N).any()):
             n = int(torch.nonzero(bad_N)[0, 0])

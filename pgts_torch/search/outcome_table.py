@@ -7,6 +7,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
+from pgts_torch.compiled import can_compile
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model
 from pgts_torch.search.table import Table, with_room
@@ -48,7 +49,8 @@ class OutcomeTable(Table):
     def missing(self, state_N: Int[Tensor, "N"]) -> Int[Tensor, "missing"]:
         """Those of the states that have no row."""
         self.row_S = with_room(self.row_S, self.model.num_states)
-        return state_N[self.row_S[state_N] < 0]
+        missing_N = self.row_S.index_select(0, state_N) < 0
+        return state_N if bool(missing_N.all()) else state_N[missing_N]
 
     def read(self, state_N: Int[Tensor, "N"]) -> None:
         """These distinct states count as queried; what follows them is read in the model's own table."""
@@ -56,8 +58,8 @@ class OutcomeTable(Table):
         self._count(missing)
         self.row_S[missing] = _NO_ROW
 
-    def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
-        """A copy of the outcomes of these distinct states; the model is queried for the missing ones.
+    def query(self, state_N: Int[Tensor, "N"]) -> None:
+        """Have rows of these distinct states; the model is queried for the missing ones.
 
         Raises:
             PgtsError: the answer cannot be true, see `check_outcomes`.
@@ -67,15 +69,22 @@ class OutcomeTable(Table):
         if len(missing):
             answer = self.model.outcomes(missing)
             self._count(missing)
-            check_outcomes(self.model, missing, answer)
+            row_N = self._written(answer) if self._can_write(len(missing), answer) else None
+            if row_N is None:
+                check_outcomes(self.model, missing, answer)
+                row_N = self._append(
+                    reward_RA=answer.reward_NA,
+                    prob_RAK=answer.prob_NAK,
+                    discount_RAK=answer.discount_NAK,
+                    child_RAK=answer.child_NAK,
+                )
             # The model may have met new states, which get room before their ids are used.
             self.row_S = with_room(self.row_S, self.model.num_states)
-            self.row_S[missing] = self._append(
-                reward_RA=answer.reward_NA,
-                prob_RAK=answer.prob_NAK,
-                discount_RAK=answer.discount_NAK,
-                child_RAK=answer.child_NAK,
-            )
+            self.row_S[missing] = row_N
+
+    def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
+        """A copy of the outcomes of these distinct states, after `query`."""
+        self.query(state_N)
         return self._rows(self.row_S[state_N])
 
     def all(self) -> tuple[Int[Tensor, "R"], Outcomes]:
@@ -90,9 +99,32 @@ class OutcomeTable(Table):
         return state_R, self._rows(slice(self.count))
 
     def _count(self, missing: Int[Tensor, "missing"]) -> None:
-        new = int((self.row_S[missing] == _NOT_QUERIED).sum())
+        # Only states of a table of its own can have been queried and have no row.
+        read = self.model.table is not None
+        new = int((self.row_S[missing] == _NOT_QUERIED).sum()) if read else missing.shape[0]
         self.num_queried += new
         self.model_calls += new * self.num_actions
+
+    def _can_write(self, states: int, answer: Outcomes) -> bool:
+        """Whether the answer is of a kind that a compiled loop can check and write."""
+        dtypes = {answer.reward_NA.dtype, answer.prob_NAK.dtype, answer.discount_NAK.dtype, self.dtype}
+        fits = len(dtypes) == 1 and tuple(answer.reward_NA.shape) == (states, self.num_actions)
+        return fits and self.dtype in (torch.float32, torch.float64) and can_compile(self.device)
+
+    def _written(self, answer: Outcomes) -> Int[Tensor, "N"] | None:
+        """The rows of the answer, checked and written in one pass; None where something seems to be off."""
+        from pgts_torch.search import table_kernels
+
+        first, last = self.count, self.count + answer.num_states
+        if last > self.reward_RA.shape[0] or answer.num_outcomes > self.num_outcomes:
+            self._reserve(answer.num_states, answer.num_outcomes)
+        given = answer.reward_NA, answer.prob_NAK, answer.discount_NAK, answer.child_NAK
+        columns = self.reward_RA, self.prob_RAK, self.discount_RAK, self.child_RAK
+        arrays = [x.detach().contiguous().numpy() for x in (*given, *columns)]
+        if not table_kernels.write(first, self.model.num_states, _TOLERANCE, *arrays):
+            return None
+        self.count = last
+        return torch.arange(first, last)
 
     def _rows(self, at: Tensor | slice) -> Outcomes:
         columns = self.reward_RA[at], self.prob_RAK[at], self.discount_RAK[at], self.child_RAK[at]
@@ -124,7 +156,8 @@ def check_outcomes(model: Model, state_N: Int[Tensor, "N"], outcomes: Outcomes) 
 
     # What follows is named by the first entry that is off: [state, action] or [state, action, outcome].
     def named(off: list[int]) -> str:
-        return f"of outcome {off[2]} " * (len(off) > 2) + f"of state {int(state_N[off[0]])} and action {off[1]}"
+        outcome = f"of outcome {off[2]} " if len(off) > 2 else ""
+        return outcome + f"of state {int(state_N[off[0]])} and action {off[1]}"
 
     # Probabilities of actions that are not allowed need not sum to 1: as if they did.
     total_NA = torch.where(reward_NA > -torch.inf, outcomes.prob_NAK.sum(-1), 1.0)

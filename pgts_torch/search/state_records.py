@@ -70,10 +70,10 @@ class StateRecords:
     def query(self, state_N: Int[Tensor, "N"]) -> None:
         """Have the outcomes of these states in the table, and room for the states that the model has met by then."""
         missing = self._table.missing(state_N)
-        if len(missing):
-            self.check_memory(len(state_N), len(missing))
-            self._topology.step(missing)
-        more = len(self._table.row_S) - len(self.state_S)
+        if missing.shape[0]:
+            self.check_memory(state_N.shape[0], missing.shape[0])
+            self._topology.query(missing)
+        more = self._table.row_S.shape[0] - len(self.state_S)
         if more:
             new_S = records((more,), STATE)
             new_S[...] = (math.nan, NEW)
@@ -85,13 +85,13 @@ class StateRecords:
         self._learn(state_N)
 
     def _learn(self, state_N: Int[Tensor, "N"]) -> None:
-        self.check_memory(len(state_N))
-        edges = len(state_N) * self._A * self._table.num_outcomes
-        child_C = torch.empty(min(edges, len(self.state_S)), dtype=torch.int64)
-        count = self._kernels.children(*self._outcomes, self.state_S, state_N.numpy(), child_C.numpy())
+        self.check_memory(state_N.shape[0])
+        edges = state_N.shape[0] * self._A * self._table.num_outcomes
+        child_C = np.empty(min(edges, len(self.state_S)), np.int64)
+        count = self._kernels.children(*self._outcomes, self.state_S, state_N.numpy(), child_C)
         if count:
-            child_C = child_C[:count].sort().values
-            self.state_S["v"][child_C.numpy()] = self._leaves.v(child_C).numpy(force=True)
+            child_C = np.sort(child_C[:count])
+            self.state_S["v"][child_C] = self._leaves.v(torch.from_numpy(child_C)).numpy(force=True)
         row: Any = 0
         if not self._uniform:
             row = np.arange(len(self.prior_TA), len(self.prior_TA) + len(state_N))

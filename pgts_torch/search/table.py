@@ -59,7 +59,7 @@ class Table:
 
 def with_room(x_S: Int[Tensor, "S"], num_states: int, fill: int = -1) -> Int[Tensor, "more"]:
     """The same numbers with room for so many states, at least doubled where there is not enough: growing is rare."""
-    room = len(x_S)
+    room = x_S.shape[0]
     if num_states <= room:
         return x_S
     return torch.nn.functional.pad(x_S, (0, max(num_states - room, room)), value=fill)

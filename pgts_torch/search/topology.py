@@ -131,12 +131,20 @@ class Topology:
 
     @torch.inference_mode(False)
     @torch.no_grad()
+    def query(self, state_N: Int[Tensor, "N"]) -> None:
+        """Have rows of these distinct states in the table; raises as `step` does."""
+        self._check_generation()
+        self._afford(state_N, None, "one level")
+        self.table.query(state_N)
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def preload(self, state_N: Int[Tensor, "N"]) -> None:
         """Have the outcomes of these states ready, as after an earlier query that does not count as a model call."""
         calls_before = self.table.model_calls
         if len(state_N):
             check_roots(state_N, self.model.num_states)
-            self.table.outcomes(state_N)
+            self.table.query(state_N)
         self.table.model_calls = calls_before
 
     def bytes(self, new: int, *, looked_up: int = 0, kept: int = 0, **counts: int) -> int:
@@ -253,7 +261,7 @@ class Topology:
         check()
         if missing > 1 and self.table.count == 0 and self.model.num_outcomes is None:
             # Only the answer of the model tells K: one state is queried alone, and the memory counted once more.
-            self.table.outcomes(state_N[:1])
+            self.table.query(state_N[:1])
             check()
 
     @property

@@ -1,5 +1,6 @@
 """For what a search queries its model, how many nodes it has, and what it remembers."""
 
+import contextlib
 import time
 import weakref
 
@@ -14,6 +15,7 @@ from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import NodeBudgetExceeded, PgtsError
 from pgts_torch.models import EnumeratingModel, TabularModel
 from pgts_torch.search import Lookahead, Topology, expectimax, mcts
+from pgts_torch.search.outcome_table import OutcomeTable
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid, ladder, random_mdp
 from tests.memory import peak_bytes
@@ -367,3 +369,91 @@ def test_a_search_that_reads_the_table_of_the_model_keeps_less_than_half_of_what
     with compiled.torch_only():
         copies = peak_bytes(search)
     assert peak_bytes(search) <= min(250 * nodes, copies / 2)
+
+
+# Answers, checked and written
+
+
+class Answering(EnumeratingModel):
+    """Gives prepared answers, whatever is asked; its number of outcomes varies."""
+
+    num_states, num_actions, device = 50, 3, torch.device("cpu")
+
+    def __init__(self, answers: list[Outcomes]) -> None:
+        self.answers, self.dtype = answers, answers[0].dtype
+
+    def outcomes(self, state_N: Tensor) -> Outcomes:
+        return self.answers.pop(0)
+
+
+def answer_of(K: int, *, dtype: torch.dtype = torch.float64, seed: int = 0, **changed: float) -> Outcomes:
+    """Five states; `changed` puts a number at the last state, its first action and the last of its outcomes."""
+    generator, shape = stream(seed, "answer"), (5, 3, K)
+    prob_NAK = torch.rand(shape, generator=generator, dtype=torch.float64)
+    prob_NAK /= prob_NAK.sum(-1, keepdim=True)
+    reward_NA = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    reward_NA[2, 1] = -torch.inf
+    prob_NAK[2, 1] = 0.25  # what is not allowed need not sum to 1
+    discount = torch.tensor(0.9, dtype=dtype).expand(shape).clone()
+    child_NAK = torch.randint(50, shape, generator=generator)
+    answer = Outcomes(reward_NA.to(dtype), prob_NAK.to(dtype), discount, child_NAK, 50)
+    for name, value in changed.items():
+        x = getattr(answer, name)
+        x[(4, 0, -1)[: x.ndim]] = value
+    return answer
+
+
+def table_of(answers: list[Outcomes]) -> OutcomeTable:
+    table = OutcomeTable(Answering(answers))
+    for first in range(0, 5 * len(answers), 5):
+        table.query(torch.arange(first, first + 5))
+    return table
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_compiled_and_torch_write_the_same_table_however_many_outcomes_an_answer_has(dtype):
+    pytest.importorskip("numba")
+    answers = [answer_of(K, dtype=dtype, seed=i) for i, K in enumerate((2, 1, 4, 3, 4, 1))]
+    columns = "reward_RA", "prob_RAK", "discount_RAK", "child_RAK", "row_S"
+    with compiled.torch_only():
+        plain = table_of(list(answers))
+    table = table_of(list(answers))
+    assert all(torch.equal(getattr(table, name)[:30], getattr(plain, name)[:30]) for name in columns)
+    assert torch.equal(table.row_S, plain.row_S)
+    assert table.count == plain.count == 30
+    assert not torch.equal(table.reward_RA[:5], table.reward_RA[5:10])
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"reward_NA": torch.nan},
+        {"reward_NA": torch.inf},
+        {"reward_NA": -torch.inf},
+        {"prob_NAK": -0.25},
+        {"prob_NAK": 0.6},
+        {"prob_NAK": torch.nan},
+        {"discount_NAK": 1.5},
+        {"discount_NAK": -0.5},
+        {"discount_NAK": torch.nan},
+        {"child_NAK": 50},
+        {"child_NAK": -1},
+    ],
+)
+def test_compiled_and_torch_refuse_the_same_answers_in_the_same_words_and_keep_nothing_of_them(changed):
+    pytest.importorskip("numba")
+    wrong, said = answer_of(2, **changed), []
+    if changed == {"reward_NA": -torch.inf}:
+        wrong.reward_NA[4] = -torch.inf
+    for context in (compiled.torch_only(), contextlib.nullcontext()):
+        with context:
+            table = OutcomeTable(Answering([wrong, answer_of(1)]))
+            with pytest.raises(PgtsError) as refused:
+                table.query(torch.arange(5))
+            said.append(str(refused.value))
+            assert table.count == 0
+            assert len(table.missing(torch.arange(50))) == 50
+            table.query(torch.arange(5))
+            assert not table.prob_RAK[:5, :, 1:].any()
+    assert said[0] == said[1]
+    assert "state 4" in said[0]
