@@ -33,9 +33,11 @@ class Critic(ABC):
     is_exact: whether its values are those of the policy, up to rounding (`error`).
     error: an upper bound on |mu^T v - J^pi|; infinite unless the critic is exact.
     dtype: of its values.
+    num_env_steps: environment steps before this iteration, by which options that are schedules change.
     """
 
     options: Any = None
+    num_env_steps: int = 0
     target: Target
     samples_when_queried: bool = False
     is_exact: bool = False

@@ -21,6 +21,7 @@ from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.options.critics import NetworkValues
 from pgts_torch.options.fields import limit
 from pgts_torch.options.policies import CNN, MLP
+from pgts_torch.options.schedules import value_at
 from pgts_torch.readings import Readings
 from pgts_torch.seeding import stream
 
@@ -111,7 +112,8 @@ class NetworkCritic(Critic):
         self.network = Network(trunk, outputs, gain=1.0, generator=generator).to(device)
         self._lags = options.lags
         self._target_network = copy.deepcopy(self.network) if self._lags else self.network
-        self._optimiser = Optimiser(learning_rate=filled.learning_rate, max_grad_norm=limit(options.max_grad_norm))
+        self._rate = filled.learning_rate
+        self._optimiser = Optimiser(learning_rate=value_at(self._rate, 0), max_grad_norm=limit(options.max_grad_norm))
         self._policy: Policy | None = None
         self._queried: tuple[Rollout, tuple[Tensor, Tensor]] | None = None
         self._mean, self._scale = (torch.tensor(x, dtype=torch.float64, device=device) for x in (0.0, 1.0))
@@ -130,6 +132,7 @@ class NetworkCritic(Critic):
         if self.target == "q" and policy is not self._policy:
             self._queried = None  # they were means over the actions of another policy
         self._policy = policy
+        self._optimiser.learning_rate = value_at(self._rate, self.num_env_steps)
         alive_TB = rollout.alive_TB
         observation_V, action_V = rollout.observation_V, rollout.action_TB[alive_TB]
         v_TB, target_TB = self._targets(rollout)

@@ -26,6 +26,7 @@ from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.updates import Update
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.options.fields import limit
+from pgts_torch.options.schedules import at
 from pgts_torch.options.updates import PPO, Gradient
 from pgts_torch.readings import Readings
 from pgts_torch.search.lookahead import check_finite
@@ -33,6 +34,8 @@ from pgts_torch.search.lookahead import check_finite
 
 class NetworkUpdate(Update):
     """Gradient steps on the parameters of a network policy.
+
+    now: the options, with the present values of those that are schedules.
 
     The batch is added to running statistics of observations after the steps, so that these start from the policy that
     collected it; only the first batch of all is added before.
@@ -42,8 +45,9 @@ class NetworkUpdate(Update):
 
     def __init__(self, options: Any) -> None:
         self.options, self.state_weight = options, options.state_weight
+        self.now = at(options, 0)
         self._optimiser = Optimiser(
-            learning_rate=options.learning_rate,
+            learning_rate=self.now.learning_rate,
             max_grad_norm=limit(options.max_grad_norm),
             method=options.optimizer,
         )
@@ -62,6 +66,8 @@ class NetworkUpdate(Update):
         """
         assert isinstance(policy, NetworkPolicy)
         network, encoder = policy.network, policy.network.trunk.encoder
+        self.now = at(self.options, self.num_env_steps)
+        self._optimiser.learning_rate = self.now.learning_rate
         with self._optimiser.attempt(network.tensors) as readings:
             _check_numbers(batch.advantage_NA, batch.weight_N, readings)
             if fresh := encoder.fresh:
@@ -124,7 +130,7 @@ class GradientUpdate(NetworkUpdate):
         self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator, readings: Readings
     ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
         """Losses: policy, minus the objective without entropy, before the step; grad_norm, before clipping."""
-        made, coef = Forward(network, input_N), self.options.entropy_coef
+        made, coef = Forward(network, input_N), self.now.entropy_coef
         log_NA, slope_NA = made.output_ND.log_softmax(-1), batch.advantage_NA.float()
         pi_NA = log_NA.exp()
         policy_loss = loss = -(batch.weight_N @ (pi_NA * slope_NA).sum(-1))
@@ -178,7 +184,7 @@ class PPOUpdate(NetworkUpdate):
             readings.add(policy=policy_loss, grad_norm=self.step(network, forward, policy_loss, down_NA))
             num_steps += 1
         new_NA = log_probs(network, input_N)
-        outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.options.clip_range
+        outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.now.clip_range
         readings.add(
             clip_fraction=mean(weight_N, (old_NA.exp() * outside_NA).sum(-1)),
             num_steps=num_steps,
@@ -195,12 +201,12 @@ class PPOUpdate(NetworkUpdate):
         It is written out because autograd through these operations would cost as much as the network itself.
         """
         ratio_NA = (log_NA - old_NA).exp()
-        clipped_NA = ratio_NA.clamp(1 - self.options.clip_range, 1 + self.options.clip_range)
+        clipped_NA = ratio_NA.clamp(1 - self.now.clip_range, 1 + self.now.clip_range)
         free_NA = ratio_NA * advantage_NA
         gain_NA = torch.minimum(free_NA, clipped_NA * advantage_NA)
         slope_NA = torch.where(gain_NA == free_NA, advantage_NA, 0.0)
-        if self.options.entropy_coef:
-            slope_NA = slope_NA - self.options.entropy_coef * (log_NA + 1)
+        if self.now.entropy_coef:
+            slope_NA = slope_NA - self.now.entropy_coef * (log_NA + 1)
         return gain_NA, log_NA.exp() * slope_NA
 
 

@@ -22,10 +22,12 @@ class Update(ABC):
     state_weight: the weight w(s) of a visited state. `occupancy`: the estimate of d^pi(s), as in the paper. `visits`:
         the fraction of all visits that are to s, without discounts. `uniform`: 1, as in h-PMD.
     policies: the classes of policy that it can change.
+    num_env_steps: environment steps before this iteration, by which options that are schedules change.
     options: what it was made from; None for an update of the caller's own class.
     """
 
     options: Any = None
+    num_env_steps: int = 0
     state_weight: StateWeight
     policies: ClassVar[tuple[type[Policy], ...]]
 

@@ -16,6 +16,7 @@ from pgts_torch.agent.states import check_keys
 from pgts_torch.agent.target_updates import TargetUpdate
 from pgts_torch.agent.updates import TabularUpdate, Update
 from pgts_torch.errors import PgtsError
+from pgts_torch.options.schedules import value_at
 
 HARDLY = 0.05
 """A policy whose total variation distance from the initial one is smaller has hardly moved."""
@@ -146,7 +147,8 @@ def learned_little(
 def _longer_steps(update: Update) -> str:
     if isinstance(update, TabularUpdate):
         return f"a larger update.step_size than {update.step_size:g}"
-    rate = f"a larger update.learning_rate than {getattr(update.options, 'learning_rate', 0):g}"
+    now = value_at(getattr(update.options, "learning_rate", 0), update.num_env_steps)
+    rate = f"a larger update.learning_rate than {now:g}"
     return f"{rate}, a smaller update.temperature" if isinstance(update, TargetUpdate) else rate
 
 

@@ -4,10 +4,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
-from pgts_torch.options.fields import Clip, Count, Positive, Share, UnitInterval, conflict
+from pgts_torch.options.fields import Clip, Count, Share, UnitInterval, conflict
 from pgts_torch.options.part import Part, null
 from pgts_torch.options.policies import CNN, MLP
 from pgts_torch.options.rollouts import GeometricHorizon, Horizon
+from pgts_torch.options.schedules import ScheduledPositive
 
 
 class MonteCarlo(Part):
@@ -113,7 +114,7 @@ class NetworkValues(Values):
     )
     """The targets of values."""
 
-    learning_rate: Positive | None = null(lookahead=1e-3, sampled=3e-4)
+    learning_rate: ScheduledPositive | None = null(lookahead=1e-3, sampled=3e-4)
     """Step size of Adam."""
 
     max_grad_norm: Clip = 0.5

@@ -2,8 +2,9 @@
 
 from typing import Literal
 
-from pgts_torch.options.fields import Clip, Count, NonNegative, Positive
+from pgts_torch.options.fields import Clip, Count, Positive
 from pgts_torch.options.part import Part, null
+from pgts_torch.options.schedules import ScheduledNonNegative, ScheduledPositive
 
 StateWeight = Literal["occupancy", "visits", "uniform"]
 
@@ -39,7 +40,7 @@ class SoftmaxGradient(TableUpdate):
 class NetworkUpdate(Part):
     """Gradient steps on the parameters of a network."""
 
-    learning_rate: Positive = 3e-4
+    learning_rate: ScheduledPositive = 3e-4
     """Step size of the optimizer."""
 
     optimizer: Literal["adam", "sgd"] = "adam"
@@ -57,7 +58,7 @@ class Gradient(NetworkUpdate):
 
     type: Literal["gradient"] = "gradient"
 
-    entropy_coef: NonNegative = 0.0
+    entropy_coef: ScheduledNonNegative = 0.0
     """The weight of the entropy (in nats), in reward units."""
 
 
@@ -76,10 +77,10 @@ class PPO(Epochs):
 
     type: Literal["ppo"] = "ppo"
 
-    clip_range: Positive = 0.2
+    clip_range: ScheduledPositive = 0.2
     """The relative change of an action's probability at which the objective is clipped."""
 
-    entropy_coef: NonNegative = 0.0
+    entropy_coef: ScheduledNonNegative = 0.0
     """The weight of the entropy (in nats), in units of the advantages."""
 
     target_kl: Positive | None = None
@@ -95,7 +96,7 @@ class CMPO(Epochs):
 
     type: Literal["cmpo"] = "cmpo"
 
-    learning_rate: Positive = 1e-3
+    learning_rate: ScheduledPositive = 1e-3
     """Step size of the optimizer."""
 
     temperature: Positive = 0.1
@@ -127,7 +128,7 @@ class Mirror(Part):
     temperature: Positive | None = null(networks=1.0)
     """By which the lookahead values are divided, in reward units. Only for networks, as all that follow."""
 
-    learning_rate: Positive | None = null(networks=3e-4)
+    learning_rate: ScheduledPositive | None = null(networks=3e-4)
     """Step size of the optimizer."""
 
     optimizer: Literal["adam", "sgd"] | None = null(networks="adam")

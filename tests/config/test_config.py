@@ -151,6 +151,8 @@ PLAIN = st.recursive(
 )
 """What may stand in env.kwargs."""
 
+SCHEDULE = "or linear(FROM, TO, STEPS) or cosine(FROM, TO, STEPS) by environment steps"
+SCHEDULES = st.builds("{}({}, {}, {})".format, st.sampled_from(["linear", "cosine"]), *[st.integers(1, 9)] * 3)
 SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a whole number >= 0": st.integers(0, 2**63 - 1),
     "a whole number >= 1": st.integers(1, 2**63 - 1),
@@ -181,6 +183,9 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a number > 0 or never": st.just("never") | st.floats(0, exclude_min=True, allow_infinity=False),
     "a number > 0 or never or null": st.sampled_from([None, "never", 0.25]),
     "a number >= 0": st.floats(0, allow_infinity=False),
+    f"a number > 0, {SCHEDULE}": SCHEDULES | st.floats(0, exclude_min=True, allow_infinity=False),
+    f"a number > 0, {SCHEDULE} or null": st.none() | SCHEDULES,
+    f"a number >= 0, {SCHEDULE}": SCHEDULES | st.floats(0, allow_infinity=False),
     "rms or none or null": st.sampled_from([None, "rms", "none"]),
     "adam or sgd or null": st.sampled_from([None, "adam", "sgd"]),
     "occupancy, visits or uniform or null": st.sampled_from([None, "occupancy", "visits", "uniform"]),

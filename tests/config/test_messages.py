@@ -82,12 +82,15 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "mistake"),
     [
-        ("seed: -1", "seed is -1; it must be a whole number >= 0"),
+        ("seed: -1", "seed is -1; it must be a whole number >= 0 or null"),
         ("total_steps: 1e6", "total_steps is 1e6; it must be a whole number >= 1 (write 1000000)"),
-        ("seed: 9223372036854775808", "seed is 9223372036854775808; it must be a whole number >= 0 and below 2**63"),
-        ("seed: true", "seed is true; it must be a whole number >= 0"),
-        ("seed:", "seed is empty; it must be a whole number >= 0"),
-        ("seed: {a: 1}", "seed is a mapping; it must be a whole number >= 0"),
+        (
+            "total_steps: 9223372036854775808",
+            "total_steps is 9223372036854775808; it must be a whole number >= 1 and below 2**63",
+        ),
+        ("seed: true", "seed is true; it must be a whole number >= 0 or null"),
+        ("total_steps:", "total_steps is empty; it must be a whole number >= 1"),
+        ("seed: {a: 1}", "seed is a mapping; it must be a whole number >= 0 or null"),
         ("threads: 2000", "threads is 2000; it must be a whole number in [1, 1024]"),
         (
             "name: 010",
@@ -242,7 +245,7 @@ def test_a_wrong_value_is_named_with_its_line_its_key_and_what_is_required(
             ["--search.depth", "*a"],
             "--search.depth: '*a': anchors (&) and aliases (*) are not allowed; write the value out",
         ),
-        (["--seed="], "--seed is empty; it must be a whole number >= 0"),
+        (["--total_steps="], "--total_steps is empty; it must be a whole number >= 1"),
         (["--search.depth", "--run.overwrite"], "--search.depth needs a value: a whole number >= 0 or adaptive"),
         (["--run.overwrite", "no"], "--run.overwrite is 'no'; it must be true or false"),
         (["--run.dir", "a\udcff"], "--run.dir is 'a\\udcff'; it must be a folder or null"),
