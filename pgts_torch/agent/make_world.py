@@ -74,7 +74,8 @@ def make_world(
             or without a model.
         MissingModel: a model is needed and none applies; the message says why, for each.
     """
-    env = source.make(num_envs) if source.given is None else source.given
+    one_by_one = not plain and other is None
+    env = source.make(num_envs, one_by_one=one_by_one) if source.given is None else source.given
     discount = DEFAULT_GAMMA if gamma is None else gamma
     check_gamma(discount)
     if other is not None:

@@ -18,6 +18,7 @@ from gymnasium.envs.registration import EnvSpec, find_highest_version, get_env_i
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
+from pgts_torch.envs.cart_poles import CartPoles, is_cart_pole
 from pgts_torch.errors import PgtsError, check_count, failure
 from pgts_torch.models.actions import Numbered, is_numbered, numbered
 from pgts_torch.models.attributes import Unlike, own_to_each, unlike
@@ -28,6 +29,9 @@ from pgts_torch.trust import import_named
 
 Given = str | EnvSpec | gymnasium.Env | VectorEnv | Callable[[], gymnasium.Env]
 """What a user may give as an environment."""
+
+_TOGETHER = 16
+"""From so many environments on the array operations of a vectorised form take less time than their single steps."""
 
 _Maker = Callable[..., gymnasium.Env]
 """Makes a new environment; takes the arguments of `gymnasium.make`, which it uses if it makes environments by an id."""
@@ -43,7 +47,8 @@ class EnvSource:
     spec: as it is registered; None where that is unknown.
     description: what a saved model says of it, its id; None where it was given as an object, which no file holds.
     given: environments that were given as a VectorEnv, to train in; None: some are made for that, too.
-    make_together: makes `num_envs` that step together; None: `makers` do.
+    make_together: makes `num_envs` that step together, of which none can be looked at by itself; None: `makers` do.
+    has_table: whether a model needs no more than the table of `make_together`.
     actions_per_dimension: as in `of`.
     """
 
@@ -52,7 +57,8 @@ class EnvSource:
     spec: EnvSpec | None = None
     description: str | None = None
     given: VectorEnv | None = None
-    make_together: Callable[..., VectorEnv] | None = None
+    make_together: Callable[[int], VectorEnv] | None = None
+    has_table: bool = False
     actions_per_dimension: int | None = None
     _known: weakref.WeakValueDictionary[int, gymnasium.Env] = field(default_factory=weakref.WeakValueDictionary)
 
@@ -114,7 +120,9 @@ class EnvSource:
         if ours:
             modes = {"vectorization_mode": "vector_entry_point", "max_episode_steps": -1}
             options: dict[str, Any] = modes | {"autoreset_mode": AutoresetMode.DISABLED} | kwargs
-            source.make_together = partial(gymnasium.make_vec, env_id, **options)
+            source.make_together, source.has_table = partial(gymnasium.make_vec, env_id, **options), True
+        elif spec is not None and count is None and is_cart_pole(spec, kwargs):
+            source.make_together = partial(CartPoles, spec=spec, **kwargs)
         return source
 
     @classmethod
@@ -127,9 +135,12 @@ class EnvSource:
             source._check_new(one)
         return source
 
-    def make(self, num_envs: int) -> VectorEnv:
+    def make(self, num_envs: int, *, one_by_one: bool = False) -> VectorEnv:
         """New environments that step together and reset by mask. Their actions are numbers from 0 on, and they have no
         registered time limit: the horizon of a rollout ends their episodes.
+
+        Args:
+            one_by_one: whether a model may have to look at each of them. It changes no bit of what they return.
 
         Raises:
             PgtsError: `num_envs` is no whole number above 0; Gymnasium knows no such environment or cannot make it; its
@@ -137,8 +148,8 @@ class EnvSource:
         """
         check_count("num_envs", num_envs)
         with _making(self.name):
-            if self.make_together is not None:
-                return self.make_together(num_envs=num_envs)
+            if self.make_together is not None and (self.has_table or not (one_by_one or num_envs < _TOGETHER)):
+                return self.make_together(num_envs)
             makers = [lambda k=k: self.like(k) for k in range(num_envs)]
             made = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
         check_vector_env(made)
