@@ -2,6 +2,9 @@
 
 from numbers import Integral
 
+LOST = 75
+"""The exit code of a training whose process hangs, or has lost another one: the same command goes on."""
+
 
 class PgtsError(ValueError):
     """An argument, a file or an environment of the caller cannot be used.

@@ -47,6 +47,7 @@ FAULTS: dict[str, dict[str, str]] = {
         "missing extra": "the `pip install` that brings it, exit code 2",
         "no time limit and no horizon": "the guard of the geometric horizon, or of evaluations, ends it",
         "autoreset in the next step": "refused with the mode that works",
+        "environment that hangs": "after `run.timeout` one line says where, exit code 75; resumed, the same bits",
         "environment raises an error": "environment, step and seed are named, `failure.json`, exit code 2",
         "a table of transitions that is not that of step and reset": UNUSED,
         "environments that differ, or differ from the instance that was given": "the attribute is named",
@@ -173,7 +174,8 @@ FAULTS: dict[str, dict[str, str]] = {
         "rendering": "on or off, the trained bits are the same",
     },
     "Several processes": {
-        "lost rank": "the others end with exit code 1; the same command goes on and ends with the same bits",
+        "lost rank": "the others end with exit code 75; the same command goes on and ends with the same bits",
+        "rank that hangs": "after `run.timeout` one line names it and says where; all end with exit code 75",
         "other world size at resume": "refused with both numbers, exit code 2; `--any-world-size` goes on",
     },
 }

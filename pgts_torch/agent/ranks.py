@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any, TypeVar, final
 
 import torch
@@ -151,7 +152,7 @@ def present_ranks() -> Ranks:
 
 
 @contextmanager
-def joined_ranks(device: str) -> Iterator[Ranks]:
+def joined_ranks(device: str, *, timeout: float = 1800) -> Iterator[Ranks]:
     """Join the processes that torchrun has started in the default process group while the context lasts.
 
     Without torchrun it is a single process. The backend is gloo on every device, because what is exchanged, episodes
@@ -159,6 +160,7 @@ def joined_ranks(device: str) -> Iterator[Ranks]:
 
     Args:
         device: where they compute; "cuda" is the GPU of the local rank.
+        timeout: the most seconds that a process waits for another one.
 
     Raises:
         PgtsError: a machine has fewer GPUs than processes, and "cuda" is asked for.
@@ -166,7 +168,7 @@ def joined_ranks(device: str) -> Iterator[Ranks]:
     if not (distributed.is_available() and distributed.is_torchelastic_launched()):
         yield Ranks()
         return
-    distributed.init_process_group("gloo")
+    distributed.init_process_group("gloo", timeout=timedelta(seconds=timeout))
     try:
         ranks = present_ranks()
         # Wait for all: a process that leaves while another one still connects breaks that connection.

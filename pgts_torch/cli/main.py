@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pgts_torch.cli.arguments import Parser, choice_of, summary
 from pgts_torch.cli.commands import COMMANDS, Arguments
 from pgts_torch.cli.terminal import plain_warnings, rank, safe_output
-from pgts_torch.errors import NotFinite, PgtsError, RankLost, Stopped
+from pgts_torch.errors import LOST, NotFinite, PgtsError, RankLost, Stopped
 
 TRAINING_FAILED = 1
 USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
@@ -19,8 +19,8 @@ def main(arguments: Arguments | None = None) -> int:
 
     Returns:
         The exit code: 0; 1 if `check-model` says no, a run of a sweep failed or a number in training was not finite; 2
-        after a mistake of the caller, reported on stderr, a line each; 130 after Ctrl-C, 143 after SIGTERM, 129 after
-        SIGHUP.
+        after a mistake of the caller, reported on stderr, a line each; 75 where another process of a training is lost
+        or hangs; 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP.
     """
     return exit_code(_run_command, sys.argv[1:] if arguments is None else arguments)
 
@@ -37,7 +37,9 @@ def exit_code(function: Callable[[Arguments], None], arguments: Arguments) -> in
         if rank() == (error.rank or 0):  # an error that all processes raise is printed by the first
             for line in str(error).splitlines():
                 print(f"error: {f'[rank {rank()}] ' if rank() else ''}{line}", file=sys.stderr)
-        return TRAINING_FAILED if isinstance(error, NotFinite | RankLost) else USAGE_ERROR
+        if isinstance(error, RankLost):
+            return LOST
+        return TRAINING_FAILED if isinstance(error, NotFinite) else USAGE_ERROR
     except BrokenPipeError:
         return BROKEN_PIPE
     except Stopped as stopped:

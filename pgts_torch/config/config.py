@@ -7,7 +7,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from pgts_torch.config import strict_yaml
 from pgts_torch.options.arguments import described
-from pgts_torch.options.fields import Count, Device, Folder, Name, Natural, conflict
+from pgts_torch.options.fields import Count, Device, Folder, Name, Natural, Positive, conflict
 from pgts_torch.options.part import Part
 from pgts_torch.options.training import Training
 
@@ -86,6 +86,11 @@ class RunConfig(Part):
 
     tensorboard: bool = True
     """Write TensorBoard events beside metrics.jsonl."""
+
+    timeout: Positive | None = 1800
+    """Seconds after which a process hangs that is still in the same call, such as a step of all its environments: it
+    ends with exit code 75, and a restart goes on from the last checkpoint. Others wait for it at most twice as long;
+    null: a year."""
 
 
 class Config(Training, General):

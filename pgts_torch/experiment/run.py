@@ -21,6 +21,9 @@ from pgts_torch.experiment.resume import Start, find, names_modules, resuming
 from pgts_torch.experiment.signals import StopFlag
 from pgts_torch.experiment.summary import Summary
 from pgts_torch.experiment.tracking import event_writer
+from pgts_torch.experiment.watchdog import Watchdog
+
+A_YEAR = 365 * 24 * 3600.0
 
 
 def build(config: Config) -> PGTS:
@@ -55,7 +58,13 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
     torch.set_num_threads(config.threads)
     if config.run.tensorboard:
         event_writer()
-    with joined_ranks(config.device) as ranks, StopFlag() as stop, ExitStack() as held:
+    timeout = min(config.run.timeout or A_YEAR, A_YEAR)
+    with (
+        joined_ranks(config.device, timeout=2 * timeout) as ranks,
+        StopFlag() as stop,
+        Watchdog(timeout, ranks),
+        ExitStack() as held,
+    ):
         config = ranks.first("the run folder", lambda: seeded(config))
         algorithm = held.enter_context(ranks.together("the algorithm", lambda: build(config)))
         algorithm.content()  # what cannot be saved is refused now, not at the first checkpoint

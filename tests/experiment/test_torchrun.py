@@ -14,6 +14,7 @@ import torch
 
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.cli.main import main
+from pgts_torch.errors import LOST
 from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.search.engine import Search
@@ -67,7 +68,7 @@ def test_a_lost_rank_ends_all_and_the_same_command_goes_on_bit_for_bit(rank, who
     folder = tmp_path / "run"
     codes = signalled(folder, signal.SIGKILL, rank=rank)
     assert codes[rank] == -signal.SIGKILL
-    assert codes[1 - rank] == 1
+    assert codes[1 - rank] == LOST
     said = capfd.readouterr().err
     assert said.count("error: rank 0 of 2 has lost another one, asking for ") == rank
     assert "Traceback" not in said
