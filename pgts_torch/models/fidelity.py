@@ -17,6 +17,7 @@ from pgts_torch.models.adapters import known_adapter, not_restored
 from pgts_torch.models.adapters_generic import PickledAttributes
 from pgts_torch.models.attributes import own_to_each
 from pgts_torch.models.classic import dynamics_of
+from pgts_torch.models.clocks import check_clock
 from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.published import compare_table, published_table
 from pgts_torch.models.restoring import (
@@ -31,6 +32,7 @@ from pgts_torch.models.restoring import (
     walks_of,
 )
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.stepper import Stepper
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.trial import compare, environment_code
 from pgts_torch.models.wrappers import transforms_of
@@ -121,6 +123,8 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
         merge       equal states have equal snapshots, so that a search can merge them
         chance      what follows is a function of state, action and key, and no generator is in a snapshot: a search
                     cannot foresee what the environment is about to draw
+        clock       where an environment counts its own steps (MiniGrid): what follows depends on that only by rewards
+                    and truncation as its own code makes them, so that a search can remember it without
         untouched   a search from the state of a real environment changes neither it nor its generator: it goes on like
                     an equal one without a search
         table       where there is one: steps and starts of a short walk are among its outcomes, bit for bit
@@ -176,6 +180,7 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
         _check("merge", lambda: _merged(walks, others()), needed=False),
         _check("chance", lambda: chance(setup, walks)),
         _check("untouched", lambda: untouched(setup, length)),
+        *_clock(setup),
         *claims,
     )
     report = Report(name, adapter.name, None, len(actions), shares[-1], checks, cost=None)
@@ -195,6 +200,13 @@ def _check(name: str, check: Callable[[], str], *, needed: bool = True) -> Check
         return Check(name, needed, True, check())
     except PgtsError as error:
         return Check(name, needed, False, str(error))
+
+
+def _clock(setup: Setup) -> Iterator[Check]:
+    """Whether transitions can be remembered without the clock of an environment that has one."""
+    stepper = Stepper(setup.make, gamma=_GAMMA, actions=setup.actions, adapter=setup.adapter, observe=None)
+    if (clock := stepper.clock) is not None:
+        yield _check("clock", lambda: check_clock(stepper, clock), needed=False)
 
 
 def _claims(env: gymnasium.Env, *, seed: int) -> Iterator[Check]:
@@ -224,7 +236,7 @@ def _answers(setup: Setup, walks: Sequence[Walk], shares: list[float]) -> str:
 def _merged(walks: Sequence[Walk], others: Sequence[Walk]) -> str:
     """Whether walks that went on the same have the same snapshots."""
     pairs = [(walk, other) for walk, other in zip(walks, others, strict=True) if walk.seen == other.seen]
-    off = sum((walk.start.key, *walk.states) != (other.start.key, *other.states) for walk, other in pairs)
+    off = sum((walk.start.name, *walk.states) != (other.start.name, *other.states) for walk, other in pairs)
     if off:
         raise MissingModel(
             f"equal states gave different bytes in {off} of {len(pairs)} continuations, so a search merges fewer of "

@@ -5,6 +5,7 @@ import enum
 import io
 import marshal
 import pickle
+from collections.abc import Set
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,20 @@ import numpy as np
 PLAIN = frozenset({type(None), bool, int, float, str, bytes})
 
 
-def text_of(state: dict[str, Any], env: Any) -> bytes:
-    """The values of a state of an environment in one order: equal for equal states, also where pickles differ."""
+START = "init_pos"
+"""The attribute of an object that says where a reset has put it."""
+
+_NONE = frozenset[str]()
+
+
+def text_of(state: dict[str, Any], env: Any, *, but: Set[str] = _NONE) -> bytes:
+    """The values of a state of an environment in one order: equal for equal states, also where pickles differ.
+
+    Args:
+        but: attributes of objects that do not count.
+    """
     parts: list[Any] = []
-    _spell(state, parts, {id(env): 0})
+    _spell(state, parts, {id(env): 0}, but)
     return marshal.dumps(parts, 2)
 
 
@@ -55,7 +66,7 @@ def _share_walls(cells: list[Any]) -> None:
                 wall = cell
 
 
-def _spell(value: Any, parts: list[Any], seen: dict[int, int]) -> None:
+def _spell(value: Any, parts: list[Any], seen: dict[int, int], but: Set[str]) -> None:
     """Append what a value consists of, in plain values and one order; an object that was met before by when that was.
 
     Each part that has parts begins with its kind and their number, so that different values are spelled differently.
@@ -76,20 +87,20 @@ def _spell(value: Any, parts: list[Any], seen: dict[int, int]) -> None:
                 wall = item
                 parts.append(("wall", wall.color))
             else:
-                _spell(item, parts, seen)
+                _spell(item, parts, seen, but)
     elif kind is np.ndarray:
-        _spell(value.tolist(), parts, seen)
+        _spell(value.tolist(), parts, seen, but)
     elif isinstance(value, np.generic):
         parts.append(value.item())
     elif isinstance(value, enum.Enum) or callable(value):
         parts.append(repr(value))
     elif isinstance(value, set | frozenset):
-        _spell(sorted(value, key=repr), parts, seen)
+        _spell(sorted(value, key=repr), parts, seen, but)
     elif kind is dict:
         parts += ("{", len(value))
         for name in sorted(value, key=repr):
-            _spell(name, parts, seen)
-            _spell(value[name], parts, seen)
+            _spell(name, parts, seen, but)
+            _spell(value[name], parts, seen, but)
     # Objects that were met before: what they consist of is spelled already, and may lead back to themselves.
     elif id(value) in seen:
         parts += ("=", seen[id(value)])
@@ -98,11 +109,13 @@ def _spell(value: Any, parts: list[Any], seen: dict[int, int]) -> None:
         content = vars(value)
         parts += (kind.__qualname__, len(content))
         for name, item in content.items():
+            if name in but:
+                continue
             parts.append(name)
             if type(item) in PLAIN:
                 parts.append(item)
             else:
-                _spell(item, parts, seen)
+                _spell(item, parts, seen, but)
 
 
 def _environment() -> Any:

@@ -8,11 +8,13 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from pgts_torch.models.minigrid_pickles import PLAIN, is_plain_wall
+from pgts_torch.models.minigrid_pickles import PLAIN, START, is_plain_wall
 
-MOVING = ("agent_pos", "agent_dir", "step_count")
-"""What changes in most steps, beside what is carried and the grid."""
+MOVING = ("agent_pos", "agent_dir")
+"""What changes in most steps, beside what is carried, the grid and the count of steps."""
 
+COUNT = "step_count"
+"""The clock."""
 
 GRID = {"width", "height", "grid"}
 """The attributes of a grid."""
@@ -49,7 +51,7 @@ class Layout:
     """
 
     def __init__(self, names: Set[str]) -> None:
-        self.names = names
+        self.names = names | {COUNT}
         self.rest = tuple(sorted(names - {*MOVING, "grid", "carrying"}))
         self._read = itemgetter(*self.rest)
         self.values: tuple[Any, ...] = ()
@@ -70,15 +72,16 @@ class Layout:
 class Template:
     """What an object of a grid is made from, again and again. Its attributes are plain, or another such object.
 
-    is_wall: whether it is one without a position of its own.   text: its values, as part of a key.
+    is_wall: whether it is one without a position of its own.   text: its values, as part of a key, but for where it
+    and what it contains lay at the start: `starts`.
     """
 
-    __slots__ = ("_copied", "_kind", "_names", "_state", "is_wall", "text")
+    __slots__ = ("_copied", "_kind", "_names", "_state", "is_wall", "starts", "text")
 
     def __init__(self, thing: Any) -> None:
         self._kind, self._state, self.is_wall = type(thing), dict(vars(thing)), is_plain_wall(thing)
         base = self._kind.__mro__[-2]  # what all things that can lie in a grid have in common
-        spelled, copied = dict(self._state), list[str]()
+        spelled, copied, starts = dict(self._state), list[str](), list[Any]()
         for name, value in self._state.items():
             if type(value) in PLAIN:
                 continue
@@ -86,12 +89,14 @@ class Template:
                 inner: Template = Template(value)
                 self._state[name], spelled[name] = inner, inner.text
                 copied.append(name)
+                starts += inner.starts
             else:
                 spelled[name] = plain(value)
                 if type(value) is np.ndarray:
                     self._state[name] = value.copy()
                     copied.append(name)
         self._copied, self._names = tuple(copied), tuple(spelled)
+        self.starts: tuple[Any, ...] = (spelled.pop(START, None), *starts)
         self.text: bytes = marshal.dumps((self._kind.__qualname__, *spelled, *spelled.values()), 2)
 
     def is_of(self, thing: Any) -> bool:

@@ -2,7 +2,7 @@
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -68,10 +68,10 @@ class Setup:
         with environment_code():
             return self.adapter.get_state(env)
 
-    def stable_key(self, env: Any) -> bytes | None:
-        """The key of a snapshot; None if a second one of the same state has another key."""
-        key = self.snapshot(env).key
-        return key if self.snapshot(env).key == key else None
+    def stable_name(self, env: Any) -> Hashable:
+        """The name of a snapshot; None if a second one of the same state has another name."""
+        name = self.snapshot(env).name
+        return name if self.snapshot(env).name == name else None
 
     def restore(self, env: Any, snapshot: Snapshot) -> None:
         with environment_code():
@@ -84,13 +84,13 @@ class Setup:
 
 @dataclass(frozen=True)
 class Walk:
-    """A recorded walk: its start, the key of its chance, its actions, what was seen and the keys of its states."""
+    """A recorded walk: its start, the key of its chance, its actions, what was seen and the names of its states."""
 
     start: Snapshot
     key: int
     actions: tuple[Any, ...]
     seen: tuple[bytes, ...]
-    states: tuple[bytes, ...]
+    states: tuple[Hashable, ...]
 
 
 def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> float:
@@ -147,11 +147,11 @@ def _recorded(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Wal
     """These actions from the present state, up to an end."""
     start = setup.snapshot(env)
     setup.seed(env, key)
-    seen, states = list[bytes](), list[bytes]()
+    seen, states = list[bytes](), list[Hashable]()
     for action in actions:
         taken = step(env, action)
         seen.append(_bits_of(env, taken))
-        states.append(setup.snapshot(env).key)
+        states.append(setup.snapshot(env).name)
         if taken.ends:
             break
     return Walk(start, key, actions, tuple(seen), tuple(states))
@@ -221,9 +221,9 @@ def chance(setup: Setup, walks: Sequence[Walk]) -> str:
     differ = 0
     for walk in walks:
         setup.restore(env, walk.start)
-        before = setup.stable_key(env)
+        before = setup.stable_name(env)
         setup.seed(env, setup.number())
-        if setup.stable_key(env) != before:
+        if setup.stable_name(env) != before:
             raise MissingModel(
                 "get_state returns the generator too, and a search would foresee what will be drawn: leave it out"
             )
@@ -280,8 +280,8 @@ def _live(env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
     return seen
 
 
-def _state_of(setup: Setup, env: Any) -> tuple[bytes | None, str]:
-    """The key of its snapshot, and its generator."""
+def _state_of(setup: Setup, env: Any) -> tuple[Hashable, str]:
+    """The name of its snapshot, and its generator."""
     with environment_code():
         generator = repr(generator_state(env))
-    return setup.stable_key(env), generator
+    return setup.stable_name(env), generator

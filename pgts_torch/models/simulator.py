@@ -14,8 +14,10 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, check_count, failure
-from pgts_torch.models.answers import Query, Step, take_much_memory
+from pgts_torch.models.adapters import methods_for
+from pgts_torch.models.answers import Answers, Query, Step
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.clocks import trusted_clock
 from pgts_torch.models.environments import Given
 from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, ExactModel, Happened, step_text
 from pgts_torch.models.provenance import draws_its_own
@@ -87,7 +89,8 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value
         self.env, self.dtype = stepper.env, dtype
         self._draws_its_own = draws_its_own(stepper.made)
-        self._sure: dict[Query, Step] = {}
+        stepper.clock = trusted_clock(stepper) if action_repeat == 1 else None
+        self._answers = Answers(stepper.at_count if stepper.clock else None)
         # The instances whose class, map and constants were compared with the model's own.
         self._compared: list[Any] = []
 
@@ -99,8 +102,8 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
         super().clear()
-        if take_much_memory(self._sure):
-            self._sure.clear()
+        if self._answers.take_much_memory():
+            self._answers.clear()
         self._compared.clear()
 
     def root(self, env: gymnasium.Env, observation: Any = None) -> int:
@@ -161,17 +164,17 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         states = self._checked("state", state_N, self.num_states)
         queries = zip(states, self._checked("action", action_N, self.num_actions), key_N.tolist(), strict=True)
         with self._watched():
-            return self._answer([self._step(*query, self.action_repeat, self._sure) for query in queries])
+            return self._answer([self._step(*query, self.action_repeat) for query in queries])
 
     def is_random(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Whether chance decides what follows each (state, action), by a step of the simulator; raises as `sample`."""
         random, states = [], self._checked("state", state_N, self.num_states)
         for pair in zip(states, self._checked("action", action_N, self.num_actions), strict=True):
             with SharedGenerators() as shared:
-                step, _ = self._step(*pair, _ANY_KEY, self.action_repeat, self._sure)
+                step, _ = self._step(*pair, _ANY_KEY, self.action_repeat)
             if shared.used:
                 # A step that used a global generator looked certain, and may have been remembered.
-                self._sure.clear()
+                self._answers.clear()
             random.append(step.random or bool(shared.used))
         return torch.tensor(random, dtype=torch.bool, device=self.device)
 
@@ -184,7 +187,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         with SharedGenerators() as shared:
             yield
         if shared.used:
-            self._sure.clear()
+            self._answers.clear()
             raise MissingModel(
                 f"{self.name} cannot be a model: step draws from the global generator of {shared.used[0]}: draw from "
                 "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
@@ -209,11 +212,11 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
     def _outcome_of(
         self, state: int, action: int, reward: float, discount: float, next_state: int, follows: bool, query: bool
     ) -> int:
-        step = self._sure.get((self._seen[state].snapshot.key, action, 1))
+        step = self._answers.known(self._seen[state].snapshot, action, 1, self.reward_range)
         if step is None:
             if not query:
                 return NOT_QUERIED
-            step, _ = self._step(state, action, _ANY_KEY, 1, self._sure)
+            step, _ = self._step(state, action, _ANY_KEY, 1)
             if step.random:
                 return RANDOM
         reached = step.child.snapshot
@@ -225,9 +228,18 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
 
     def outcomes_text(self, state: int, action: int) -> str:
         """The one outcome of a single step."""
-        step, child = self._step(state, action, _ANY_KEY, 1, self._sure)
+        step, child = self._step(state, action, _ANY_KEY, 1)
         then = self.state_text(child) + step.child.snapshot.cut * ", where the episode is truncated"
-        return step_text(step.reward, step.discount, then)
+        text = step_text(step.reward, step.discount, then)
+        if (clock := self._stepper.clock) is not None:
+            now = self._stepper.follow(self._seen[state].snapshot.data, self.actions[action], _ANY_KEY, 1, None)
+            if (now.reward, now.discount, now.child.snapshot.name) != (
+                step.reward,
+                step.discount,
+                step.child.snapshot.name,
+            ):
+                text += f", as at another {clock.name}, on which it depends: {methods_for(self.env)}"
+        return text
 
     def _certain(self, pairs: Iterable[tuple[int, int]]) -> list[tuple[Step, int]]:
         """`_step` for each state and action, under repeated actions. The generator is looked at once for all of them:
@@ -237,29 +249,28 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         self._stepper.chance.watch()
         answers = [self._step(*pair, None, self.action_repeat, found) for pair in each]
         if any(step.random is None for step in found.values()) and self._stepper.chance.was_drawn():
-            return [self._step(*pair, _ANY_KEY, self.action_repeat, self._sure) for pair in each]
+            return [self._step(*pair, _ANY_KEY, self.action_repeat) for pair in each]
         for step in found.values():
             step.random = False
-        self._sure.update(found)
+        self._answers.add(found)
         return answers
 
     def _step(
-        self, state: int, action: int, key: int | None, repeat: int, found: dict[Query, Step]
+        self, state: int, action: int, key: int | None, repeat: int, found: dict[Query, Step] | None = None
     ) -> tuple[Step, int]:
         """What follows an action that is taken so many times, and the number of the state reached; from memory where no
         chance is involved.
 
         Args:
             key: None: nothing may be random, which the caller sees to.
-            found: where to remember it, if it is certain.
+            found: where to remember it, if it is certain. Default: in `Answers`.
         """
         seen = self._seen[state]
         at = seen.snapshot
         if at.cut:
             # The state leads to itself under its first action alone, see the class.
             return Step(-math.inf if action else 0.0, 1.0, seen, False), state
-        query = at.key, action, repeat
-        if (known := self._sure.get(query)) is not None:
+        if (known := self._answers.known(at, action, repeat, self.reward_range, found)) is not None:
             # The child gets its number now, so that numbers do not depend on what is remembered.
             return known, self._enter(known.child)
         taken = self.actions[action]
@@ -272,13 +283,16 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         # The record by which the state is known, so that equal ones are kept in memory once.
         step.child = self._seen[child]
         if not step.random:
-            found[query] = step
+            self._answers.remember(at, action, repeat, step, found)
         return step, child
 
     def _late(self, state: int) -> Any:
         if not self._stepper.observes_late:
             return None
-        try:
-            return self._stepper.observation(self._seen[state].snapshot.data)
-        except BaseException as error:
-            raise failure(f"{self.name} failed to observe state {state}", error) from error
+        seen = self._seen[state].like or self._seen[state]
+        if seen.observation is None:
+            try:
+                seen.observation = self._stepper.observation(seen.snapshot.data)
+            except BaseException as error:
+                raise failure(f"{self.name} failed to observe state {state}", error) from error
+        return seen.observation

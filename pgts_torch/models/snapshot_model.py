@@ -1,7 +1,7 @@
 """Models whose states are snapshots, numbered as they are met, equal ones with the same number."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ class SnapshotModel(Model):
         self.num_states = 0
         # By number: the state. By the name of a snapshot: the number.
         self._seen: list[Seen] = []
-        self._number: dict[bytes | tuple[bytes, bool], int] = {}
+        self._number: dict[Hashable, int] = {}
 
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
@@ -113,7 +113,7 @@ class SnapshotModel(Model):
         """With its observation, or else its snapshot."""
         snapshot, seen = self._seen[state].snapshot, self._seen[state].observation
         what = repr(snapshot.key) if seen is None else np.array2string(np.asarray(seen), threshold=20)
-        return f"state {state} ({what})"
+        return f"state {state} ({what})" if snapshot.clock is None else f"state {state} ({what} at {snapshot.clock})"
 
     def _checked(self, what: str, number_N: Int[Tensor, "N"], count: int) -> Sequence[int]:
         """These numbers, each of them below a count; PgtsError if one is not."""

@@ -3,7 +3,7 @@
 An adapter takes a snapshot of an environment and puts it back, bit for bit. The generator of the environment is no part
 of a snapshot: a search that restored it would foresee what the environment is about to draw. What only rendering reads
 is no part of it either, and neither is the clock of a `TimeLimit` wrapper, because models live on `env.unwrapped`; a
-clock that the environment itself keeps (MiniGrid, ALE) is.
+clock that the environment itself keeps is, in MiniGrid apart from the rest, in ALE among it.
 
 An environment of your own needs no adapter, but two methods:
 
@@ -18,7 +18,7 @@ merge surest.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -32,18 +32,54 @@ _ODD = 0x9E3779B97F4A7C15
 class Snapshot(NamedTuple):
     """A state of a simulator.
 
-    key: equal for equal states.   data: what `SnapshotAdapter.set_state` takes; often the key itself.
+    key: equal for equal states, at any count of a clock.   data: what `SnapshotAdapter.set_state` takes; often the key.
     cut: whether the step that led here truncated the episode, so that no other step may follow.
+    clock: the steps that the environment itself has counted, where the adapter keeps that apart (`Clock`); else None.
     """
 
     key: bytes
     data: Any
     cut: bool = False
+    clock: int | None = None
 
     @property
-    def name(self) -> bytes | tuple[bytes, bool]:
+    def name(self) -> Hashable:
         """What tells states apart: one in which an episode was cut off is not the one in which it would go on."""
-        return (self.key, True) if self.cut else self.key
+        return (self.key, self.clock, self.cut) if self.cut or self.clock is not None else self.key
+
+
+class Reading(NamedTuple):
+    """What a step has read of a clock.
+
+    limit: the count from which on an episode is truncated.   pays: whether its reward is that of the count after it.
+    """
+
+    limit: int
+    pays: bool
+
+
+class Clock(ABC):
+    """A count of the steps of an episode, which an environment reads for rewards and for truncation alone.
+
+    So what a step does at one count says what it does at any other: transitions are remembered without it.
+
+    name: of the attribute that counts.
+    """
+
+    name: str
+
+    @abstractmethod
+    def reading(self, reward: Any, truncated: bool) -> Reading | None:
+        """What the last step has read, by the reward and the truncation that it gave; None where these have another
+        reason, so that the step says nothing of other counts. To be called after each step."""
+
+    @abstractmethod
+    def reward(self, reading: Reading, count: int) -> float:
+        """The reward of a step that pays by the clock, if the count is so high after it."""
+
+    @abstractmethod
+    def at(self, snapshot: Snapshot, count: int) -> Snapshot:
+        """The same state at another count, where no episode was cut off."""
 
 
 class SnapshotAdapter(ABC):
@@ -68,7 +104,7 @@ class SnapshotAdapter(ABC):
 
     def same_state(self, one: Snapshot, other: Snapshot) -> bool:
         """Whether two snapshots are of one state, also where their keys differ."""
-        return one.key == other.key
+        return one.key == other.key and one.clock == other.clock
 
     def seed(self, env: Any, key: int) -> None:
         """Whatever `env` draws from here on is a function of the 64 bits of `key`; its state stays as it is."""
@@ -85,6 +121,11 @@ class SnapshotAdapter(ABC):
         Returns:
             What makes the observation of the present state; None where nothing was changed and steps still return it.
         """
+        return None
+
+    def clock(self, env: Any) -> Clock | None:
+        """The clock that snapshots keep apart, read by this instance from here on; None where there is none, or where
+        its rewards are made by code of which that is not known."""
         return None
 
     def obstacle(self, env: Any) -> str:

@@ -24,7 +24,7 @@ class Stepper:
 
     name: of the environment.   env: the instance.   space: of observations, outside of the wrappers.
     actions: as the instance takes them, in the order of their numbers.
-    steps: how often it was stepped.   chance: its generator, watched.
+    steps: how often it was stepped.   chance: its generator, watched.   clock: what `Clock` says of it.
 
     Args:
         env, gamma, actions, adapter, observe: as in `SimulatorModel`, which says what is raised.
@@ -59,6 +59,8 @@ class Stepper:
         self._show = self.adapter.skip_observations(self.env)
         self._names_discounts, self._gamma = names_discounts(self.env), gamma
         self._inner_space = self.env.observation_space
+        # With discounts of its own a step might read the clock for these too.
+        self.clock = None if self._names_discounts else self.adapter.clock(self.env)
         self.chance = Chance(self.env, self.adapter)
         self.steps = 0
 
@@ -95,15 +97,10 @@ class Stepper:
                 known = self.chance.was_drawn()
             if known or random is False:
                 random = known
-            # What is not finite or does not fit its space is found before it is transformed.
-            reward = number_of("reward", reward)
-            check_rewards(reward)
+            reading = None if self.clock is None else self.clock.reading(reward, truncated)
+            reward = self._reward(reward, rewards)
             if shown:
                 check_observation(self._inner_space, observation)
-            if self._pays:
-                reward = number_of("reward", self.transforms.reward(reward))
-            if rewards is not None:
-                rewards.check(reward)
             total += discount * reward
             if terminated:
                 discount = 0.0
@@ -117,7 +114,29 @@ class Stepper:
         reached = adapter.get_state(env)
         if truncated and discount:
             reached = reached._replace(cut=True)
-        return Step(total, discount, Seen(reached, self._kept(observation) if shown else None), random)
+        seen = Seen(reached, self._kept(observation) if shown else None)
+        return Step(total, discount, seen, random, reading if repeat == 1 else None)
+
+    def at_count(self, step: Step, count: int, rewards: RewardRange | None = None) -> Step:
+        """What follows an action where the clock is at another count after it."""
+        reading, seen = step.reading, step.child
+        assert self.clock is not None
+        assert reading is not None
+        reward = self._reward(self.clock.reward(reading, count), rewards) if reading.pays else step.reward
+        reached = self.clock.at(seen.snapshot, count)
+        if count >= reading.limit and step.discount:
+            reached = reached._replace(cut=True)
+        return Step(reward, step.discount, Seen(reached, seen.observation, seen.like or seen), step.random, reading)
+
+    def _reward(self, paid: Any, rewards: RewardRange | None) -> float:
+        """A reward outside of the wrappers; what is not finite is found before it is transformed."""
+        reward = number_of("reward", paid)
+        check_rewards(reward)
+        if self._pays:
+            reward = number_of("reward", self.transforms.reward(reward))
+        if rewards is not None:
+            rewards.check(reward)
+        return reward
 
     def observation(self, data: Any) -> Any:
         """The observation of a state by the data of its snapshot, where steps make none."""
