@@ -1,8 +1,9 @@
 """Monte-Carlo tree search below many roots at once: where full width is too much, trees grow where values are high."""
 
+import functools
 import math
 from collections.abc import Iterator
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -89,7 +90,7 @@ def mcts(
         NodeBudgetExceeded: more than `max_nodes` would be needed; or what is to be expanded next would not fit into
             `max_bytes`, and the model has not been queried for it.
     """
-    options = MCTS(
+    options = _options(
         simulations=simulations,
         root=root,
         rule=rule,
@@ -107,6 +108,17 @@ def mcts(
     )
 
 
+# From one root a search takes hardly longer than the checks of its options.
+_known_options = functools.lru_cache(maxsize=64, typed=True)(MCTS)
+
+
+def _options(**given: Any) -> MCTS:
+    try:
+        return _known_options(**given)
+    except TypeError:  # something that has no hash, and so is no option: MCTS says which
+        return MCTS(**given)
+
+
 @torch.no_grad()
 def search_tree(
     leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], options: MCTS, generator: torch.Generator | None
@@ -115,13 +127,14 @@ def search_tree(
     check_roots(root_B, topology.model.num_states)
     if leaves.expansions == 0:
         return unexpanded(leaves, root_B)
-    state_B, row_B = root_B.unique(return_inverse=True)
+    # A root alone needs no sorting, which takes as long as many of its simulations.
+    state_B, row_B = (root_B, None) if root_B.shape[0] == 1 else root_B.unique(return_inverse=True)
     calls_before = topology.table.model_calls
     grow = _grow_compiled if _can_compile(topology.model, options) else _grow
     q_NA, pruned_NA, nodes_per_level = grow(leaves, topology, state_B, options, generator)
     return Lookahead.enumerated(
-        q_NA[row_B],
-        pruned_BA=pruned_NA[row_B],
+        q_NA if row_B is None else q_NA[row_B],
+        pruned_BA=pruned_NA if row_B is None else pruned_NA[row_B],
         model_calls=topology.table.model_calls - calls_before,
         critic_calls=leaves.calls,
         nodes_per_level=nodes_per_level,

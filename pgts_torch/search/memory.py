@@ -1,5 +1,6 @@
 """How much memory and how many nodes a search takes, counted and limited in one place."""
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -53,6 +54,7 @@ class Sizes:
         return self.dtype.itemsize, self.num_actions, self.num_actions * self.num_outcomes
 
 
+@functools.lru_cache(maxsize=256)
 def search_bytes(
     sizes: Sizes,
     *,

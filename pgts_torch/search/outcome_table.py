@@ -1,7 +1,9 @@
 """What a model has answered so far, one row for each state, checked: the one copy of outcomes that searches read."""
 
+import operator
 from typing import final
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
@@ -40,6 +42,15 @@ class OutcomeTable(Table):
         self.prob_RAK, self.discount_RAK = self._column("AK"), self._column("AK")
         self.child_RAK = self._column("AK", dtype=torch.int64)
         self.row_S = torch.empty(0, dtype=torch.int64, device=model.device)
+        self._seen: tuple[tuple[Tensor, ...], list[np.ndarray]] = (), []
+
+    @property
+    def arrays(self) -> list[np.ndarray]:
+        """The columns and `row_S` as compiled loops read them, in the same memory; on the CPU."""
+        columns = self.reward_RA, self.prob_RAK, self.discount_RAK, self.child_RAK, self.row_S
+        if not all(map(operator.is_, columns, self._seen[0])) or not self._seen[0]:
+            self._seen = columns, [column.numpy() for column in columns]
+        return self._seen[1]
 
     @property
     def queried(self) -> Int[Tensor, "N"]:

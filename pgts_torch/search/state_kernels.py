@@ -39,8 +39,8 @@ def _has_weight(reward, prob, discount, r, a, k):  # type: ignore[no-untyped-def
     return prob[r, a, k] > 0 and discount[r, a, k] > 0 and reward[r, a] > -np.inf
 
 
-@jit
-def reach(reward, prob, discount, child, table_row, state, wanted, count, levels):  # type: ignore[no-untyped-def]
+@inlined
+def _reach(reward, prob, discount, child, table_row, state, wanted, count, levels):  # type: ignore[no-untyped-def]
     """Add the states that follow the first `count` wanted ones within so many levels, as far as their outcomes are
     known and there is room; how many are wanted now."""
     A, K = prob.shape[1:]
@@ -66,7 +66,8 @@ def reach(reward, prob, discount, child, table_row, state, wanted, count, levels
 
 @jit
 def children(reward, prob, discount, child, table_row, state, state_N, child_C):  # type: ignore[no-untyped-def]
-    """List the children of these states of which the critic's values are not known, each once; how many there are."""
+    """List the children of these states of which the critic's values are not known, each once, ascending; how many
+    there are."""
     A, K = prob.shape[1:]
     count = 0
     for i in range(len(state_N)):
@@ -78,4 +79,37 @@ def children(reward, prob, discount, child, table_row, state, state_N, child_C):
                     state[s].v = np.inf
                     child_C[count] = s
                     count += 1
+    child_C[:count].sort()
     return count
+
+
+@jit
+def has_rows(table_row, state_N):  # type: ignore[no-untyped-def]
+    """Whether all these states have a row in the table of outcomes."""
+    missing = 0
+    for s in state_N:
+        missing += table_row[s] < 0
+    return missing == 0
+
+
+@jit
+def begin(reward, prob, discount, child, table_row, state, root_B, levels, wanted):  # type: ignore[no-untyped-def]
+    """Forget what is known of states; want the roots, and as many as there is room for of what follows them within so
+    many levels. How many are wanted; they are listed in `wanted`, ascending."""
+    for s in range(len(state)):
+        state[s].v, state[s].row = math.nan, NEW
+    for b in range(len(root_B)):
+        state[root_B[b]].row = WANTED
+        wanted[b] = root_B[b]
+    count = _reach(reward, prob, discount, child, table_row, state, wanted, len(root_B), levels)
+    wanted[:count].sort()
+    return count
+
+
+@jit
+def learn(state, child_C, v_C, state_N, row, step):  # type: ignore[no-untyped-def]
+    """Write the critic's values of children, and the rows of priors: row, row + step, row + 2 step, ..."""
+    for i in range(len(child_C)):
+        state[child_C[i]].v = v_C[i]
+    for i in range(len(state_N)):
+        state[state_N[i]].row = row + i * step

@@ -1,5 +1,6 @@
 """What compiled tree searches know of states: what the model, the critic and the policy say of them."""
 
+import functools
 import math
 from typing import Any, final
 
@@ -12,8 +13,21 @@ from pgts_torch.options.search import MCTS
 from pgts_torch.search.lookahead import Leaves
 from pgts_torch.search.memory import check_memory
 from pgts_torch.search.topology import Topology
-from pgts_torch.search.tree_records import NEW, STATE, WANTED
+from pgts_torch.search.tree_records import NEW, STATE
 from pgts_torch.seeding import sample_keys
+
+_UNKNOWN = np.array([(math.nan, NEW)], STATE)
+
+_NO_VALUES = np.empty(0)
+
+_SMALL = 2**16
+"""So many bytes are not worth an allocation by torch, whose memory is counted."""
+
+
+@functools.cache
+def _log(x: float) -> float:
+    """As torch has it."""
+    return float(torch.tensor(x, dtype=torch.float64).log())
 
 
 @final
@@ -36,7 +50,7 @@ class StateRecords:
         self._leaves, self._topology, self._table = leaves, topology, topology.table
         self._uniform, self._A = options.prior == "uniform", topology.model.num_actions
         self.state_S = np.empty(0, STATE)
-        self.prior_TA = torch.full((int(self._uniform), self._A), 1 / self._A, dtype=torch.float64)
+        self.prior_TA = np.full((int(self._uniform), self._A), 1 / self._A)
         self.grown = self.places = 0
 
     @property
@@ -47,11 +61,14 @@ class StateRecords:
     @property
     def arrays(self) -> list[Any]:
         """What the kernels read: the columns of the `OutcomeTable`, `state_S`, `prior_TA`."""
-        return [*self._outcomes, self.state_S, self.prior_TA.numpy()]
+        return [*self._table.arrays, self.state_S, self.prior_TA]
 
     def preference(self, root_B: Int[Tensor, "B"], generator: torch.Generator | None) -> Float[Tensor, "B A"]:
         """log prior(a) of known states, plus standard Gumbel noise if there is a generator."""
-        preference_BA = self.prior_TA[torch.from_numpy(self.state_S["row"][root_B.numpy()])].log()
+        if self._uniform:
+            preference_BA = torch.from_numpy(np.full((root_B.shape[0], self._A), _log(1 / self._A)))
+        else:
+            preference_BA = torch.from_numpy(self.prior_TA[self.state_S["row"][root_B.numpy()]]).log()
         if generator is not None:
             key = sample_keys(1, generator=generator).numpy().view(np.uint64)[0]
             self._kernels.add_noise(key, root_B.numpy(), preference_BA.numpy())
@@ -61,42 +78,42 @@ class StateRecords:
         """Learn of these states, and of at most so many that follow within so many levels, as far as their outcomes are
         known: the critic is called at once for what simulations may reach."""
         self.query(root_B)
-        wanted_N = torch.empty(max(most, len(root_B)), dtype=torch.int64)
-        wanted_N[: len(root_B)] = root_B
-        self.state_S["row"][root_B.numpy()] = WANTED
-        found = self._kernels.reach(*self._outcomes, self.state_S, wanted_N.numpy()[:most], len(root_B), levels)
-        self._learn(wanted_N[:found].sort().values)
+        wanted_N = np.empty(most, np.int64)
+        found = self._kernels.begin(*self._table.arrays, self.state_S, root_B.numpy(), levels, wanted_N)
+        self._learn(wanted_N[:found])
 
     def query(self, state_N: Int[Tensor, "N"]) -> None:
         """Have the outcomes of these states in the table, and room for the states that the model has met by then."""
-        missing = self._table.missing(state_N)
-        if missing.shape[0]:
-            self.check_memory(state_N.shape[0], missing.shape[0])
-            self._topology.query(missing)
-        more = self._table.row_S.shape[0] - len(self.state_S)
+        table = self._table
+        has_room = table.row_S.shape[0] >= self._topology.model.num_states
+        if not (has_room and self._kernels.has_rows(table.arrays[-1], state_N.numpy())):
+            missing = table.missing(state_N)
+            if missing.shape[0]:
+                self.check_memory(state_N.shape[0], missing.shape[0])
+                self._topology.query(missing)
+        more = table.row_S.shape[0] - len(self.state_S)
         if more:
-            new_S = records((more,), STATE)
-            new_S[...] = (math.nan, NEW)
-            self.state_S = np.concatenate([self.state_S, new_S])
+            new_S = _UNKNOWN.repeat(more)
+            self.state_S = np.concatenate([self.state_S, new_S]) if len(self.state_S) else new_S
 
     def learn(self, state_N: Int[Tensor, "N"]) -> None:
         """The outcomes of these wanted states, the critic's values of their children, and the prior."""
         self.query(state_N)
-        self._learn(state_N)
+        self._learn(state_N.numpy())
 
-    def _learn(self, state_N: Int[Tensor, "N"]) -> None:
-        self.check_memory(state_N.shape[0])
-        edges = state_N.shape[0] * self._A * self._table.num_outcomes
+    def _learn(self, state_N: Int[np.ndarray, "N"]) -> None:
+        self.check_memory(len(state_N))
+        edges = len(state_N) * self._A * self._table.num_outcomes
         child_C = np.empty(min(edges, len(self.state_S)), np.int64)
-        count = self._kernels.children(*self._outcomes, self.state_S, state_N.numpy(), child_C)
+        count = self._kernels.children(*self._table.arrays, self.state_S, state_N, child_C)
+        child_C, row, step, v_C = child_C[:count], 0, 0, _NO_VALUES
         if count:
-            child_C = np.sort(child_C[:count])
-            self.state_S["v"][child_C] = self._leaves.v(torch.from_numpy(child_C)).numpy(force=True)
-        row: Any = 0
+            v_C = self._leaves.v(torch.from_numpy(child_C)).numpy(force=True)
         if not self._uniform:
-            row = np.arange(len(self.prior_TA), len(self.prior_TA) + len(state_N))
-            self.prior_TA = torch.cat([self.prior_TA, self._leaves.prior(state_N).double()])
-        self.state_S["row"][state_N.numpy()] = row
+            row, step = len(self.prior_TA), 1
+            prior_NA = self._leaves.prior(torch.from_numpy(state_N)).double().numpy(force=True)
+            self.prior_TA = np.concatenate([self.prior_TA, prior_NA])
+        self._kernels.learn(self.state_S, child_C, v_C, state_N, row, step)
 
     def check_memory(self, looked_up: int = 0, new: int = 0) -> None:
         """NodeBudgetExceeded if a step that looks up so many states, of which so many are new, takes too much."""
@@ -106,13 +123,10 @@ class StateRecords:
         what = f"the search ({self.grown} nodes, {looked_up} states of {self._A} actions)"
         check_memory(needed, self._topology.max_bytes, what)
 
-    @property
-    def _outcomes(self) -> list[Any]:
-        table = self._table
-        columns = table.reward_RA, table.prob_RAK, table.discount_RAK, table.child_RAK, table.row_S
-        return [column.numpy() for column in columns]
-
 
 def records(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
     """An array of these, anything in them."""
-    return torch.empty(math.prod(shape) * kind.itemsize, dtype=torch.uint8).numpy().view(kind).reshape(shape)
+    size = math.prod(shape) * kind.itemsize
+    if size <= _SMALL:
+        return np.empty(shape, kind)
+    return torch.empty(size, dtype=torch.uint8).numpy().view(kind).reshape(shape)

@@ -1,5 +1,6 @@
 """Which states a lookahead meets at which level. Transitions do not depend on the policy, so this outlives a search."""
 
+import functools
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import replace
@@ -149,7 +150,7 @@ class Topology:
 
     def bytes(self, new: int, *, looked_up: int = 0, kept: int = 0, **counts: int) -> int:
         """`search_bytes` of a search that queries the model for so many new states and looks up so many."""
-        sizes = Sizes(self.model.num_actions, self._num_outcomes, self.model.dtype)
+        sizes = _sizes(self.model.num_actions, self._num_outcomes, self.model.dtype)
         states, remembered = max(self.model.num_states, len(self.table.row_S)), self.table.count + new
         if self.model.samples_outcomes:
             # Such a model keeps what it has sampled, and the bootstrap resamples a level as a whole.
@@ -272,6 +273,9 @@ class Topology:
     def _check_generation(self) -> None:
         if self.model.generation != self._generation:
             raise PgtsError("the model has been reset since this topology was made: make a new topology")
+
+
+_sizes = functools.lru_cache(maxsize=64)(Sizes)
 
 
 def _children_in(table: Outcomes, state_N: Int[Tensor, "N"]) -> Int[Tensor, "children"]:
