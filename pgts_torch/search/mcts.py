@@ -13,9 +13,11 @@ from pgts_torch.compiled import can_compile
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model
 from pgts_torch.options.search import MAX_NODES, MCTS
+from pgts_torch.search.fixed_trees import FixedTrees
 from pgts_torch.search.forest import Forest
 from pgts_torch.search.known import KnownStates
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_roots, unexpanded
+from pgts_torch.search.memory import check_memory, check_nodes, tree_nodes
 from pgts_torch.search.split import Rule, sigma
 from pgts_torch.search.topology import Topology, topology_of
 from pgts_torch.search.tree import Tree
@@ -60,7 +62,8 @@ def mcts(
     stop at unknown states until the model and the critic have been called for those of all roots together. On other
     devices, with `merge`, or where numba is missing, they go down in waves (`pgts_torch.search.tree`): those of one
     wave are split among actions and outcomes as if they came one by one, but do not know each other's values. What a
-    wave could not use is sent again. With waves of 1 both are the same search.
+    wave could not use is sent again. With waves of 1 both are the same search; where the model keeps a table of all
+    states it then is one of fixed shape (`pgts_torch.search.fixed_trees`), for which the critic values all states.
 
     With root="gumbel" the root's actions get simulations by sequential halving of g(a) + log prior(a) + sigma(q(a))
     (Danihelka et al. 2022); the trees below them are separate, so those of one round run side by side. With merge=False
@@ -130,7 +133,8 @@ def search_tree(
     # A root alone needs no sorting, which takes as long as many of its simulations.
     state_B, row_B = (root_B, None) if root_B.shape[0] == 1 else root_B.unique(return_inverse=True)
     calls_before = topology.table.model_calls
-    grow = _grow_compiled if _can_compile(topology.model, options) else _grow
+    grow = _grow_fixed if _fits_arrays(topology.model, len(state_B), options) else _grow
+    grow = _grow_compiled if _can_compile(topology.model, options) else grow
     q_NA, pruned_NA, nodes_per_level = grow(leaves, topology, state_B, options, generator)
     return Lookahead.enumerated(
         q_NA if row_B is None else q_NA[row_B],
@@ -155,6 +159,38 @@ def _grow_compiled(
     values = forest.search(generator)
     q_BA, pruned_BA = (value_BA.to(topology.model.dtype) for value_BA in values)
     return q_BA, pruned_BA, forest.nodes_per_level
+
+
+def _fits_arrays(model: EnumeratingModel, roots: int, options: MCTS) -> bool:
+    """Whether the search is one for which there are trees of fixed shape, and its table no larger than they may be: the
+    critic values all its states."""
+    if model.table is None or options.wave != 1 or options.backup != "max" or options.merges:
+        return False
+    return model.num_states <= roots * options.simulations * model.num_actions * model.table.num_outcomes
+
+
+def _grow_fixed(
+    leaves: Leaves, topology: Topology, state_B: Tensor, options: MCTS, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """The same by torch, one simulation after another, from the values of all states."""
+    model, bottom, B = topology.model, leaves.expansions, len(state_B)
+    table, S, A = model.table, model.num_states, model.num_actions
+    assert table is not None
+    num_nodes = int(min(options.simulations, tree_nodes(1, A * table.num_outcomes, bottom - 1)))
+    needed = topology.bytes(0, fixed=2 * S + B * (num_nodes + 2 * A) + 1, places=2 * bottom)
+    check_memory(needed, topology.max_bytes, f"the search ({B * num_nodes} nodes, {S} states of {A} actions)")
+    state_S = torch.arange(S, device=model.device)
+    prior_SA = leaves.prior(state_S)
+    trees = FixedTrees(table, leaves.v(state_S), prior_SA, bottom, options, num_roots=B, num_nodes=num_nodes)
+    values = trees.search(state_B, _preference(prior_SA[state_B].double(), state_B, generator))
+    state_N, level_N = trees.expanded().unbind(1)
+    topology.table.read(state_N.unique())
+    valued_L = torch.zeros(bottom + 1, dtype=torch.int64, device=model.device)
+    valued_L[0] = B
+    nodes_per_level = tuple(valued_L.index_add_(0, level_N + 1, trees.outcomes_S[state_N]).tolist())
+    check_nodes(sum(nodes_per_level), options.max_nodes)
+    q_BA, pruned_BA = (value_BA.to(model.dtype) for value_BA in values)
+    return q_BA, pruned_BA, nodes_per_level
 
 
 def _grow(

@@ -50,6 +50,12 @@ class Sizes:
         return 28 + 32 * A + 32 * E
 
     @property
+    def fixed(self) -> int:
+        """A node, or a state, of `FixedTrees`."""
+        _, A, E = self._parts
+        return 16 + 40 * A + 40 * E
+
+    @property
     def _parts(self) -> tuple[int, int, int]:
         return self.dtype.itemsize, self.num_actions, self.num_actions * self.num_outcomes
 
@@ -70,6 +76,7 @@ def search_bytes(
     learned: int = 0,
     nodes: int = 0,
     grown: int = 0,
+    fixed: int = 0,
     places: int = 0,
     arms: int = 0,
 ) -> int:
@@ -88,7 +95,8 @@ def search_bytes(
         sampled: nodes whose outcomes were sampled, after the step.   sampling: those that the step samples.
         resampled: nodes that the bootstrap samples again at once.
         learned: rows of `KnownStates`.
-        nodes: rows of `Nodes`.   grown: nodes for which a `Forest` has room.
+        nodes: rows of `Nodes`.   grown: nodes for which a `Forest` has room.   fixed: nodes, states and lanes of
+            `FixedTrees`.
         places: of tables by level, by state and by both.   arms: that a wave passes at once.
     """
     s, A, E = sizes.dtype.itemsize, sizes.num_actions, sizes.num_actions * sizes.num_outcomes
@@ -106,6 +114,7 @@ def search_bytes(
     total += learned * (GROWTH * sizes.known + widest)
     total += nodes * (GROWTH * sizes.node + widest + E * (4 * s + 16) + 40 * A)
     total += 2 * grown * sizes.grown  # twice, as outcomes of an action may become more
+    total += fixed * (2 * sizes.fixed + 32 * E)
     total += 8.0 * places
     total += arms * (96 * sizes.num_outcomes + 160)
     return int(total)

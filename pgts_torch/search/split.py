@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 Rule = Literal["gumbel", "puct", "uct"]
@@ -51,21 +51,13 @@ class Selection:
     ) -> Float[Tensor, "N A"]:
         """How many of the simulations of a node each action gets: none where it is exhausted, at most `most_NA`."""
         if self.rule == "gumbel":
-            # Deficits: the visits that pi' deals each action of all N + b, minus those it has had.
-            policy_NA = prior_NA.double() * sigma(q_NA, visits_NA).exp_()
-            policy_NA /= policy_NA.sum(1, keepdim=True).clamp_min_(torch.finfo(torch.float64).tiny)
-            total_N1 = visits_NA.sum(1).add_(budget_N).unsqueeze(1)
-            return apportion(policy_NA.mul_(total_N1).sub_(visits_NA).add_(exhausted_NA), budget_N, most_NA)
+            deficit_NA = _deficits(q_NA, visits_NA, prior_NA, budget_N)
+            return apportion(deficit_NA.add_(exhausted_NA), budget_N, most_NA)
         # One simulation of every node at a time, each to the best action; their number grows with `given_NA`.
         limit_NA = None if most_NA is None else visits_NA + most_NA
         q_NA, given_NA = scaled(q_NA).add_(exhausted_NA), visits_NA.clone()
         for given in range(math.ceil(budget_N.amax())):
-            total_N1, next_NA = given_NA.sum(1, keepdim=True), given_NA + 1
-            if self.rule == "puct":
-                bonus_NA = (total_N1 + 1).sqrt_() / next_NA * prior_NA
-            else:
-                bonus_NA = (total_N1.log1p() / next_NA).sqrt_()
-            score_NA = bonus_NA.mul_(self.exploration).add_(q_NA)
+            score_NA = self._bonus(given_NA, prior_NA).add_(q_NA)
             if limit_NA is not None:
                 score_NA.masked_fill_(given_NA >= limit_NA, -torch.inf)
             best_N1, a_N1 = score_NA.max(1, keepdim=True)
@@ -73,6 +65,43 @@ class Selection:
             takes_N1 = (budget_N - given).clamp_(0, 1).unsqueeze(1).masked_fill_(best_N1 == -torch.inf, 0)
             given_NA.scatter_add_(1, a_N1, takes_N1.to(given_NA.dtype))
         return given_NA - visits_NA
+
+    def best(
+        self,
+        *,
+        q_NA: Float[Tensor, "N A"],
+        visits_NA: Float[Tensor, "N A"],
+        prior_NA: Float[Tensor, "N A"],
+        open_NA: Bool[Tensor, "N A"],
+    ) -> Int[Tensor, "N"]:
+        """The open action that gets the one simulation of a node. Nothing is read back from a GPU."""
+        if self.rule == "gumbel":
+            score_NA = _deficits(q_NA, visits_NA, prior_NA, 1).mul_(_GRID).round_()
+        else:
+            score_NA = self._bonus(visits_NA, prior_NA).add_(scaled(q_NA))
+        return score_NA.masked_fill_(~open_NA, -torch.inf).argmax(1)
+
+    def _bonus(self, visits_NA: Float[Tensor, "N A"], prior_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
+        """What puct and uct add to values."""
+        total_N1, next_NA = visits_NA.sum(1, keepdim=True), visits_NA + 1
+        if self.rule == "puct":
+            bonus_NA = (total_N1 + 1).sqrt_() / next_NA * prior_NA
+        else:
+            bonus_NA = (total_N1.log1p() / next_NA).sqrt_()
+        return bonus_NA.mul_(self.exploration)
+
+
+def _deficits(q_NA: Tensor, visits_NA: Tensor, prior_NA: Tensor, budget_N: Tensor | int) -> Float[Tensor, "N A"]:
+    """The visits that pi' deals each action of all N + b, minus those it has had."""
+    policy_NA = prior_NA.double() * sigma(q_NA, visits_NA).exp_()
+    policy_NA /= policy_NA.sum(1, keepdim=True).clamp_min_(torch.finfo(torch.float64).tiny)
+    total_N1 = visits_NA.sum(1).add_(budget_N).unsqueeze(1)
+    return policy_NA.mul_(total_N1).sub_(visits_NA)
+
+
+def most_lacking(lack_NK: Float[Tensor, "N K"]) -> Int[Tensor, "N"]:
+    """The place with the largest deficit, which gets one unit; of equal ones the first."""
+    return lack_NK.mul(_GRID).round_().argmax(1)
 
 
 def sigma(q_NA: Float[Tensor, "N A"], visits_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
@@ -84,9 +113,8 @@ def scaled(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N A"]:
     """Values on the scale on which the best action of a node has 0 and the worst that is allowed -1."""
     # The span is at least a share of the values, so that differences by rounding stay small, and never 0.
     high_N1 = q_NA.amax(1, keepdim=True)
-    low_N1 = q_NA.amin(1, keepdim=True)
-    if not math.isfinite(low_N1.amin()):  # -inf of actions that are not allowed: the worst of the others
-        low_N1 = torch.where(q_NA > -torch.inf, q_NA, high_N1).amin(1, keepdim=True)
+    # -inf of actions that are not allowed does not count: the worst is that of the others.
+    low_N1 = torch.where(q_NA > -torch.inf, q_NA, high_N1).amin(1, keepdim=True)
     span_N1 = (high_N1 - low_N1).add_(high_N1.abs(), alpha=_TIE).clamp_min_(torch.finfo(q_NA.dtype).tiny)
     return (q_NA - high_N1).div_(span_N1)
 

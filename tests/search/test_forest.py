@@ -1,6 +1,7 @@
 """Trees that compiled loops grow are those of torch; model and critic are called for all roots at once."""
 
 import math
+import sys
 
 import pytest
 import torch
@@ -24,14 +25,18 @@ rules = st.sampled_from(["gumbel", "puct", "uct"])
 backups = st.sampled_from(["max", "mean"])
 
 
-def both(model: EnumeratingModel, root_B: Tensor, *, noise: int | None = None, **options) -> list[Lookahead]:
-    """The same search, compiled and by torch."""
+def both(
+    model: EnumeratingModel, root_B: Tensor, *, noise: int | None = None, in_waves: bool = False, **options
+) -> list[Lookahead]:
+    """The same search, compiled and by torch: in waves of one, or where it can in arrays of fixed shape."""
 
     def look() -> Lookahead:
         generator = None if noise is None else stream(noise, "noise")
         return mcts(model, root_B, wave=1, generator=generator, **options)
 
-    with torch_only():
+    with torch_only(), pytest.MonkeyPatch.context() as patch:
+        if in_waves:
+            patch.setattr(sys.modules["pgts_torch.search.mcts"], "_fits_arrays", lambda *_: False)
         by_torch = look()
     return [look(), by_torch]
 
@@ -52,9 +57,10 @@ def assert_same(compiled: Lookahead, by_torch: Lookahead, tolerance: float = 1e-
     rules,
     backups,
     st.sampled_from([1e-3, 1.0, 1e6]),
+    st.booleans(),
 )
-def test_compiled_trees_are_those_of_torch(mdp, depth, simulations, seed, root, rule, backup, scale):
-    mdp, options = rewarded(mdp, factor=scale), {"root": root, "rule": rule, "backup": backup}
+def test_compiled_trees_are_those_of_torch(mdp, depth, simulations, seed, root, rule, backup, scale, in_waves):
+    mdp, options = rewarded(mdp, factor=scale), {"root": root, "rule": rule, "backup": backup, "in_waves": in_waves}
     if root == "gumbel":
         options["noise"] = seed
     if not (root == "rule" and rule == "uct"):

@@ -1,9 +1,13 @@
 """A lookahead that would not fit into memory is refused before it asks the model for what would fill it."""
 
+import sys
+from contextlib import nullcontext
+
 import pytest
 import torch
 from torch import Tensor
 
+from pgts_torch.compiled import torch_only
 from pgts_torch.errors import NodeBudgetExceeded
 from pgts_torch.models.base import EnumeratingModel
 from pgts_torch.models.tabular import TabularModel
@@ -25,6 +29,8 @@ from pgts_torch.tabular import random_mdp
 from tests.memory import peak_bytes
 from tests.search.models import WatchedModel, zeros
 
+MCTS_MODULE = sys.modules["pgts_torch.search.mcts"]  # whose name in the package is that of the function
+
 A, K = 3, 4
 GARNET = random_mdp(4000, A, branching=K, seed=5)
 ROOT = torch.tensor([0])
@@ -43,11 +49,13 @@ def look_of(kind: str, model: EnumeratingModel, max_bytes: int) -> tuple[Lookahe
         options = {
             "mcts": {},
             "mcts, in waves": {"wave": 30},
+            "mcts, fixed": {"wave": 1},
             "mcts, prior": {"prior": lambda state_N: torch.full((len(state_N), A), 1 / A)},
             "mcts, merged": {"merge": True},
             "mcts, means": {"backup": "mean"},
         }[kind]
-        return mcts(**ask, simulations=30, topology=topology, **options), topology
+        with torch_only() if kind == "mcts, fixed" else nullcontext():
+            return mcts(**ask, simulations=30, topology=topology, **options), topology
     return expectimax(**ask, topology=topology, max_width=100 if kind == "pruned" else None), topology
 
 
@@ -55,7 +63,7 @@ def least_bytes(kind: str, model: EnumeratingModel, monkeypatch: pytest.MonkeyPa
     """The smallest limit under which the search is made."""
     told = [0]
     with monkeypatch.context() as patch:
-        for module in (topology_module, known_module, records_module):
+        for module in (topology_module, known_module, records_module, MCTS_MODULE):
             patch.setattr(module, "check_memory", lambda needed, most, what: told.append(needed))
         look_of(kind, model, MAX_BYTES)
     return max(told)
@@ -69,6 +77,7 @@ KINDS = [
     "sampled search",
     "mcts",
     "mcts, in waves",
+    "mcts, fixed",
     "mcts, prior",
     "mcts, merged",
     "mcts, means",
