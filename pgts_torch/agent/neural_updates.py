@@ -178,10 +178,10 @@ class PPOUpdate(NetworkUpdate):
                 and mean(part_N, divergence(before_NA, log_NA)) > self.options.target_kl
             ):
                 break
-            gain_NA, push_NA = self.objective(log_NA, before_NA, part_NA)
-            policy_loss = -mean(part_N, (before_NA.exp() * gain_NA).sum(-1))
-            down_NA = through_log_softmax(log_NA, -push_NA * (part_N / len(part_N))[:, None])
-            readings.add(policy=policy_loss, grad_norm=self.step(network, forward, policy_loss, down_NA))
+            gain_NA, down_NA = self.objective(log_NA, before_NA, part_NA, part_N)
+            loss = -mean(part_N, gain_NA.sum(-1))
+            norm = self.step(network, forward, loss, through_log_softmax(log_NA, down_NA))
+            readings.add(policy=loss, grad_norm=norm)
             num_steps += 1
         new_NA = log_probs(network, input_N)
         outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.now.clip_range
@@ -192,22 +192,34 @@ class PPOUpdate(NetworkUpdate):
         return old_NA, new_NA
 
     def objective(
-        self, log_NA: Float[Tensor, "N A"], old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"]
+        self,
+        log_NA: Float[Tensor, "N A"],
+        old_NA: Float[Tensor, "N A"],
+        advantage_NA: Float[Tensor, "N A"],
+        weight_N: Float[Tensor, "N"],
     ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
-        """Return min(rho adv, clip(rho) adv), and the gradient of a state's whole objective in log pi(a|s):
+        """Return pi_old min(rho adv, clip(rho) adv), and the gradient of the loss, minus the objective, in log pi(a|s):
 
-            pi(a|s) ( adv(s, a) 1(not clipped) - entropy_coef (log pi(a|s) + 1) )
+            -w(s) / N pi(a|s) ( adv(s, a) 1(not clipped) - entropy_coef (log pi(a|s) + 1) )
 
         It is written out because autograd through these operations would cost as much as the network itself.
         """
-        ratio_NA = (log_NA - old_NA).exp()
-        clipped_NA = ratio_NA.clamp(1 - self.now.clip_range, 1 + self.now.clip_range)
+        ratio_NA, pi_NA, before_NA = (log_NA - old_NA).exp(), log_NA.exp(), old_NA.exp()
+        low, high, coef = 1 - self.options.clip_range, 1 + self.options.clip_range, self.options.entropy_coef
+        if self._optimiser.compiles:
+            from pgts_torch.agent import step_kernels
+
+            gain_NA, down_NA = torch.empty_like(log_NA), torch.empty_like(log_NA)
+            given = (log_NA, ratio_NA, pi_NA, before_NA, advantage_NA, weight_N)
+            arrays = tuple(each.numpy() for each in given)
+            step_kernels.clipped_objective(arrays, low, high, coef, gain_NA.numpy(), down_NA.numpy())
+            return gain_NA, down_NA
         free_NA = ratio_NA * advantage_NA
-        gain_NA = torch.minimum(free_NA, clipped_NA * advantage_NA)
-        slope_NA = torch.where(gain_NA == free_NA, advantage_NA, 0.0)
-        if self.now.entropy_coef:
-            slope_NA = slope_NA - self.now.entropy_coef * (log_NA + 1)
-        return gain_NA, log_NA.exp() * slope_NA
+        least_NA = torch.minimum(free_NA, ratio_NA.clamp(low, high) * advantage_NA)
+        slope_NA = torch.where(least_NA == free_NA, advantage_NA, 0.0)
+        if coef:
+            slope_NA = slope_NA - coef * (log_NA + 1)
+        return before_NA * least_NA, -(pi_NA * slope_NA) * (weight_N / len(weight_N))[:, None]
 
 
 def entropy(log_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:

@@ -10,11 +10,16 @@ import torch
 from torch import Tensor, nn
 
 from pgts_torch.agent.policies import fitting
+from pgts_torch.compiled import can_compile
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.readings import Readings
 
 _BETAS = 0.9, 0.999
 _EPSILON = 1e-8
+
+_SHORT, _MANY = 2**15, 500
+"""Steps of up to so many numbers are compiled, because calls of torch take longer than these; and only from so many
+steps on, because a training that takes fewer is over before compiled loops are loaded."""
 
 
 @final
@@ -41,6 +46,8 @@ class Optimiser:
         self._first_D: Tensor | None = None
         self._second_D: Tensor | None = None
         self._undo, self._readings = Undo(), Readings()
+        self._parameters: Sequence[Tensor] = ()
+        self._step_D, self._moved, self._pieces = torch.empty(0), list[Tensor](), list[Tensor]()
 
     @contextmanager
     def attempt(self, tensors: Sequence[Tensor]) -> Iterator[Readings]:
@@ -85,34 +92,72 @@ class Optimiser:
         with torch.no_grad():
             gradient_D = torch.cat([piece.reshape(-1) for piece in gradients])
             norm = torch.linalg.vector_norm(gradient_D)
-            if self.max_grad_norm is not None:
-                limit = torch.full_like(norm, self.max_grad_norm, dtype=torch.float64)
-                gradient_D *= limit.div_(norm).clamp_(max=1)
-            step_D = self._adam(gradient_D) if self.method == "adam" else gradient_D.mul_(-self.learning_rate)
+            if self._parameters is not parameters:
+                self._prepare(parameters)
+            is_short = self.method == "adam" and len(gradient_D) <= _SHORT
+            total = (self._compiled if is_short and self.compiles else self._move)(gradient_D, norm)
             self._readings.check(loss, partial(_refuse, "loss", f"the {name} loss"))
             self._readings.check(norm, partial(_refuse, "gradient", f"the gradient of the {name} loss"))
-            self._readings.check(step_D.sum(), partial(_refuse, "gradient", f"the step down the {name} loss"))
-            moved: list[Tensor] = list(parameters)
-            pieces = step_D.split([parameter.numel() for parameter in moved])
-            torch._foreach_add_(moved, [piece.view_as(like) for piece, like in zip(pieces, moved, strict=True)])
+            self._readings.check(total, partial(_refuse, "gradient", f"the step down the {name} loss"))
+            torch._foreach_add_(self._moved, self._pieces)
         return norm
 
-    def _adam(self, gradient_D: Tensor) -> Tensor:
-        if self._first_D is None or self._second_D is None:
-            self._first_D, self._second_D = torch.zeros_like(gradient_D), torch.zeros_like(gradient_D)
-        if len(self._first_D) != len(gradient_D):
-            raise PgtsError(
-                f"the optimiser has moments of {len(self._first_D)} parameters; the network has {len(gradient_D)}"
-            )
-        first_D, second_D = self._first_D, self._second_D = self._first_D.to(gradient_D), self._second_D.to(gradient_D)
-        self.num_steps += 1
+    @property
+    def compiles(self) -> bool:
+        """Whether compiled loops are used where they save time. No bit depends on it."""
+        return self.num_steps >= _MANY and can_compile(self._step_D.device)
+
+    def _prepare(self, parameters: Sequence[Tensor]) -> None:
+        """Make room for steps of these parameters, which is kept."""
+        sizes, like = [each.numel() for each in parameters], parameters[0]
+        self._step_D = torch.empty(sum(sizes), dtype=like.dtype, device=like.device)
+        pieces = zip(self._step_D.split(sizes), parameters, strict=True)
+        self._parameters, self._moved = parameters, list(parameters)
+        self._pieces = [piece.view_as(each) for piece, each in pieces]
+
+    def _move(self, gradient_D: Tensor, norm: Tensor) -> Tensor:
+        """Write the step for a gradient of this norm. Return the sum of its numbers."""
+        if self.max_grad_norm is not None:
+            limit = torch.full_like(norm, self.max_grad_norm, dtype=torch.float64)
+            gradient_D *= limit.div_(norm).clamp_(max=1)
+        if self.method == "sgd":
+            return torch.mul(gradient_D, -self.learning_rate, out=self._step_D).sum()
+        first_D, second_D = self._moments(gradient_D)
         first_D.lerp_(gradient_D, 1 - _BETAS[0])
         second_D.mul_(_BETAS[1]).addcmul_(gradient_D, gradient_D, value=1 - _BETAS[1])
-        # m / c1 / (sqrt(v / c2) + eps), with the corrections taken out of the vectors.
+        epsilon, rate = self._corrected()
+        return torch.div(first_D, second_D.sqrt().add_(epsilon), out=self._step_D).mul_(rate).sum()
+
+    def _compiled(self, gradient_D: Tensor, norm: Tensor) -> Tensor:
+        """As `_move` of Adam, by compiled loops."""
+        from pgts_torch.agent import step_kernels
+
+        first_D, second_D = self._moments(gradient_D)
+        first, second, total = first_D.numpy(), second_D.numpy(), torch.empty_like(norm)
+        longest = math.inf if self.max_grad_norm is None else self.max_grad_norm
+        rates = 1 - _BETAS[0], _BETAS[1], 1 - _BETAS[1]
+        step_kernels.move_moments(gradient_D.numpy(), norm.numpy(), longest, first, second, *rates)
+        torch.sqrt(second_D, out=self._step_D)
+        step_kernels.steps(first, self._step_D.numpy(), *self._corrected(), total.numpy())
+        return total
+
+    def _corrected(self) -> tuple[float, float]:
+        """e and c for which c m / (sqrt(v) + e) is the step: the corrections of moments, taken out of the vectors."""
         mean_correction, square_correction = (1 - beta**self.num_steps for beta in _BETAS)
         root = math.sqrt(square_correction)
-        scale_D = second_D.sqrt().add_(_EPSILON * root)
-        return torch.div(first_D, scale_D).mul_(-self.learning_rate * root / mean_correction)
+        return _EPSILON * root, -self.learning_rate * root / mean_correction
+
+    def _moments(self, like_D: Tensor) -> tuple[Tensor, Tensor]:
+        """The moments before one more step, which is counted."""
+        if self._first_D is None or self._second_D is None:
+            self._first_D, self._second_D = torch.zeros_like(like_D), torch.zeros_like(like_D)
+        if len(self._first_D) != len(like_D):
+            raise PgtsError(
+                f"the optimiser has moments of {len(self._first_D)} parameters; the network has {len(like_D)}"
+            )
+        self._first_D, self._second_D = self._first_D.to(like_D), self._second_D.to(like_D)
+        self.num_steps += 1
+        return self._first_D, self._second_D
 
     @property
     def moments(self) -> list[Tensor]:

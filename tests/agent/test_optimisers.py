@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -10,12 +11,14 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from pgts_torch.agent import optimisers
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
 from pgts_torch.agent.optimisers import Optimiser, Undo
 from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
+from pgts_torch.compiled import torch_only
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.options import CMPO, MLP, PPO, FixedHorizon, Gradient, Mirror, NetworkValues
 from pgts_torch.seeding import stream
@@ -47,6 +50,41 @@ def test_adam_is_that_of_torch_and_gradients_are_clipped_as_torch_does():
     assert clipped == {False, True}
 
 
+@pytest.mark.parametrize("max_grad_norm", [None, 0.5])
+def test_compiled_steps_have_the_bits_of_torch(monkeypatch, max_grad_norm):
+    step_kernels, found, compiled = pytest.importorskip("pgts_torch.agent.step_kernels"), [], []
+    plain = step_kernels.steps
+    monkeypatch.setattr(step_kernels, "steps", lambda *each: compiled.append(plain(*each)))
+    monkeypatch.setattr(optimisers, "_MANY", 10)
+    for form in (nullcontext, torch_only):
+        generator, parameter = stream(0, "compiled"), torch.nn.Parameter(torch.ones(1003))
+        optimiser, norms = Optimiser(learning_rate=1e-3, max_grad_norm=max_grad_norm), []
+        with form(), optimiser.attempt([parameter]):
+            for k in range(60):
+                gradient_D = torch.randn(1003, generator=generator) * 10.0 ** (k % 12 - 6)
+                norms.append(optimiser.step([parameter], [gradient_D], torch.zeros(()), "test"))
+        found.append((parameter.detach(), *optimiser.moments, torch.stack(norms)))
+        with pytest.raises(NotFinite, match="the gradient"), form(), optimiser.attempt([parameter]):
+            optimiser.step([parameter], [torch.full_like(gradient_D, math.nan)], torch.zeros(()), "test")
+        assert torch.equal(parameter, found[-1][0])
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one, other)
+    assert len(compiled) == 50 + 1
+    assert (found[0][0] - 1).abs().min() > 0
+
+
+def test_few_steps_and_long_gradients_are_left_to_torch(monkeypatch):
+    step_kernels = pytest.importorskip("pgts_torch.agent.step_kernels")
+    calls: list[int] = []
+    monkeypatch.setattr(step_kernels, "steps", lambda first, *_: calls.append(len(first)))
+    for size in (2**15, 2**15 + 1):
+        parameters, optimiser = [torch.nn.Parameter(torch.zeros(size))], Optimiser(learning_rate=0.1, max_grad_norm=1.0)
+        with optimiser.attempt(parameters):
+            for _ in range(502):
+                optimiser.step(parameters, [torch.ones(size)], torch.zeros(()), "test")
+    assert calls == [2**15] * 2
+
+
 @pytest.mark.parametrize("size", [0.0, 0.3, 0.7, 1e15])
 def test_a_gradient_that_is_short_enough_keeps_every_bit_and_a_longer_one_its_direction(size):
     parameter = torch.nn.Parameter(torch.zeros(3))
@@ -65,7 +103,7 @@ def test_a_step_reads_nothing_back_and_an_attempt_reads_once(method, max_grad_no
     optimiser = Optimiser(learning_rate=0.1, max_grad_norm=max_grad_norm, method=method)
     counted = []
     for num_steps in (1, 5):
-        with Counting() as whole, optimiser.attempt(parameters) as readings, Counting() as steps:
+        with torch_only(), Counting() as whole, optimiser.attempt(parameters) as readings, Counting() as steps:
             for _ in range(num_steps):
                 loss = torch.ones(())
                 readings.add(norm=optimiser.step(parameters, parameters, loss, "test"), loss=loss)
@@ -82,7 +120,7 @@ def reads(make: Callable[..., NetworkUpdate], observations: int = 70, **options:
     advantage_NA = torch.randn(observations, 4, generator=generator, dtype=torch.float64)
     batch = Batch(observation_ND, advantage_NA, torch.ones(observations, dtype=torch.float64))
     update = make(learning_rate=0.01, **options)
-    with Counting() as counts:
+    with torch_only(), Counting() as counts:
         update(policy, batch, generator=generator)
     return counts.num_reads, len(update.state_dict()) and update.state_dict()["num_steps"]
 
@@ -122,7 +160,7 @@ def fitted(options: NetworkValues) -> tuple[NetworkCritic, int]:
     rollouts = [experience(mdp, pi_SA, FixedHorizon(length=16), episodes=4, seed=seed) for seed in range(2)]
     critic.fit(policy, rollouts[0], generator=stream(0, "critic"))
     rollouts[1].observation_V  # noqa: B018 - made once, by a mask
-    with Counting() as counts:
+    with torch_only(), Counting() as counts:
         critic.fit(policy, rollouts[1], generator=stream(1, "critic"))
     return critic, counts.num_reads
 
