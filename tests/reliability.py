@@ -176,6 +176,7 @@ FAULTS: dict[str, dict[str, str]] = {
     "Several processes": {
         "lost rank": "the others end with exit code 75; the same command goes on and ends with the same bits",
         "rank that hangs": "after `run.timeout` one line names it and says where; all end with exit code 75",
+        "launcher killed": "the processes notice, finish the iteration, save and end; the same command goes on",
         "other world size at resume": "refused with both numbers, exit code 2; `--any-world-size` goes on",
     },
 }

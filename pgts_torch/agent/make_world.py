@@ -29,7 +29,7 @@ from pgts_torch.models.adapters import known_adapter, not_restored
 from pgts_torch.models.adapters_generic import PickledAttributes
 from pgts_torch.models.attributes import attributes, own_to_each, unlike
 from pgts_torch.models.classic import CLASSIC
-from pgts_torch.models.environments import EnvSource, kinds_of
+from pgts_torch.models.environments import SLOW, EnvSource, kinds_of
 from pgts_torch.models.published import publishes_table, table_of
 from pgts_torch.models.restoring import Setup, check_snapshots
 from pgts_torch.models.simulator import SimulatorModel
@@ -146,7 +146,7 @@ def _first_model(
         _check_single(request.action_repeat, "in a table")
         return TabularWorld(env, env.mdp, observation_key=request.observation_key, device=request.device), []
     if type(env) is not SyncVectorEnv:
-        return None, [f"{request.name} is a VectorEnv of unknown kind; a simulator needs a SyncVectorEnv"]
+        return None, [f"{request.name} is a VectorEnv of unknown kind; a simulator needs a SyncVectorEnv ({SLOW})"]
     try:
         _check_wrappers(request)
         _check_alike(request)

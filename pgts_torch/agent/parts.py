@@ -34,7 +34,7 @@ from pgts_torch.models.rewards import RewardRange
 from pgts_torch.options.arguments import read
 from pgts_torch.options.models import LEARNED, OwnModel
 from pgts_torch.options.replay import UniformReplay
-from pgts_torch.options.rollouts import SampledAdvantages, StepsHorizon
+from pgts_torch.options.rollouts import SampledAdvantages, StepsHorizon, check_processes
 from pgts_torch.options.training import Training
 from pgts_torch.search.engine import Search
 from pgts_torch.seeding import SharedGenerators
@@ -197,8 +197,7 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
             arguments["env"], kwargs=arguments["env_kwargs"], **{name: arguments[name] for name in given}
         )
         if source.given is None:
-            if num_envs < ranks.size:
-                raise PgtsError(f"num_envs is {num_envs}; {ranks.size} ranks need at least as many")
+            check_processes(ranks.size, num_envs)
         elif arguments["num_envs"] not in (None, (has := source.given.num_envs) * ranks.size):
             raise PgtsError(f"num_envs is {num_envs}, and a VectorEnv of {has} was given: leave num_envs out")
         world = make_world(

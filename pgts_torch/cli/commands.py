@@ -55,11 +55,14 @@ def train(arguments: Arguments) -> None:
         "--any-world-size", action="store_true", help="go on with another number of processes than before"
     )
     _add_trust(parser, "with --resume: ")
+    _add_launch(parser)
     parser.add_argument("--print-config", action="store_true", help="print the whole configuration as YAML and stop")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     if {"-h", "--help"} & set(arguments):
         parser.epilog = "\n".join(describe_options(schema_of(Config).options()))
     fixed, overrides = parser.parse_known_args(arguments)
+    if fixed.max_restarts and fixed.processes is None:
+        parser.error(f"--max-restarts is {fixed.max_restarts}, which goes with --processes only")
     overrides += ["--run.overwrite"] if fixed.overwrite else []
     if fixed.resume is not None:
         for name in ("config", "run.dir", "run.overwrite", "overwrite"):
@@ -77,6 +80,14 @@ def train(arguments: Arguments) -> None:
         saved_id = None if typed & {"env", "env.id"} else config.env.id
         saved_model = None if typed & {"model", "model.make"} else config.model.plain()
         check_imports(fixed.resume / "config.yaml", saved_id, config.env.kwargs, saved_model)
+    if fixed.processes is not None:
+        from pgts_torch.experiment.launch import check_launch, launch
+
+        processes = {"processes": fixed.processes, "max_restarts": fixed.max_restarts}
+        check_launch(config, **processes)
+        own = Parser(train, add_help=False)
+        _add_launch(own)
+        raise SystemExit(launch(own.parse_known_args(arguments)[1], **processes))
     if fixed.config is None and fixed.resume is None and rank() == 0:
         print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
     from pgts_torch.experiment import run
@@ -233,6 +244,19 @@ An environment of your own needs two methods:
   def set_state(self, state):
       self.x, self.fuel = state
 and draws from self.np_random only."""
+
+
+def _add_launch(parser: Parser) -> None:
+    parser.add_argument(
+        "--processes", metavar="N", type=whole(1), help="train in N processes of this machine, which share the work"
+    )
+    parser.add_argument(
+        "--max-restarts",
+        metavar="K",
+        type=whole(0),
+        default=0,
+        help="with --processes: begin again from the last checkpoint, K times, where one is lost or hangs (default: 0)",
+    )
 
 
 def _add_trust(parser: Parser, when: str = "") -> None:

@@ -13,6 +13,7 @@ from pgts_torch import files
 from pgts_torch.config import Config, dump, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
+from pgts_torch.experiment.launch import check_restarts
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.ownership import (
     BEST_FILE,
@@ -59,8 +60,7 @@ def _check_dir(config: Config) -> None:
         with files.named(f"run.dir {config.run.dir!a}"):
             config.run.dir.encode()  # it is written down in config.yaml
         check_folder(Path(config.run.dir))
-    elif int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")):
-        raise PgtsError("run.dir is not set; torchrun --max-restarts needs it, so that a restart finds the run")
+    check_restarts(config, int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")))
 
 
 @contextmanager

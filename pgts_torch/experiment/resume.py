@@ -123,8 +123,8 @@ def names_modules(config: Config) -> bool:
 def resuming(run: str | Path, world_size: int, *, imports: bool) -> str:
     """The command that resumes a run with the same number of processes; `imports`: if it imports modules."""
     trust = " --trust-imports" if imports else ""
-    command = "pgts train" if world_size == 1 else f"torchrun --nproc-per-node={world_size} train.py"
-    return f"{command} --resume {shlex.quote(str(run))}{trust}"
+    processes = "" if world_size == 1 else f" --processes {world_size}"
+    return f"pgts train{processes} --resume {shlex.quote(str(run))}{trust}"
 
 
 def plain(config: Config) -> dict[str, Any]:

@@ -31,6 +31,8 @@ SET_BY_SWEEP = {
     "run.dir": "--out is the folder of all runs",
     "run.overwrite": "finished runs are kept, others go on",
     "threads": "every run has one, --jobs says how many run at once",
+    "processes": "every run is one, --jobs says how many run at once",
+    "max-restarts": "the same command goes on with runs that were cut off",
 }
 """Keys that a sweep sets itself, and which option to use instead."""
 

@@ -33,6 +33,9 @@ Given = str | EnvSpec | gymnasium.Env | VectorEnv | Callable[[], gymnasium.Env]
 _TOGETHER = 16
 """From so many environments on the array operations of a vectorised form take less time than their single steps."""
 
+SLOW = "slow environments are shared out by pgts train --processes N"
+"""What is there in place of an AsyncVectorEnv."""
+
 _Maker = Callable[..., gymnasium.Env]
 """Makes a new environment; takes the arguments of `gymnasium.make`, which it uses if it makes environments by an id."""
 
@@ -166,7 +169,8 @@ class EnvSource:
         several makers number k makes it, by an id with these options of gymnasium.make."""
         if not self.makers:
             raise PgtsError(
-                f"{self.name} was given as a VectorEnv of which no others can be made; give a SyncVectorEnv or an id"
+                f"{self.name} was given as a VectorEnv of which no others can be made; give a SyncVectorEnv or an id "
+                f"({SLOW})"
             )
         with _making(self.name):
             made = self.makers[k % len(self.makers)](**options)

@@ -50,7 +50,7 @@ RESERVED_KWARGS = {
     "gamma": "env.gamma sets it",
     "num_envs": "rollout.num_envs sets it",
     "max_episode_steps": "rollout.horizon ends episodes",
-    "vectorization_mode": "the rollout sets it",
+    "vectorization_mode": "the rollout sets it; slow environments are shared out by pgts train --processes N",
     "autoreset_mode": "the rollout sets it",
     "vector_kwargs": "the rollout sets it",
 }

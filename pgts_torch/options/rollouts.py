@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from pgts_torch.errors import PgtsError
 from pgts_torch.options.fields import Count, UnitInterval
 from pgts_torch.options.part import Part, null
 
@@ -91,3 +92,9 @@ class SampledAdvantages(Part):
 
 
 Estimator = LookaheadAdvantages | SampledAdvantages
+
+
+def check_processes(count: int, num_envs: int) -> None:
+    """PgtsError if so many processes cannot share out these environments."""
+    if num_envs < count:
+        raise PgtsError(f"num_envs is {num_envs}; {count} processes need at least as many")

@@ -171,7 +171,8 @@ def test_an_environment_given_as_an_object_is_evaluated_in_new_ones_of_its_kind(
     ]
     lengths = [evaluate(PGTS(env, depth=0, num_envs=2), episodes=3).episodic_length.mean for env in given]
     assert lengths == [100.0] * 3  # always left, until the time limit
-    with pytest.raises(PgtsError, match="VectorEnv of which no others can be made; give a SyncVectorEnv or an id"):
+    refused = r"of which no others can be made; give a SyncVectorEnv or an id \(.* pgts train --processes N\)"
+    with pytest.raises(PgtsError, match=refused):
         evaluate(PGTS(vector_env(short_lake().mdp, 2)), episodes=2)
 
 

@@ -234,7 +234,7 @@ def test_fewer_episodes_than_ranks_are_refused():
             PGTS("pgts/Ladder-v0", num_envs=1)
         return str(caught.value)
 
-    assert on_ranks(2, mistake) == ["num_envs is 1; 2 ranks need at least as many"] * 2
+    assert on_ranks(2, mistake) == ["num_envs is 1; 2 processes need at least as many"] * 2
 
 
 def test_an_error_in_one_rank_is_raised_in_all_with_its_number():

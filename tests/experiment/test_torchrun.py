@@ -4,6 +4,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +21,7 @@ from pgts_torch.experiment.tracking import read_metrics
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import check_finite
 from tests.experiment.runs import SHORT, SMALL, arguments, left, train_with_signals
-from tests.forks import PATIENCE, launched
+from tests.forks import PATIENCE, launched, started
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -81,7 +82,7 @@ def test_a_lost_rank_ends_all_and_the_same_command_goes_on_bit_for_bit(rank, who
 def test_a_signal_to_one_process_stops_all_after_the_iteration(rank, whole, tmp_path, capfd):
     folder = tmp_path / "run"
     assert signalled(folder, signal.SIGTERM, rank=rank) == [143, 143]
-    assert capfd.readouterr().err.count(f"`torchrun --nproc-per-node=2 train.py --resume {folder}` goes on") == 1
+    assert capfd.readouterr().err.count(f"`pgts train --processes 2 --resume {folder}` goes on") == 1
     assert checkpoint.newest(folder, strict=True)[1].iterations == 3
     assert trained(folder) == [0, 0]
     assert left(folder) == whole
@@ -143,10 +144,26 @@ def test_torchrun_trains(tmp_path):
     assert json.loads(made.stdout)["env_steps"] == read_metrics(folder)[-1]["step"]
 
 
+def test_two_agents_that_meet_by_a_rendezvous_train_as_one_with_two_processes(whole, tmp_path):
+    """As on two machines: each agent has one process, and knows only where they meet."""
+    folder = tmp_path / "run"
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    meeting = ["--rdzv-backend=c10d", f"--rdzv-endpoint=127.0.0.1:{port}", "--rdzv-id=test", "--local-addr=127.0.0.1"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1", *meeting, "train.py"]
+    options: Any = {"cwd": ROOT, "stdout": subprocess.PIPE}
+    command += arguments(folder)[1:]
+    with started(command, **options) as one, started(command, **options) as other:
+        said = [agent.communicate(timeout=PATIENCE) for agent in (one, other)]
+    assert (one.returncode, other.returncode) == (0, 0), said
+    assert sorted(out.count("environment steps") for out, _ in said) == [0, 1]
+    assert left(folder) == whole
+
+
 def test_a_restart_by_torchrun_needs_a_folder_that_it_can_find(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "3")
     monkeypatch.chdir(tmp_path)
     assert main(["train", *SMALL, *SHORT]) == 2
-    assert "run.dir is not set; torchrun --max-restarts needs it" in capfd.readouterr().err
+    assert "run.dir is not set; --max-restarts needs it" in capfd.readouterr().err
     assert not list(tmp_path.iterdir())
     assert main(arguments(tmp_path / "run")) == 0
