@@ -9,6 +9,7 @@ from torch import Tensor
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import NotFinite
 from pgts_torch.options.critics import MonteCarlo, TDLambda
+from pgts_torch.readings import Readings
 
 
 def lambda_returns(
@@ -32,16 +33,28 @@ def lambda_returns(
 
 
 def critic_targets(
-    rollout: Rollout, next_v_TB: Float[Tensor, "T B"], method: TDLambda | MonteCarlo
-) -> Float[Tensor, "T B"]:
-    """The returns that a critic is fitted to; NotFinite unless their sum over all visits is finite."""
+    rollout: Rollout,
+    next_v_TB: Float[Tensor, "T B"],
+    method: TDLambda | MonteCarlo,
+    readings: Readings | None = None,
+) -> Float[Tensor, "V"]:
+    """The returns that a critic is fitted to, of all visits; NotFinite, with readings when these are read, unless their
+    sum is finite."""
     if isinstance(method, MonteCarlo):
         target_TB = lambda_returns(rollout, next_v_TB, rollout.survival_TB, 1.0)
     else:
         target_TB = lambda_returns(rollout, next_v_TB, rollout.discount_TB, method.lambda_)
-    if not math.isfinite(target_TB[rollout.alive_TB].sum()):
-        raise NotFinite("a target of the critic is not finite; it has learned nothing from this rollout", what="value")
-    return target_TB
+    target_V = rollout.of_visits(target_TB)
+    total = target_V.sum()
+    if readings is not None:
+        readings.check(total, _refuse_target)
+    elif not math.isfinite(total):
+        _refuse_target()
+    return target_V
+
+
+def _refuse_target(_: float = math.nan) -> None:
+    raise NotFinite("a target of the critic is not finite; it has learned nothing from this rollout", what="value")
 
 
 def gae(

@@ -160,7 +160,7 @@ class TabularCritic(Critic):
         target_V = self._targets(rollout, value_C)
         cell_V = rollout.observation_V
         if self.target == "q":
-            cell_V = cell_V * self.num_actions + rollout.action_TB[rollout.alive_TB]
+            cell_V = cell_V * self.num_actions + rollout.of_visits(rollout.action_TB)
         loss = float((target_V - value_C[cell_V]).square().mean())
         # the number of visits to each cell in this rollout, and the sum of their targets
         count_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, torch.ones_like(target_V))
@@ -197,7 +197,7 @@ class TabularCritic(Critic):
     def _targets(self, rollout: Rollout, value_C: Float[Tensor, "C"]) -> Float[Tensor, "V"]:
         """The target of each visit, bootstrapped with the values of a table."""
         _, next_v_TB = rollout.values(partial(self._read, value_C))
-        return critic_targets(rollout, next_v_TB, self.options.method)[rollout.alive_TB]
+        return critic_targets(rollout, next_v_TB, self.options.method)
 
     def _mean_target(self, rollout: Rollout) -> Float[Tensor, ""]:
         """The w that is the mean of the targets if it is the value of all cells that were never visited.

@@ -61,7 +61,7 @@ class LookaheadEstimator(Estimator):
         q_NA = chosen.look.q_BA
         # Differences that rounding may have caused are no advantages.
         eps = max(torch.finfo(dtype).eps for dtype in (q_NA.dtype, self._look.critic.dtype))
-        rounding = _ROUNDINGS * eps * float(q_NA[q_NA.isfinite()].abs().amax())
+        rounding = _ROUNDINGS * eps * torch.where(q_NA.isfinite(), q_NA, 0.0).abs().amax().double()
         return PolicyBatch(
             observation_N,
             centred(q_NA, pi_NA, rounding=rounding),
@@ -97,13 +97,13 @@ class SampledEstimator(Estimator):
         return self._batch
 
     def _before_fit(self, experience: Rollout) -> PolicyBatch:
-        alive_TB, observation_N = experience.alive_TB, experience.observation_V
+        observation_N = experience.observation_V
         pi_NA = self._policy.probs(observation_N)
         advantage_TB = gae(experience, *self._critic.values(experience), self._lambda)
         weight_N = experience.visit_weight(self._weight)
         return PolicyBatch(
             observation_N,
-            score_function(experience.action_TB[alive_TB], advantage_TB[alive_TB], pi_NA),
+            score_function(experience.of_visits(experience.action_TB), experience.of_visits(advantage_TB), pi_NA),
             weight_N,
             state_N=None,
             pi_NA=pi_NA,

@@ -133,19 +133,12 @@ class NetworkCritic(Critic):
             self._queried = None  # they were means over the actions of another policy
         self._policy = policy
         self._optimiser.learning_rate = value_at(self._rate, self.num_env_steps)
-        alive_TB = rollout.alive_TB
-        observation_V, action_V = rollout.observation_V, rollout.action_TB[alive_TB]
-        v_TB, target_TB = self._targets(rollout)
-        target_V = target_TB[alive_TB]
-        if self._lags or self.target == "q":
-            error_V = target_V - self._taken(self._values(self.network, observation_V), action_V)
-        else:
-            error_V = target_V - v_TB[alive_TB]
-
         num_fits, tensors = self._num_fits, [*self.network.tensors, self._mean, self._scale]
         tensors += self._target_network.tensors if self._lags else []
         try:
             with self._optimiser.attempt(tensors) as readings:
+                v_TB, target_V = self._targets(rollout, readings)
+                error_V = target_V - self._before_fit(rollout, v_TB)
                 readings.add(value=error_V.square().mean())
                 readings.add(spread=target_V.var(correction=0), unexplained=error_V.var(correction=0))
                 self._fit_all(rollout, target_V, generator, readings)
@@ -159,19 +152,26 @@ class NetworkCritic(Critic):
             "value_grad_norm": found["value_grad_norm"],
         }
 
+    def _before_fit(self, rollout: Rollout, v_TB: Float[Tensor, "T B"]) -> Float[Tensor, "V"]:
+        """The values of the visits that the fit changes; v_TB are those of the target network."""
+        if not self._lags and self.target == "v":
+            return rollout.of_visits(v_TB)
+        action_V = rollout.of_visits(rollout.action_TB)
+        return self._taken(self._values(self.network, rollout.observation_V), action_V)
+
     def _fit_all(
         self, rollout: Rollout, target_V: Float[Tensor, "V"], generator: torch.Generator, readings: Readings
     ) -> None:
         """Fit the network to these targets, and to those that it makes itself then, as often as the options say."""
-        alive_TB, encoder = rollout.alive_TB, self.network.trunk.encoder
-        observation_V, action_V = rollout.observation_V, rollout.action_TB[alive_TB]
+        observation_V, action_V = rollout.observation_V, rollout.of_visits(rollout.action_TB)
+        encoder = self.network.trunk.encoder
         if encoder.fresh or not _shares_trunk(self._policy, self.network):
             encoder.absorb(observation_V)
         input_V = self.network.encode(observation_V)
         fits, passes = (self.options.num_epochs, 1) if self.options.fresh_targets else (1, self.options.num_epochs)
         self._fit(input_V, action_V, target_V, passes, generator, readings)
         for _ in range(fits - 1):
-            self._fit(input_V, action_V, self._targets(rollout)[1][alive_TB], passes, generator, readings)
+            self._fit(input_V, action_V, self._targets(rollout, readings)[1], passes, generator, readings)
 
     def _fit(
         self,
@@ -260,8 +260,8 @@ class NetworkCritic(Critic):
         """v, or Q of the actions taken."""
         return value_ND.squeeze(-1) if self.target == "v" else value_ND.gather(-1, action_N[:, None]).squeeze(-1)
 
-    def _targets(self, rollout: Rollout) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
-        """Return v of the target network at the visits, and the targets that are bootstrapped with it."""
+    def _targets(self, rollout: Rollout, readings: Readings) -> tuple[Float[Tensor, "T B"], Float[Tensor, "V"]]:
+        """Return v of the target network, and the targets of the visits that are bootstrapped with it."""
         queried, self._queried = self._queried, None
         if queried is not None and queried[0] is rollout and not self._lags:
             v_TB, next_v_TB = queried[1]
@@ -269,7 +269,7 @@ class NetworkCritic(Critic):
             v_TB = next_v_TB = torch.zeros_like(rollout.reward_TB)
         else:
             v_TB, next_v_TB = rollout.values(lambda observation_N: self._v(self._target_network, observation_N))
-        return v_TB, critic_targets(rollout, next_v_TB, self.options.method)
+        return v_TB, critic_targets(rollout, next_v_TB, self.options.method, readings)
 
     @torch.no_grad()
     def _rescale(self, target_V: Float[Tensor, "V"]) -> None:

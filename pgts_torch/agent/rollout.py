@@ -79,7 +79,23 @@ class Rollout:
     @cached_property
     def observation_V(self) -> Shaped[Tensor, "V ..."]:
         """The observation of each of the V = `num_steps` visits, in the order of `alive_TB`."""
-        return self.observation_UB[:-1][self.alive_TB]
+        return self.of_visits(self.observation_UB[:-1])
+
+    def of_visits(self, column_TB: Shaped[Tensor, "T B ..."]) -> Shaped[Tensor, "V ..."]:
+        """The rows of the visits, in the order of `alive_TB`."""
+        return column_TB.flatten(0, 1).index_select(0, self._visit_V)
+
+    # Positions are found once, because a GPU is waited for each time that a mask is an index.
+
+    @cached_property
+    def _visit_V(self) -> Int[Tensor, "V"]:
+        return torch.nonzero(self.alive_TB.flatten()).squeeze(1)
+
+    @cached_property
+    def _needed_M(self) -> Int[Tensor, "M"]:
+        """Where the observations of visits and of ends are: a visit at t has its own in row t and the one after it in
+        row t + 1."""
+        return torch.nonzero(torch.cat([self.alive_TB[:1], self.alive_TB]).flatten()).squeeze(1)
 
     @property
     def state_TB(self) -> Int[Tensor, "T B"]:
@@ -129,10 +145,9 @@ class Rollout:
         Args:
             v: returns the values of observations; called once, with each visit and each end of an episode.
         """
-        # a visit at t has its observation in row t and the one after it in row t + 1
-        needed_UB = torch.cat([self.alive_TB[:1], self.alive_TB])
-        v_UB = torch.zeros_like(needed_UB, dtype=self.reward_TB.dtype)
-        v_UB[needed_UB] = v(self.observation_UB[needed_UB]).to(v_UB)
+        v_M = v(self.observation_UB.flatten(0, 1).index_select(0, self._needed_M)).to(self.reward_TB)
+        v_UB = v_M.new_zeros(len(self.observation_UB) * self.num_episodes).index_copy_(0, self._needed_M, v_M)
+        v_UB = v_UB.view(-1, self.num_episodes)
         return v_UB[:-1], v_UB[1:]
 
     def returns(self) -> Float[Tensor, "B"]:
@@ -167,16 +182,16 @@ class Rollout:
     @property
     def _searched_V(self) -> Any:
         """Which of the visits a lookahead starts from, as an index."""
-        return slice(None) if self.searched_TB is None else self.searched_TB[self.alive_TB]
+        return slice(None) if self.searched_TB is None else self.of_visits(self.searched_TB)
 
     @cached_property
     def _distinct(self) -> tuple[Int[Tensor, "N"], Int[Tensor, "V"]]:
         """The distinct visited states, ascending, and the index among them of the state of each visit."""
-        return self.state_TB[self.alive_TB][self._searched_V].unique(return_inverse=True)
+        return self.of_visits(self.state_TB)[self._searched_V].unique(return_inverse=True)
 
     def visit_weight(self, state_weight: StateWeight) -> Float[Tensor, "V"]:
         """The weight that each visit adds to w(s), in the order of `alive_TB`; with "uniform" it is 1."""
-        weight_V = self.weight_TB[self.alive_TB]
+        weight_V = self.of_visits(self.weight_TB)
         if state_weight == "occupancy":
             return weight_V / self.num_episodes
         return torch.full_like(weight_V, 1 / len(weight_V) if state_weight == "visits" else 1.0)

@@ -14,7 +14,9 @@ from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
 
 
-def centred(q_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"], *, rounding: float = 0.0) -> Float[Tensor, "N A"]:
+def centred(
+    q_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"], *, rounding: Float[Tensor, ""] | float = 0.0
+) -> Float[Tensor, "N A"]:
     """Advantages of all actions, none on the average of the policy:
 
         A(s, a) = q(s, a) - <pi(.|s), q(s, .)>,        so that sum_a pi(a|s) A(s, a) = 0

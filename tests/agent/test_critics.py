@@ -96,8 +96,10 @@ def test_the_exact_critic_is_the_exact_evaluation():
     ],
 )
 def test_targets_are_bootstrapped_where_an_episode_was_cut_and_not_where_it_terminated(method, expected):
-    target_TB = critic_targets(by_hand(), torch.full((3, 3), 10.0, dtype=torch.float64), method)
-    torch.testing.assert_close([*target_TB[:, 0].tolist(), float(target_TB[2, 1])], expected)
+    made = by_hand()
+    target_V = critic_targets(made, torch.full((3, 3), 10.0, dtype=torch.float64), method)
+    episode_V = made.of_visits(torch.arange(3).expand(3, 3))
+    torch.testing.assert_close([*target_V[episode_V == 0].tolist(), float(target_V[episode_V == 1][2])], expected)
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
