@@ -8,6 +8,7 @@ folder for such files; NUMBA_CACHE_DIR names another place.
 """
 
 import functools
+import hashlib
 import importlib.util
 import inspect
 import os
@@ -15,6 +16,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
 import torch
@@ -50,12 +52,14 @@ def jit(function: _Function) -> _Function:
     """The function, compiled by numba when it is first called: for numpy arrays and numbers, and with sums in the order
     in which they are written. Divisions by zero are not noticed.
 
-    What it calls must be marked too and stand in the same file: a function from the disk does not notice what has
-    changed in another file.
+    What it calls must be marked too, and stand in a file of the same folder whose name ends in `_kernels` or
+    `_records`: a function is read from the disk as long as none of these files has changed.
     """
     import numba
 
     function = inspect.unwrap(function)  # without the shape checks of tests, which numba cannot read
+    # Numba compares the age of one file, but also finds what it has kept by this name.
+    function.__qualname__ += "_" + _digest(Path(function.__code__.co_filename).parent)
     try:
         machine_code: _Function = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError as error:  # no folder for it
@@ -65,7 +69,7 @@ def jit(function: _Function) -> _Function:
 
 
 def inlined(function: _Function) -> _Function:
-    """The function, which becomes a part of those that call it: they are marked with `jit`, in the same file."""
+    """The function, which becomes a part of those that call it: they are marked with `jit`, see there."""
     import numba
 
     function = inspect.unwrap(function)
@@ -74,6 +78,13 @@ def inlined(function: _Function) -> _Function:
     )
     machine_code: _Function = inside(function)
     return machine_code
+
+
+@functools.cache
+def _digest(folder: Path) -> str:
+    """Of the compiled loops in a folder, and what they read."""
+    files = sorted(path for end in ("kernels", "records") for path in folder.glob(f"*_{end}.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 
 @functools.cache

@@ -90,3 +90,15 @@ def test_where_nothing_can_be_written_it_is_compiled_all_the_same_and_said(folde
     assert "NUMBA_CACHE_DIR" in done.stderr
     kept = [call(folder, NUMBA_CACHE_DIR=str(folder / "kept")).stdout for _ in range(2)]
     assert kept == ["0\n", "1\n"]
+
+
+def test_a_change_in_another_file_of_loops_is_noticed(folder: Path) -> None:
+    """Numba alone compares the age of one file only."""
+    (folder / "unit_kernels.py").write_text("UNIT = 1.0\n")
+    (folder / "kernel.py").write_text(
+        KERNEL.replace("total += x[i]", "total += UNIT * x[i]") + "from unit_kernels import UNIT\n"
+    )
+    call(folder)
+    assert call(folder).stdout == "1\n"
+    (folder / "unit_kernels.py").write_text("UNIT = 2.0\n")
+    assert "AssertionError" in call(folder).stderr

@@ -85,8 +85,7 @@ class MCTS(Budget):
 
     wave: Count | None = None
     """The largest number of simulations of one action of a root (with root rule: of the root) between two backups of
-    values; 1 is the ordinary search. null: 1 on the CPU without merging, where loops are compiled, else as many as
-    possible."""
+    values; 1 is the ordinary search. null: 1 on the CPU, where loops are compiled, else as many as possible."""
 
     prior: Literal["uniform", "policy"] = "uniform"
     """The prior probabilities of actions: uniform, or those of the current policy, as in AlphaZero."""

@@ -58,16 +58,17 @@ def mcts(
     are visited in proportion to their probabilities, not sampled. A node below which everything is expanded is
     exhausted and never selected again, so after finitely many simulations the answer is T^m Q.
 
-    On the CPU simulations come one after another below each root, in compiled loops (`pgts_torch.search.forest`), which
-    stop at unknown states until the model and the critic have been called for those of all roots together. On other
-    devices, with `merge`, or where numba is missing, they go down in waves (`pgts_torch.search.tree`): those of one
-    wave are split among actions and outcomes as if they came one by one, but do not know each other's values. What a
-    wave could not use is sent again. With waves of 1 both are the same search; where the model keeps a table of all
-    states it then is one of fixed shape (`pgts_torch.search.fixed_trees`), for which the critic values all states.
+    On the CPU simulations come one after another, in compiled loops (`pgts_torch.search.forest`), which stop at unknown
+    states until the model and the critic have been called for those of all roots together. On other devices, or where
+    numba is missing, they go down in waves (`pgts_torch.search.tree`): those of one wave are split among actions and
+    outcomes as if they came one by one, but do not know each other's values. What a wave could not use is sent again.
+    With waves of 1 both are the same search; without merging, where the model keeps a table of all states, it then is
+    one of fixed shape (`pgts_torch.search.fixed_trees`), for which the critic values all states.
 
     With root="gumbel" the root's actions get simulations by sequential halving of g(a) + log prior(a) + sigma(q(a))
-    (Danihelka et al. 2022); the trees below them are separate, so those of one round run side by side. With merge=False
-    the answer is the same bit for bit however the roots are split into batches or ordered.
+    (Danihelka et al. 2022). With merge=False the answer is the same bit for bit however the roots are split into
+    batches or ordered. With merge=True the roots search one graph, in the order of their states: in each round every
+    root sends one simulation after another by each of its actions that are due, the best first.
 
     Args:
         model, root_B, depth, q_leaf, v_leaf: as in `expectimax`.
@@ -146,9 +147,8 @@ def search_tree(
 
 
 def _can_compile(model: Model, options: MCTS) -> bool:
-    """Whether the search is one of trees and of one simulation after another, for which there are compiled loops."""
-    is_simple = not options.merges and options.wave in (None, 1)
-    return is_simple and model.dtype in (torch.float32, torch.float64) and can_compile(model.device)
+    """Whether the search is one of one simulation after another, for which there are compiled loops."""
+    return options.wave in (None, 1) and model.dtype in (torch.float32, torch.float64) and can_compile(model.device)
 
 
 def _grow_compiled(
@@ -214,7 +214,9 @@ def _grow(
 def _by_rule(tree: Tree, node_B: Tensor, options: MCTS) -> None:
     """The tree rule at the root too. Without a given size a wave is as large as all waves before it together."""
     used_B = torch.zeros(len(node_B), dtype=torch.float64, device=node_B.device)
+    place_A = torch.arange(tree.A, device=node_B.device)
     while True:
+        tree.back_up_shared(node_B)
         # at_B: the roots that have a whole simulation left and something to expand.
         open_B = tree.nodes.open(node_B).any(1)
         budget_B = (options.simulations - 1 - used_B + _WHOLE).floor_()
@@ -224,8 +226,8 @@ def _by_rule(tree: Tree, node_B: Tensor, options: MCTS) -> None:
         most_B = (used_B[at_B] + _WHOLE).floor_().clamp_min_(1)
         if options.wave is not None:
             most_B.fill_(options.wave)
-        budget_B = budget_B[at_B].minimum(most_B)
-        used_B[at_B] += tree.wave(node_B[at_B], tree.split(node_B[at_B], budget_B))
+        share_BA = tree.split(node_B[at_B], budget_B[at_B].minimum(most_B))
+        used_B[at_B] += _send(tree, node_B[at_B], share_BA, place_A.expand_as(share_BA), options.wave)
 
 
 def _halve(tree: Tree, node_B: Tensor, options: MCTS, preference_BA: Tensor) -> None:
@@ -239,6 +241,7 @@ def _halve(tree: Tree, node_B: Tensor, options: MCTS, preference_BA: Tensor) -> 
     place_A = torch.arange(tree.A, device=node_B.device)
     before = 0
     for width, most in _rounds(tree.A, simulations, options.wave):
+        tree.back_up_shared(node_B)
         if width != before:  # a new round: the best `width` actions of those that are left go on
             order_BA, before = _order(tree, node_B, preference_BA, alive_BA), width
             alive_BA = torch.zeros_like(alive_BA).scatter_(1, order_BA[:, :width], True)
@@ -254,7 +257,24 @@ def _halve(tree: Tree, node_B: Tensor, options: MCTS, preference_BA: Tensor) -> 
         share_BA = share_B1 + (place_A < total_B1 - share_B1 * lanes_B1)
         share_BA.masked_fill_(place_A >= lanes_B1, 0)
         order_BA = _order(tree, node_B[at_B], preference_BA[at_B], alive_BA[at_B])
-        used_B[at_B] += tree.wave(node_B[at_B], torch.zeros_like(share_BA).scatter_(1, order_BA, share_BA))
+        share_BA = torch.zeros_like(share_BA).scatter_(1, order_BA, share_BA)
+        used_B[at_B] += _send(tree, node_B[at_B], share_BA, order_BA, options.wave)
+
+
+def _send(tree: Tree, node_B: Tensor, share_BA: Tensor, order_BA: Tensor, wave: int | None) -> Float[Tensor, "B"]:
+    """A wave of so many simulations below each action of these roots; how many of each root could be used.
+
+    Below roots of one graph waves of 1 are sent one after another, root by root, in this order of actions.
+    """
+    if not (tree.merge and wave == 1):
+        return tree.wave(node_B, share_BA)
+    used_B = torch.zeros_like(share_BA[:, 0])
+    for b, a in ((b, a) for b, order in enumerate(order_BA.tolist()) for a in order if share_BA[b, a] > 0):
+        # Others may have expanded all that was left below it.
+        if tree.nodes.open(node_B[b : b + 1])[0, a]:
+            alone_1A = torch.zeros_like(share_BA[b : b + 1]).index_fill_(1, order_BA.new_tensor([a]), 1)
+            used_B[b : b + 1] += tree.wave(node_B[b : b + 1], alone_1A)
+    return used_B
 
 
 def _rounds(actions: int, simulations: int, wave: int | None) -> Iterator[tuple[int, int]]:

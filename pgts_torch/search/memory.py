@@ -47,7 +47,7 @@ class Sizes:
     def grown(self) -> int:
         """A node of the trees of `Forest`."""
         _, A, E = self._parts
-        return 28 + 32 * A + 32 * E
+        return 44 + 32 * A + 32 * E
 
     @property
     def fixed(self) -> int:

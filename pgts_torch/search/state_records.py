@@ -36,7 +36,7 @@ class StateRecords:
 
     state_S: see `tree_records.STATE`.
     prior_TA: rows of priors; one if they are uniform.
-    grown, places: what the trees take, see `search_bytes`; they say so.
+    grown, places, places_of_state: what the trees take, see `search_bytes`, and of that for each state; they say so.
 
     Raises:
         PgtsError, NodeBudgetExceeded: the methods, as `mcts`.
@@ -51,7 +51,7 @@ class StateRecords:
         self._uniform, self._A = options.prior == "uniform", topology.model.num_actions
         self.state_S = np.empty(0, STATE)
         self.prior_TA = np.full((int(self._uniform), self._A), 1 / self._A)
-        self.grown = self.places = 0
+        self.grown = self.places = self.places_of_state = 0
 
     @property
     def num_outcomes(self) -> int:
@@ -118,7 +118,8 @@ class StateRecords:
     def check_memory(self, looked_up: int = 0, new: int = 0) -> None:
         """NodeBudgetExceeded if a step that looks up so many states, of which so many are new, takes too much."""
         priors = 0 if self._uniform else 2 * self._A * (len(self.prior_TA) + looked_up)
-        places = self.places + 2 * max(len(self.state_S), self._topology.model.num_states) + priors
+        states = max(len(self.state_S), self._topology.model.num_states)
+        places = self.places + (2 + self.places_of_state) * states + priors
         needed = self._topology.bytes(new, looked_up=looked_up, grown=self.grown, places=places)
         what = f"the search ({self.grown} nodes, {looked_up} states of {self._A} actions)"
         check_memory(needed, self._topology.max_bytes, what)

@@ -247,6 +247,11 @@ class Tree:
         nodes.exhausted_NA.index_copy_(0, node_F, exhausted_FA)
         nodes.exhausted_N.index_copy_(0, node_F, exhausted_FA.amax(1))
 
+    def back_up_shared(self, node_B: Int[Tensor, "B"]) -> None:
+        """In a graph back up the roots, whose children other roots may have expanded."""
+        if self.merge:
+            self._back_up(node_B, 0)
+
     def _average(self, step: _Step, edge_L: Tensor, return_G: Tensor, used_M: Tensor) -> Float[Tensor, "F"]:
         """q = (q_0 + sum of returns) / (1 + N). A return is a critic's value, backed up along the path.
 

@@ -1,4 +1,4 @@
-"""What `tree_kernels` and `state_kernels` know of states and nodes, as records."""
+"""What compiled loops know of states and nodes, as records."""
 
 import numpy as np
 
@@ -9,9 +9,12 @@ STATE = np.dtype([("v", "f8"), ("row", "i8")])
 """v: the critic's value; NaN where it is not known, infinite where the critic is to be called.
 row: of the prior, where the outcomes of the state and the values of its children are known too."""
 
-NODE = np.dtype([(name, "i8" if name == "row" else "i4") for name in ("row", "level", "open", "parent", "action", "k")])
-"""row: in the table of outcomes.   open: how many actions are.   parent, action, k: the edge that leads to the node;
-the parent of a root is -1."""
+NODE = np.dtype(
+    [("v", "f8"), ("row", "i8"), ("place", "i8")] + [(x, "i4") for x in ("level", "open", "parent", "action", "k")]
+)
+"""v, place: in a graph, the largest q, and where the node is in `node_at`.   row: in the table of outcomes.   open: how
+many actions are.   parent, action, k: in a tree, the edge that leads to the node; the parent of a root is -1. In a
+graph the parent is what `node_at` said before."""
 
 ARM = np.dtype([("q", "f8"), ("reward", "f8"), ("prior", "f8"), ("visits", "i4"), ("open", "i4")])
 """A node and an action.   open: how many outcomes have something below that is to be expanded."""
@@ -20,11 +23,14 @@ EDGE = np.dtype([("value", "f8"), ("weight", "f8"), ("prob", "f8"), ("below", "i
 """A node, an action and an outcome.   value: what q is backed up from.   weight: p gamma, 0 for an outcome that does
 not count.   prob: -1 where nothing below is to be expanded.   below: the child."""
 
-SLOT = np.dtype([(name, "i4") for name in ("root", "nodes", "used", "phase", "width", "waves", "ranked", "waiting")])
-"""root: -1 where the slot is empty.   used: simulations.   phase, width, waves: of sequential halving, its round, how
-many actions it has and simulations of each are left.   ranked: `width` when the actions were last ranked.   waiting:
-simulations that are under way."""
+SLOT = np.dtype([(name, "i8") for name in ("root", "nodes", "used", "phase", "width", "waves", "ranked", "waiting")])
+"""root: -1 where the slot is empty.   nodes: of a tree.   used: simulations.   phase, width, waves: of sequential
+halving, its round, how many actions it has and simulations of each are left.   ranked: `width` when the actions were
+last ranked.   waiting: simulations that are under way."""
 
-LANE = np.dtype([(name, "i4") for name in ("survives", "node", "action", "k")])
+LANE = np.dtype([(name, "i8") for name in ("survives", "node", "action", "k")])
 """One for each slot and action. survives: whether the action is left in sequential halving.   node, action, k: the edge
 where one of the simulations under way has ended."""
+
+STEP = np.dtype([(name, "i8") for name in ("node", "action", "k")])
+"""The edge that a simulation takes, one for each level of a graph."""

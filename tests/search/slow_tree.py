@@ -1,6 +1,8 @@
-"""Tree search node by node, one simulation after another."""
+"""Tree search node by node, one simulation after another, with merging and without."""
 
 import math
+from collections.abc import Hashable, Iterator, Sequence
+from itertools import repeat
 from typing import Any, Self
 
 from torch import Tensor
@@ -16,84 +18,100 @@ def grid(deficit: float) -> int:
 
 
 class SlowTree:
-    """The oracle of `mcts` below one root, without noise: plain floats, plain dictionaries, one path at a time."""
+    """The oracle of `mcts` below some roots, without noise: plain floats, plain dictionaries, one path at a time.
+
+    A node is known by the path that leads to it; with `merge` by its state and level, whatever the path and the root.
+    """
 
     def __init__(
         self,
         mdp: TabularMDP,
-        state: int,
+        states: Sequence[int],
         bottom: int,
         v_S: Tensor,
         prior_SA: Tensor,
         *,
         root: str,
         rule: str,
-        backup: str,
+        backup: str = "max",
+        merge: bool = False,
         exploration: float = 1.25,
     ) -> None:
         self.mdp, self.bottom, self.v, self.prior = mdp, bottom, v_S.tolist(), prior_SA.tolist()
         self.gumbel, self.rule, self.mean, self.exploration = root == "gumbel", rule, backup == "mean", exploration
-        self.A, self.K = mdp.num_actions, mdp.outcomes.num_outcomes
-        self.root = self.expand(state, 0)
+        self.A, self.K, self.merge, self.nodes = mdp.num_actions, mdp.outcomes.num_outcomes, merge, dict[Any, Node]()
+        self.valued = {(0, state) for state in states}
+        self.roots = [self.expand((state, 0), state, 0) for state in states]
 
-    def expand(self, state: int, level: int) -> Node:
+    def expand(self, name: Hashable, state: int, level: int) -> Node:
         table = self.mdp.outcomes
         prob, discount, child = (x[state].tolist() for x in (table.prob_NAK, table.discount_NAK, table.child_NAK))
-        node: Node = {"state": state, "level": level, "children": {}, "visits": [0] * self.A, "outcome_visits": {}}
+        node: Node = {"name": name, "state": state, "level": level, "visits": [0] * self.A, "outcome_visits": {}}
         node["reward"] = table.reward_NA[state].tolist()
         node["outcomes"] = {
             (a, k): (prob[a][k], discount[a][k], child[a][k])
             for a in range(self.A)
             for k in range(self.K)
-            if prob[a][k] > 0 and discount[a][k] > 0
+            if prob[a][k] > 0 and discount[a][k] > 0 and node["reward"][a] > -math.inf
         }
+        # Averages go on below the last level, to take its values again.
+        node["open"] = set(node["outcomes"]) if self.mean or level + 1 < self.bottom else set()
+        self.nodes[name] = node
+        self.valued |= {(level + 1, self.below(node, a, k)) for a, k in node["outcomes"]}
         node["q"] = [self.backed_up(node, a) for a in range(self.A)]
         return node
+
+    def below(self, node: Node, a: int, k: int) -> Hashable:
+        """The name of the node that an edge leads to."""
+        state = node["outcomes"][a, k][2]
+        return (state, node["level"] + 1) if self.merge else (node["name"], a, k)
 
     def backed_up(self, node: Node, action: int) -> float:
         q = node["reward"][action]
         for (a, k), (p, gamma, state) in node["outcomes"].items():
             if a == action:
-                below = node["children"].get((a, k))
+                below = self.nodes.get(self.below(node, a, k))
                 q += p * gamma * (max(below["q"]) if below else self.v[state])
         return q
 
+    def refresh(self, node: Node) -> None:
+        """What the children say now, of their values and of whether something below them is open."""
+        if not self.mean:
+            node["q"] = [self.backed_up(node, a) for a in range(self.A)]
+            children = {edge: self.nodes.get(self.below(node, *edge)) for edge in node["open"]}
+            node["open"] = {edge for edge, child in children.items() if child is None or child["open"]}
+
     def open(self, node: Node, action: int) -> list[int]:
         """The outcomes of an action below which there is something to expand; for averages, all that have weight."""
-        ks = [k for a, k in node["outcomes"] if a == action]
-        return ks if self.mean else [k for k in ks if not self.complete(node, action, k)]
-
-    def complete(self, node: Node, a: int, k: int) -> bool:
-        if node["level"] + 1 >= self.bottom:
-            return True
-        below = node["children"].get((a, k))
-        return below is not None and all(self.complete(below, *edge) for edge in below["outcomes"])
+        return sorted(k for a, k in node["open"] if a == action)
 
     def simulate(self, node: Node, actions: list[int]) -> float | None:
-        """One simulation below a node by one of these actions; the return, where averages are backed up."""
+        """One simulation below a node by one of these actions: its return, or None if it could not be used."""
         actions = [a for a in actions if self.open(node, a)]
         if not actions:
-            return max(node["q"])
+            return max(node["q"]) if self.mean else None
         a = max(actions, key=lambda a: (self.score(node, a), -a))
         visits, counts = node["visits"][a], node["outcome_visits"]
         lack = {k: grid(node["outcomes"][a, k][0] * (visits + 1) - counts.get((a, k), 0)) for k in self.open(node, a)}
         k = max(lack, key=lambda k: (lack[k], -k))
         _, gamma, state = node["outcomes"][a, k]
-        if (a, k) in node["children"]:
-            value = self.simulate(node["children"][a, k], list(range(self.A)))
-        elif node["level"] + 1 < self.bottom:
-            node["children"][a, k] = self.expand(state, node["level"] + 1)
-            value = max(node["children"][a, k]["q"])
+        name, level = self.below(node, a, k), node["level"] + 1
+        if name in self.nodes:
+            self.refresh(self.nodes[name])
+            value = self.simulate(self.nodes[name], list(range(self.A)))
+        elif level < self.bottom:
+            value = max(self.expand(name, state, level)["q"])
         else:
             value = self.v[state]
+        self.refresh(node)
+        if value is None:
+            return None
         node["visits"][a] += 1
         counts[a, k] = counts.get((a, k), 0) + 1
-        if not self.mean:
-            node["q"][a] = self.backed_up(node, a)
-            return None
         has_weight = sum(p for (b, _), (p, _, _) in node["outcomes"].items() if b == a)
         outcome = node["reward"][a] + has_weight * gamma * value
-        node["q"][a] += (outcome - node["q"][a]) / (1 + node["visits"][a])
+        if self.mean:
+            node["q"][a] += (outcome - node["q"][a]) / (1 + node["visits"][a])
         return outcome
 
     def score(self, node: Node, a: int) -> float:
@@ -108,47 +126,52 @@ class SlowTree:
         return self.normalized(node, a) + self.exploration * bonus
 
     def normalized(self, node: Node, a: int) -> float:
-        high, low = max(node["q"]), min(node["q"])
+        high, low = max(node["q"]), min(q for q in node["q"] if q > -math.inf)
         return (node["q"][a] - high) / max(high - low + 1e-8 * abs(high), 1e-300)
 
     def sigma(self, node: Node, a: int) -> float:
         return (50 + max(node["visits"])) * 0.1 * self.normalized(node, a)
 
     def search(self, simulations: int) -> Self:
-        """The first simulation is the expansion of the root."""
-        left = simulations - 1
-        if not self.gumbel:
-            for _ in range(left):
-                if self.bottom > 1 and any(self.open(self.root, a) for a in range(self.A)):
-                    self.simulate(self.root, list(range(self.A)))
-            return self
-        if self.bottom <= 1:
-            return self
-        survivors, width, phases = list(range(self.A)), self.A, max(1, math.ceil(math.log2(self.A)))
-        for phase in range(phases):
-            exhausted = [a for a in range(self.A) if not self.open(self.root, a)]
-            survivors = [*self.ranked(survivors), *exhausted][:width]
-            last, passes = phase + 1 == phases, max(1, (simulations - 1) // (phases * width))
-            while left > 0 and (last or passes > 0) and self.ranked(survivors):
-                for a in self.ranked(survivors)[: min(width, left)]:
-                    self.simulate(self.root, [a])
-                    left -= 1
-                passes -= 1
-            width = max(2, width // 2)
+        """The first simulation is the expansion of the root. In each round every root sends those that are due."""
+        left = [simulations - 1] * len(self.roots)
+        rounds = [self.rounds(root, simulations) for root in self.roots]
+        while True:
+            due = []
+            for b, root in enumerate(self.roots):
+                self.refresh(root)
+                if left[b] > 0 and root["open"] and self.bottom > 1:
+                    due += [(b, a) for a in next(rounds[b])[: left[b]]]
+            if not due:
+                break
+            for b, a in due:
+                left[b] -= self.simulate(self.roots[b], [a]) is not None
+        for node in sorted(self.nodes.values(), key=lambda node: -node["level"]):
+            self.refresh(node)
         return self
 
-    def ranked(self, survivors: list[int]) -> list[int]:
+    def rounds(self, root: Node, simulations: int) -> Iterator[list[int]]:
+        """The actions of a root that are due next."""
+        while not self.gumbel:
+            actions = [a for a in range(self.A) if self.open(root, a)]
+            yield [max(actions, key=lambda a: (self.score(root, a), -a))]
+        survivors, width, phases = list(range(self.A)), self.A, max(1, math.ceil(math.log2(self.A)))
+        for phase in range(phases):
+            exhausted = [a for a in range(self.A) if not self.open(root, a)]
+            survivors = [*self.ranked(root, survivors), *exhausted][:width]
+            passes = max(1, (simulations - 1) // (phases * width))
+            for _ in repeat(0, passes) if phase + 1 < phases else repeat(0):
+                yield self.ranked(root, survivors)[:width]
+            width = max(2, width // 2)
+
+    def ranked(self, root: Node, survivors: list[int]) -> list[int]:
         """The root's actions that are not complete, best first, survivors before the others."""
-        scores = [math.log(self.prior[self.root["state"]][a]) + self.sigma(self.root, a) for a in range(self.A)]
-        actions = [a for a in range(self.A) if self.open(self.root, a)]
+        scores = [math.log(self.prior[root["state"]][a]) + self.sigma(root, a) for a in range(self.A)]
+        actions = [a for a in range(self.A) if self.open(root, a)]
         return sorted(actions, key=lambda a: (a not in survivors, -scores[a], a))
 
-    def root_values(self) -> list[float]:
-        return self.root["q"]
+    def root_values(self) -> list[list[float]]:
+        return [root["q"] for root in self.roots]
 
     def nodes_per_level(self) -> list[int]:
-        answer, level = [1], [self.root]
-        for _ in range(self.bottom):
-            answer.append(sum(len(node["outcomes"]) for node in level))
-            level = [child for node in level for child in node["children"].values()]
-        return answer
+        return [sum(level == each for level, _ in self.valued) for each in range(self.bottom + 1)]

@@ -55,6 +55,7 @@ def path(request: pytest.FixtureRequest) -> Iterator[str]:
 roots = st.sampled_from(["gumbel", "rule"])
 rules = st.sampled_from(["gumbel", "puct", "uct"])
 waves = st.sampled_from([None, 1, 3])
+forms = st.sampled_from([{}, {"backup": "mean"}, {"merge": True}])
 
 
 # A complete tree is the exact lookahead
@@ -212,9 +213,9 @@ def test_the_noise_changes_a_search_and_takes_one_number_of_the_generator_whatev
     st.integers(0, 99),
     roots,
     rules,
-    st.sampled_from(["max", "mean"]),
+    forms,
 )
-def test_waves_of_one_are_one_simulation_after_another(mdp, depth, simulations, seed, root, rule, backup):
+def test_waves_of_one_are_one_simulation_after_another(mdp, depth, simulations, seed, root, rule, form):
     v_S, prior_SA = some_v(mdp, seed), random_policy(mdp, seed)
     uses_prior = not (root == "rule" and rule == "uct")
     look = mcts(
@@ -225,17 +226,14 @@ def test_waves_of_one_are_one_simulation_after_another(mdp, depth, simulations, 
         simulations=simulations,
         root=root,
         rule=rule,
-        backup=backup,
         wave=1,
         prior=Critic(prior_SA) if uses_prior else None,
+        **form,
     )
-    slow = [
-        SlowTree(mdp, s, depth + 1, v_S, prior_SA, root=root, rule=rule, backup=backup).search(simulations)
-        for s in range(mdp.num_states)
-    ]
-    assert_close(look.q_BA, torch.tensor([tree.root_values() for tree in slow], dtype=torch.float64))
-    nodes = [sum(level) for level in zip(*(tree.nodes_per_level() for tree in slow), strict=True)]
-    assert list(look.nodes_per_level) == nodes
+    states = range(mdp.num_states)
+    slow = SlowTree(mdp, states, depth + 1, v_S, prior_SA, root=root, rule=rule, **form).search(simulations)
+    assert_close(look.q_BA, torch.tensor(slow.root_values(), dtype=torch.float64))
+    assert list(look.nodes_per_level) == slow.nodes_per_level()
 
 
 @given(st.integers(1, 6), st.integers(0, 30), st.integers(0, 999), st.booleans())
