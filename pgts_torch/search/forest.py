@@ -1,6 +1,5 @@
 """Search trees that compiled loops grow, or, merged, a graph (`tree_kernels`, `graph_kernels`), and their memory."""
 
-import math
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -53,7 +52,7 @@ class Forest:
         B, bottom = len(root_B), self._bottom
         most = min(topology.model.num_states, B * options.simulations)
         self._known = known = StateRecords(leaves, topology, options)
-        known.places = bottom + B * (7 * self._A + 8) + most
+        known.places = bottom + B * (7 * self._A + 9) + most
         known.places_of_state = (bottom + 1) * options.merges
         known.check_memory()
         # Each of the simulations that are under way, one of each action, may want a state.
@@ -144,7 +143,7 @@ class Forest:
             room,
             self._bottom,
             options.simulations,
-            phases=0 if options.root == "rule" else max(1, math.ceil(math.log2(self._A))),
+            halves=options.root == "gumbel",
             rule=_RULES.index(options.rule),
             exploration=1.25 if options.exploration is None else options.exploration,
             mean=options.backup == "mean",

@@ -110,11 +110,11 @@ def search(  # type: ignore[no-untyped-def]
     if turn[0] == 0:
         turn[0] = B
         for b in range(B):
-            begin(slot, lane, rules, b, b)
             node[b].v, _ = expand(
                 reward, prob, discount, child, table_row, state, prior, node, arm, edge, rules, b, root_B[b],
                 np.int64(0),
             )  # fmt: skip
+            begin(arm, slot, lane, rules, b, b, b)
             _count_children(child, node, edge, rules, valued_L, node_at, b)
     while valued_L[-1] <= rules.max_nodes:
         if turn[1] == 0:

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.errors import PgtsError
 from pgts_torch.search.lookahead import Leaves
 from pgts_torch.search.memory import check_memory
 from pgts_torch.search.outcome_table import has_weight
@@ -100,7 +101,7 @@ class KnownStates(Table):
             state_N = state_N.clone()
             outcomes, children = self.topology.step(state_N)
             v_C = self._leaves.v(children) if len(children) else None
-            prior_NA = self._leaves.prior(state_N)
+            prior_NA = prior_of_allowed(self._leaves.prior(state_N), outcomes.reward_NA, state_N)
         # Terminal outcomes, actions that are not allowed and padding count nothing, whatever their numbers.
         weighs_NAK = has_weight(outcomes)
         zero = torch.zeros((), dtype=self.dtype, device=self.device)
@@ -127,3 +128,25 @@ class KnownStates(Table):
         )
         self.row_S = with_room(self.row_S, self.topology.model.num_states)  # with those that the model has met since
         self.row_S[state_N] = row_N
+
+
+def prior_of_allowed(
+    prior_NA: Float[Tensor, "N A"], reward_NA: Float[Tensor, "N A"], state_N: Int[Tensor, "N"]
+) -> Float[Tensor, "N A"]:
+    """The prior probabilities of actions, given that the action is allowed: its reward is not -inf.
+
+    Raises:
+        PgtsError: no action that is allowed in a state has a prior.
+    """
+    allowed_NA = reward_NA > -torch.inf
+    if allowed_NA.all():
+        return prior_NA
+    share_NA = prior_NA.where(allowed_NA, 0)
+    total_N1 = share_NA.sum(-1, keepdim=True)
+    if (total_N1 == 0).any():
+        n = int((total_N1 == 0).nonzero()[0, 0])
+        raise PgtsError(
+            f"the prior of state {int(state_N[n])} is {prior_NA[n].tolist()}; one of its allowed actions, "
+            f"{allowed_NA[n].nonzero().flatten().tolist()}, must have a probability"
+        )
+    return torch.where(allowed_NA.all(-1, keepdim=True), prior_NA, share_NA / total_N1)

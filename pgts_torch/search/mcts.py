@@ -54,9 +54,11 @@ def mcts(
 
         q(n, a) = r + sum_k p_k gamma_k v(n_k),   v(n) = max_a q(n, a) where n is expanded, else the critic's
 
-    Of the outcomes of an action the one that most lacks simulations is taken, argmax_k p_k (N_a + 1) - N_k: outcomes
-    are visited in proportion to their probabilities, not sampled. A node below which everything is expanded is
-    exhausted and never selected again, so after finitely many simulations the answer is T^m Q.
+    An action with the reward -inf is not allowed: its q is -inf, nothing below it is queried, and it gets neither prior
+    nor simulations. Of the outcomes of an action the one that most lacks simulations is taken,
+    argmax_k p_k (N_a + 1) - N_k: outcomes are visited in proportion to their probabilities, not sampled. A node below
+    which everything is expanded is exhausted and never selected again, so after finitely many simulations the answer is
+    T^m Q.
 
     On the CPU simulations come one after another, in compiled loops (`pgts_torch.search.forest`), which stop at unknown
     states until the model and the critic have been called for those of all roots together. On other devices, or where
@@ -79,7 +81,8 @@ def mcts(
             values are backed up. 1 is the ordinary search, one simulation after another. Default: 1 in compiled loops,
             else a whole round of sequential halving (with root="rule": as many as before it together), which is
             several times faster there, and less right with as many simulations.
-        prior: the policy, states [N] to probabilities [N, A]. Default: uniform.
+        prior: the policy, states [N] to probabilities [N, A]; what it gives to actions that are not allowed is shared
+            out among the others. Default: uniform.
         backup: "max", or for comparison "mean": q(n, a) = (q_0 + sum_i G_i) / (1 + N_a) over the critic's first
             estimate q_0 and the returns G_i of simulations, which does not converge to T^m Q; its `pruned_BA` is inf.
         merge: a node is a (level, state), shared by all paths and roots. What a simulation could not update is
@@ -90,7 +93,8 @@ def mcts(
 
     Raises:
         PgtsError: an option that makes no sense or is ignored by the others, roots that are no states, leaf values of a
-            wrong shape or not finite (naming the state), a prior that is no distribution.
+            wrong shape or not finite (naming the state), a prior that is no distribution, or gives all to actions that
+            are not allowed; no action of a state is allowed.
         NodeBudgetExceeded: more than `max_nodes` would be needed; or what is to be expanded next would not fit into
             `max_bytes`, and the model has not been queried for it.
     """
@@ -166,6 +170,8 @@ def _fits_arrays(model: EnumeratingModel, roots: int, options: MCTS) -> bool:
     critic values all its states."""
     if model.table is None or options.wave != 1 or options.backup != "max" or options.merges:
         return False
+    if not (model.table.reward_NA > -torch.inf).all():  # roots differ in how often their actions are halved
+        return False
     return model.num_states <= roots * options.simulations * model.num_actions * model.table.num_outcomes
 
 
@@ -239,16 +245,26 @@ def _halve(tree: Tree, node_B: Tensor, options: MCTS, preference_BA: Tensor) -> 
     used_B = torch.zeros(len(node_B), dtype=torch.float64, device=node_B.device)
     alive_BA = torch.ones_like(preference_BA, dtype=torch.bool)
     place_A = torch.arange(tree.A, device=node_B.device)
-    before = 0
-    for width, most in _rounds(tree.A, simulations, options.wave):
+    allowed_B = (tree.nodes.q_NA[node_B] > -torch.inf).sum(1)
+    widths, width_B1 = list[int](), torch.zeros_like(allowed_B).unsqueeze(1)
+    rounds = [_rounds(allowed, simulations, options.wave) for allowed in range(1, tree.A + 1)]
+    while True:
         tree.back_up_shared(node_B)
-        if width != before:  # a new round: the best `width` actions of those that are left go on
-            order_BA, before = _order(tree, node_B, preference_BA, alive_BA), width
-            alive_BA = torch.zeros_like(alive_BA).scatter_(1, order_BA[:, :width], True)
+        # Each root has the rounds of as many actions as are allowed there.
+        of_count = [next(each) for each in rounds]
+        before_B1, (width_B1, most_B1) = (
+            width_B1,
+            torch.tensor(of_count, device=node_B.device)[allowed_B - 1].split(1, 1),
+        )
+        if widths != (widths := [width for width, _ in of_count]):
+            # In a new round the best `width` actions of those that are left go on.
+            order_BA = _order(tree, node_B, preference_BA, alive_BA)
+            survives_BA = torch.zeros_like(alive_BA).scatter_(1, order_BA, place_A < width_B1)
+            alive_BA = torch.where(width_B1 != before_B1, survives_BA, alive_BA)
         # total_B1: the simulations of this wave; the best `lanes_B1` actions share them evenly, the first get one more.
-        lanes_B1 = tree.nodes.open(node_B).sum(1, keepdim=True).clamp_max_(width)
+        lanes_B1 = tree.nodes.open(node_B).sum(1, keepdim=True).minimum(width_B1)
         left_B1 = (simulations - used_B + _WHOLE).floor_().unsqueeze(1)
-        total_B1 = left_B1.minimum(lanes_B1 * most)
+        total_B1 = left_B1.minimum(lanes_B1 * most_B1)
         at_B = (total_B1.squeeze(1) >= 1).nonzero().squeeze(1)
         if len(at_B) == 0:
             return
@@ -278,7 +294,7 @@ def _send(tree: Tree, node_B: Tensor, share_BA: Tensor, order_BA: Tensor, wave: 
 
 
 def _rounds(actions: int, simulations: int, wave: int | None) -> Iterator[tuple[int, int]]:
-    """How many actions of a root a wave considers, and the most simulations each of them gets.
+    """How many of the allowed actions of a root a wave considers, and the most simulations each of them gets.
 
     The last round takes what is left.
     """

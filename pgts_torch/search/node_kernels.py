@@ -21,13 +21,13 @@ _VISITS, _SCALE = 50.0, 0.1
 
 
 class Rules(NamedTuple):
-    """The options, as numbers. A node at level `bottom` is never expanded; `phases` of sequential halving, 0: none.
+    """The options, as numbers. A node at level `bottom` is never expanded; `halves`: sequential halving at the root.
     `room`: nodes of a tree."""
 
     room: int
     bottom: int
     simulations: int
-    phases: int
+    halves: bool
     rule: int
     exploration: float
     mean: bool
@@ -36,13 +36,13 @@ class Rules(NamedTuple):
 
 @inlined
 def expand(reward, prob, discount, child, table_row, state, prior, node, arm, edge, rules, n, s, level):  # type: ignore[no-untyped-def]
-    """Make n a node of state s, which begins with the critic's values of its children. Return v, and how many outcomes
-    have weight."""
+    """Make n a node of state s, which begins with the critic's values of its children; its prior is that of the actions
+    that are allowed. Return v, and how many outcomes have weight."""
     r = table_row[s]
     A, K = edge.shape[1:]
     # Below the last level nothing is expanded; only averages go there, to take its values again.
     is_last = level + 1 == rules.bottom and (level == 0 or not rules.mean)
-    v, num_open, total = -np.inf, 0, 0
+    v, num_open, total, share, num_allowed = -np.inf, 0, 0, 0.0, 0
     for a in range(A):
         q, width, is_allowed = 0.0, 0, reward[r, a] > -np.inf
         for k in range(K):
@@ -55,11 +55,16 @@ def expand(reward, prob, discount, child, table_row, state, prior, node, arm, ed
                 e.value, e.weight, e.prob = 0.0, 0.0, -1.0
             e.below = e.visits = 0
         x = arm[n, a]
-        x.q, x.reward, x.prior = q + reward[r, a], reward[r, a], prior[state[s].row, a]
+        x.q, x.reward, x.prior = q + reward[r, a], reward[r, a], prior[state[s].row, a] if is_allowed else 0.0
+        share += x.prior
+        num_allowed += is_allowed
         x.visits, x.open = 0, 0 if is_last else width
         num_open += x.open > 0
         total += width
         v = max(v, x.q)
+    if num_allowed < A:
+        for a in range(A):
+            arm[n, a].prior /= share
     node[n].row, node[n].level, node[n].open = r, level, num_open
     return v, total
 
@@ -139,20 +144,23 @@ def _rank(arm, lane, preference, w, b, n, count, score_A, class_A):  # type: ign
 
 
 @inlined
-def begin(slot, lane, rules, w, b):  # type: ignore[no-untyped-def]
-    """The search below root b begins in slot w."""
-    x = slot[w]
-    x.root, x.used, x.waiting, x.ranked = b, 0, 0, 0
+def begin(arm, slot, lane, rules, w, b, n):  # type: ignore[no-untyped-def]
+    """The search below root b, which is node n, begins in slot w."""
+    x, num_allowed = slot[w], 0
+    x.root, x.used, x.waiting, x.ranked, x.phases = b, 0, 0, 0, 1
     for a in range(lane.shape[1]):
         lane[w, a].survives = 1
-    _begin_round(slot, rules, w, np.int64(0), lane.shape[1])
+        num_allowed += arm[n, a].q > -np.inf
+    while 1 << x.phases < num_allowed:
+        x.phases += 1
+    _begin_round(slot, rules, w, np.int64(0), num_allowed)
 
 
 @inlined
 def _begin_round(slot, rules, w, phase, width):  # type: ignore[no-untyped-def]
     """A round of sequential halving; the last one takes the simulations that are left."""
     slot[w].phase, slot[w].width = phase, width
-    slot[w].waves = max(1, (rules.simulations - 1) // (max(1, rules.phases) * width))
+    slot[w].waves = max(1, (rules.simulations - 1) // (slot[w].phases * width))
 
 
 @inlined
@@ -164,7 +172,7 @@ def due(node, arm, slot, lane, rules, preference, w, n, score_A, class_A):  # ty
     if left < 1 or node[n].open == 0:
         return 0
     count = 1
-    if rules.phases == 0:
+    if not rules.halves:
         lane[w, 0].action = select(arm, rules, n, score_A)
     else:
         if x.ranked != x.width:  # a new round: the best `width` actions of those that are left go on
@@ -177,7 +185,7 @@ def due(node, arm, slot, lane, rules, preference, w, n, score_A, class_A):  # ty
         count = min(left, x.width, node[n].open)
         _rank(arm, lane, preference, w, x.root, n, count, score_A, class_A)
         x.waves -= 1
-        if x.waves == 0 and x.phase + 1 < rules.phases:
+        if x.waves == 0 and x.phase + 1 < x.phases:
             _begin_round(slot, rules, w, x.phase + 1, max(2, x.width // 2))
     x.waiting = count
     x.used += count

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.options.search import MCTS
+from pgts_torch.search.known import prior_of_allowed
 from pgts_torch.search.lookahead import Leaves
 from pgts_torch.search.memory import check_memory
 from pgts_torch.search.topology import Topology
@@ -111,8 +112,11 @@ class StateRecords:
             v_C = self._leaves.v(torch.from_numpy(child_C)).numpy(force=True)
         if not self._uniform:
             row, step = len(self.prior_TA), 1
-            prior_NA = self._leaves.prior(torch.from_numpy(state_N)).double().numpy(force=True)
-            self.prior_TA = np.concatenate([self.prior_TA, prior_NA])
+            states = torch.from_numpy(state_N)
+            prior_NA = prior_of_allowed(
+                self._leaves.prior(states), self._table.reward_RA[self._table.row_S[states]], states
+            )
+            self.prior_TA = np.concatenate([self.prior_TA, prior_NA.double().numpy(force=True)])
         self._kernels.learn(self.state_S, child_C, v_C, state_N, row, step)
 
     def check_memory(self, looked_up: int = 0, new: int = 0) -> None:

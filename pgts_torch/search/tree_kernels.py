@@ -105,13 +105,13 @@ def search(  # type: ignore[no-untyped-def]
             if x.root < 0:
                 if begun[0] == len(root_B):
                     break
-                begin(slot, lane, rules, w, begun[0])
-                begun[0] += 1
                 x.nodes, node[root].parent = 1, -1
                 _, width = expand(
                     reward, prob, discount, child, table_row, state, prior, node, arm, edge, rules, root,
-                    root_B[x.root], np.int64(0),
+                    root_B[begun[0]], np.int64(0),
                 )  # fmt: skip
+                begin(arm, slot, lane, rules, w, begun[0], root)
+                begun[0] += 1
                 valued_L[1] += width
                 valued_L[-1] += width
             # The states that are to be expanded must all be known.

@@ -23,9 +23,12 @@ EDGE = np.dtype([("value", "f8"), ("weight", "f8"), ("prob", "f8"), ("below", "i
 """A node, an action and an outcome.   value: what q is backed up from.   weight: p gamma, 0 for an outcome that does
 not count.   prob: -1 where nothing below is to be expanded.   below: the child."""
 
-SLOT = np.dtype([(name, "i8") for name in ("root", "nodes", "used", "phase", "width", "waves", "ranked", "waiting")])
-"""root: -1 where the slot is empty.   nodes: of a tree.   used: simulations.   phase, width, waves: of sequential
-halving, its round, how many actions it has and simulations of each are left.   ranked: `width` when the actions were
+SLOT = np.dtype(
+    [(name, "i8") for name in ("root", "nodes", "used", "phase", "width", "phases", "waves", "ranked", "waiting")]
+)
+"""root: -1 where the slot is empty.   nodes: of a tree.   used: simulations.   phase, width, phases, waves: of
+sequential halving, its round, how many actions it has, how many rounds there are, and simulations of each action are
+left.   ranked: `width` when the actions were
 last ranked.   waiting: simulations that are under way."""
 
 LANE = np.dtype([(name, "i8") for name in ("survives", "node", "action", "k")])

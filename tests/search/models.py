@@ -1,5 +1,6 @@
 """Models and critics that keep a record of their queries, the slow oracle of the search, and what its tests share."""
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 
 import torch
@@ -72,6 +73,39 @@ class InterningModel(EnumeratingModel):
         return Outcomes(reward, prob, discount, child, self.num_states)
 
 
+class Masked(EnumeratingModel):
+    """An MDP in which some actions of some states are not allowed; what follows them is a state that nobody may see.
+
+    Args:
+        allowed_SA: which actions are.
+        keeps_table: whether searches may read the table in place.
+    """
+
+    def __init__(self, mdp: TabularMDP, allowed_SA: Tensor, *, keeps_table: bool = False) -> None:
+        S, off_SA1 = mdp.num_states, ~allowed_SA.unsqueeze(-1)
+        self.num_actions, self.num_states, self.num_outcomes = mdp.num_actions, S + 1, mdp.outcomes.num_outcomes
+        self.device, self.dtype = torch.device("cpu"), torch.float64
+        reward, prob, discount, child = (
+            torch.cat([x, x[:1]])
+            for x in (
+                mdp.outcomes.reward_NA.masked_fill(~allowed_SA, -torch.inf),
+                mdp.outcomes.prob_NAK.where(~off_SA1, 0.7),
+                mdp.outcomes.discount_NAK.where(~off_SA1, 0.9),
+                mdp.outcomes.child_NAK.where(~off_SA1, S),
+            )
+        )
+        self.outcomes_of_all = Outcomes(reward, prob, discount, child, S + 1)
+        self.keeps_table = keeps_table
+
+    @property
+    def table(self) -> Outcomes | None:
+        return self.outcomes_of_all if self.keeps_table else None
+
+    def outcomes(self, state_N: Tensor) -> Outcomes:
+        assert int(state_N.max()) < self.num_states - 1
+        return self.outcomes_of_all.rows(state_N)
+
+
 class Critic:
     """The rows of a table, with the states of its calls, call by call."""
 
@@ -128,6 +162,8 @@ def walk_the_tree(
 
     def q(state: Hashable, a: int, m: int) -> float:
         reward, followers = step(state, a)
+        if reward == -math.inf:
+            return reward
         return reward + sum(p * gamma * (value(child, m) if gamma else 0.0) for p, gamma, child in followers)
 
     def value(state: Hashable, m: int) -> float:

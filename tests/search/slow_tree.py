@@ -8,6 +8,7 @@ from typing import Any, Self
 from torch import Tensor
 
 from pgts_torch.tabular import TabularMDP
+from tests.search.models import Masked
 
 Node = dict[str, Any]
 
@@ -25,7 +26,7 @@ class SlowTree:
 
     def __init__(
         self,
-        mdp: TabularMDP,
+        mdp: TabularMDP | Masked,
         states: Sequence[int],
         bottom: int,
         v_S: Tensor,
@@ -39,19 +40,19 @@ class SlowTree:
     ) -> None:
         self.mdp, self.bottom, self.v, self.prior = mdp, bottom, v_S.tolist(), prior_SA.tolist()
         self.gumbel, self.rule, self.mean, self.exploration = root == "gumbel", rule, backup == "mean", exploration
-        self.A, self.K, self.merge, self.nodes = mdp.num_actions, mdp.outcomes.num_outcomes, merge, dict[Any, Node]()
+        self.A, self.merge, self.nodes = mdp.num_actions, merge, dict[Any, Node]()
         self.valued = {(0, state) for state in states}
         self.roots = [self.expand((state, 0), state, 0) for state in states]
 
     def expand(self, name: Hashable, state: int, level: int) -> Node:
-        table = self.mdp.outcomes
+        table = self.mdp.outcomes_of_all if isinstance(self.mdp, Masked) else self.mdp.outcomes
         prob, discount, child = (x[state].tolist() for x in (table.prob_NAK, table.discount_NAK, table.child_NAK))
         node: Node = {"name": name, "state": state, "level": level, "visits": [0] * self.A, "outcome_visits": {}}
         node["reward"] = table.reward_NA[state].tolist()
         node["outcomes"] = {
             (a, k): (prob[a][k], discount[a][k], child[a][k])
             for a in range(self.A)
-            for k in range(self.K)
+            for k in range(table.num_outcomes)
             if prob[a][k] > 0 and discount[a][k] > 0 and node["reward"][a] > -math.inf
         }
         # Averages go on below the last level, to take its values again.
@@ -117,13 +118,19 @@ class SlowTree:
     def score(self, node: Node, a: int) -> float:
         total, visits = sum(node["visits"]), node["visits"][a]
         if self.rule == "gumbel":
-            policy = [self.prior[node["state"]][b] * math.exp(self.sigma(node, b)) for b in range(self.A)]
+            policy = [self.prior_of(node)[b] * math.exp(self.sigma(node, b)) for b in range(self.A)]
             return grid(policy[a] / sum(policy) * (total + 1) - visits)
         if self.rule == "puct":
-            bonus = self.prior[node["state"]][a] * math.sqrt(1 + total) / (1 + visits)
+            bonus = self.prior_of(node)[a] * math.sqrt(1 + total) / (1 + visits)
         else:
             bonus = math.sqrt(math.log(1 + total) / (1 + visits))
         return self.normalized(node, a) + self.exploration * bonus
+
+    def prior_of(self, node: Node) -> list[float]:
+        """The policy, given that it takes an action that is allowed."""
+        prior = self.prior[node["state"]]
+        share = sum(prior[a] for a in range(self.A) if node["reward"][a] > -math.inf)
+        return [prior[a] / share if node["reward"][a] > -math.inf else 0.0 for a in range(self.A)]
 
     def normalized(self, node: Node, a: int) -> float:
         high, low = max(node["q"]), min(q for q in node["q"] if q > -math.inf)
@@ -155,7 +162,8 @@ class SlowTree:
         while not self.gumbel:
             actions = [a for a in range(self.A) if self.open(root, a)]
             yield [max(actions, key=lambda a: (self.score(root, a), -a))]
-        survivors, width, phases = list(range(self.A)), self.A, max(1, math.ceil(math.log2(self.A)))
+        survivors, width = list(range(self.A)), sum(reward > -math.inf for reward in root["reward"])
+        phases = max(1, math.ceil(math.log2(width)))
         for phase in range(phases):
             exhausted = [a for a in range(self.A) if not self.open(root, a)]
             survivors = [*self.ranked(root, survivors), *exhausted][:width]
