@@ -26,6 +26,9 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 SWITCH = "PGTS_COMPILED"
 """The environment variable that is 0 where nothing is to be compiled; a process reads it once."""
 
+_LITTLE = 256
+"""Work on fewer numbers takes less time than loading numba."""
+
 _torch_only = False
 
 
@@ -35,6 +38,12 @@ def can_compile(device: torch.device) -> bool:
     That numba is missing is said once.
     """
     return device.type == "cpu" and not _torch_only and _wanted() and _installed()
+
+
+def pays(device: torch.device, size: int) -> bool:
+    """Whether compiled loops are used for work on so many numbers: as `can_compile`, but for little work only where
+    numba is loaded already, which takes longer than a short training. Only for loops that change no bit."""
+    return (size >= _LITTLE or "numba" in sys.modules) and can_compile(device)
 
 
 @contextmanager

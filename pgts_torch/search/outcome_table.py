@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.compiled import can_compile
+from pgts_torch.compiled import pays
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model
 from pgts_torch.search.table import Table, with_room
@@ -120,7 +120,7 @@ class OutcomeTable(Table):
         """Whether the answer is of a kind that a compiled loop can check and write."""
         dtypes = {answer.reward_NA.dtype, answer.prob_NAK.dtype, answer.discount_NAK.dtype, self.dtype}
         fits = len(dtypes) == 1 and tuple(answer.reward_NA.shape) == (states, self.num_actions)
-        return fits and self.dtype in (torch.float32, torch.float64) and can_compile(self.device)
+        return fits and self.dtype in (torch.float32, torch.float64) and pays(self.device, answer.child_NAK.numel())
 
     def _written(self, answer: Outcomes) -> Int[Tensor, "N"] | None:
         """The rows of the answer, checked and written in one pass; None where something seems to be off."""

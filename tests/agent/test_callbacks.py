@@ -136,7 +136,7 @@ def test_an_evaluation_is_the_mean_of_its_episodes_with_the_interval_of_student(
 
 def test_evaluations_in_the_same_environments_are_those_in_new_ones_and_make_them_once(monkeypatch):
     made, real = [], EnvSource.make
-    monkeypatch.setattr(EnvSource, "make", lambda source, count: made.append(count) or real(source, count))
+    monkeypatch.setattr(EnvSource, "make", lambda source, count, **_: made.append(count) or real(source, count))
     model = PGTS("CartPole-v1", depth=0, policy="mlp", num_envs=2, seed=0)
     made.clear()
     with Evaluator(3) as evaluator:
