@@ -2,14 +2,16 @@
 
     python benchmarks/simulators.py [--json FILE] [--quick]
 
-A call is what a lookahead pays for one state and action: restore, step, check, take a snapshot, number it. The step
-alone is that of the bare environment, with and without its observation where the model makes none; it walks on by
-random actions and is reset where an episode ends. Full search without a critic, so that no observation of MiniGrid is
-drawn. CPU microseconds of one thread, medians of repeats in turns after a first one, which does not count. What is not
-installed is left out.
+A call is what a lookahead pays for one state and action: restore, step, check, take a snapshot, number it. Not all of
+them are simulated where states differ in MiniGrid's clock alone. The step alone is that of the bare environment, with
+and without its observation where the model makes none; it walks on by random actions and is reset where an episode
+ends. The emulator alone is ALE's or MuJoCo's, for as many frames as a step of the environment has. Full search without
+a critic, so that no observation of MiniGrid is drawn. CPU microseconds of one thread, medians of repeats in turns after
+a first one, which does not count. What is not installed is left out.
 """
 
 import importlib.util
+import math
 import statistics
 import sys
 import time
@@ -79,22 +81,43 @@ def step_cost(env: Any, *, is_blind: bool) -> float:
     return spent / STEPS * 1e6
 
 
-def call_cost(case: tuple[str, Any, dict[str, Any], int, int]) -> tuple[float, int]:
-    """CPU microseconds of a call in a full search that begins with a new model, and how many calls it made."""
+def emulator_cost(env: Any) -> float:
+    """CPU microseconds of what ALE or MuJoCo do in a step; not a number in other environments."""
+    env.reset(seed=0)
+    if hasattr(env, "ale"):
+        frames = range(env._frameskip)
+        advance = lambda: [env.ale.act(0) for _ in frames]  # noqa: E731
+    elif hasattr(env, "frame_skip"):
+        import mujoco
+
+        advance = lambda: mujoco.mj_step(env.model, env.data, nstep=env.frame_skip)  # noqa: E731
+    else:
+        return float("nan")
+    begin = time.thread_time()
+    for _ in range(STEPS):
+        advance()
+    return (time.thread_time() - begin) / STEPS * 1e6
+
+
+def call_cost(case: tuple[str, Any, dict[str, Any], int, int]) -> tuple[float, int, int]:
+    """CPU microseconds of a call in a full search that begins with a new model; how many there were, and how many of
+    them were simulated."""
     make, (*_, depth, roots) = made(case), case
     model, envs = SimulatorModel(make, gamma=0.99, actions=actions_of(make())), [make() for _ in range(roots)]
     seen = [env.reset(seed=seed)[0] for seed, env in enumerate(envs)]
     root_B = model.roots(envs, seen)
     begin = time.thread_time()
-    expectimax(model, root_B, depth=depth, v_leaf=lambda state_N: torch.zeros(len(state_N)), topology=Topology(model))
-    return (time.thread_time() - begin) / model.simulator_steps * 1e6, model.simulator_steps
+    zero = lambda state_N: torch.zeros(len(state_N))  # noqa: E731
+    calls = expectimax(model, root_B, depth=depth, v_leaf=zero, topology=Topology(model)).model_calls
+    return (time.thread_time() - begin) / calls * 1e6, calls, model.simulator_steps
 
 
 def main(arguments: list[str] | None = None) -> None:
     args = common.parser(__doc__).parse_args(arguments)
     common.use_one_core()
     report: dict[str, Any] = {"about": common.about(args)}
-    print(f"{'us':18}{'m':>3}{'calls':>8}{'a call':>10}{'a step':>10}{'blind':>10}{'call / step':>13}")
+    columns = "calls", "simulated", "a call", "a step", "blind", "emulator", "call / step"
+    print(f"{'us':18}{'m':>3}" + "".join(f"{column:>12}" for column in columns))
     for name, case in CASES.items():
         if not importlib.util.find_spec(case[0]):
             print(f"{case[0]} is not installed: {name} is left out", file=sys.stderr)
@@ -102,14 +125,15 @@ def main(arguments: list[str] | None = None) -> None:
         base = made(case)().unwrapped
         blind = made(case)().unwrapped
         rounds = [
-            (*call_cost(case), step_cost(base, is_blind=False), step_cost(blind, is_blind=True))
+            (*call_cost(case), step_cost(base, is_blind=False), step_cost(blind, is_blind=True), emulator_cost(base))
             for _ in range(3 if args.quick else 6)
         ][1:]
-        call, calls, step, unseen = (statistics.median(column) for column in zip(*rounds, strict=True))
-        report[name] = {"call": call, "calls": calls, "step": step, "blind": unseen}
-        text = "-" if unseen != unseen else f"{unseen:.1f}"
-        cheapest = step if unseen != unseen else unseen
-        print(f"{name:18}{case[3]:3}{calls:8.0f}{call:10.1f}{step:10.1f}{text:>10}{call / cheapest:13.1f}", flush=True)
+        call, calls, simulated, *alone = (statistics.median(column) for column in zip(*rounds, strict=True))
+        report[name] = {"call": call, "calls": calls, "simulated": simulated}
+        report[name] |= dict(zip(("step", "blind", "emulator"), alone, strict=True))
+        times = "".join(f"{'-' if math.isnan(cost) else f'{cost:.1f}':>12}" for cost in (call, *alone))
+        ratio = call / (alone[0] if math.isnan(alone[1]) else alone[1])
+        print(f"{name:18}{case[3]:3}{calls:12.0f}{simulated:12.0f}{times}{ratio:12.1f}", flush=True)
     common.write(report, args.json)
 
 

@@ -3,7 +3,6 @@
 An environment of your own comes first: see the head of `pgts_torch.models.snapshots`.
 """
 
-import functools
 import inspect
 import pickle
 import struct
@@ -117,9 +116,8 @@ class Blackjack(SnapshotAdapter):
         return type(env) is type(own) and (env.natural, env.sab) == (own.natural, own.sab)
 
 
-@functools.lru_cache(maxsize=64)
-def _head(dtype: str, beyond: int | None) -> bytes:
-    return f"{dtype}{beyond}:".encode()
+_FLOAT64, _HEAD = np.dtype(np.float64), b"dNone:"
+"""Most states are of this dtype, and not after an end: how their keys begin."""
 
 
 @final
@@ -130,8 +128,10 @@ class ClassicControl(SnapshotAdapter):
     restored = frozenset({"state", "steps_beyond_terminated", "last_u", "screen", "clock", "isopen", "surf"})
 
     def get_state(self, env: Any) -> Snapshot:
-        state, beyond = np.array(env.state), vars(env).get("steps_beyond_terminated")
-        return Snapshot(_head(state.dtype.char, beyond) + state.tobytes(), (state, beyond))
+        held, beyond = env.state, vars(env).get("steps_beyond_terminated")
+        state = held.copy() if type(held) is np.ndarray else np.array(held)
+        head = _HEAD if beyond is None and state.dtype is _FLOAT64 else f"{state.dtype.char}{beyond}:".encode()
+        return Snapshot(head + state.tobytes(), (state, beyond))
 
     def set_state(self, env: Any, data: Any) -> None:
         state, beyond = data

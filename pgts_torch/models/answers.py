@@ -1,10 +1,13 @@
 """What a simulator has answered: remembered where no chance was involved, as long as it takes little memory."""
 
+import gc
 import itertools
 import math
 import pickle
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, final
 
 import numpy as np
@@ -15,11 +18,14 @@ from pgts_torch.models.snapshots import Reading, Snapshot
 _MOST_BYTES = 2**28
 """All answers are dropped once they take more memory than this, roughly."""
 
-_BYTES_OF_AN_ANSWER, _MEASURED = 500, 100
-"""What an answer takes beside the state that it led to and its observation; of how many answers these are measured."""
+_BYTES_OF_AN_ANSWER, _MEASURED = 500, 50
+"""What an answer takes beside the state that it led to and its observation; of how many states the
+answers are measured."""
 
-Query = tuple[Hashable, int, int]
-"""The name of a snapshot, or its key where the clock does not matter; an action, and how often it is taken."""
+_NOTHING: Mapping[int, Any] = MappingProxyType({})
+
+Query = tuple[Hashable, int]
+"""The name of a snapshot, or its key where the clock does not matter; and how often each action is taken."""
 
 
 @dataclass(slots=True)
@@ -61,56 +67,67 @@ class Answers:
 
     def __init__(self, at_count: Callable[[Step, int, RewardRange | None], Step] | None) -> None:
         self._at_count = at_count
-        self._steps: dict[Query, Step] = {}
+        self._rows: dict[Query, dict[int, Step]] = {}
         # By the key of a snapshot: the first state with that key, where there is a clock.
         self._first: dict[bytes, Seen] = {}
 
     def clear(self) -> None:
-        self._steps.clear()
+        self._rows.clear()
         self._first.clear()
 
-    def take_much_memory(self) -> bool:
-        """Whether they should be dropped, by the mean size of some of them."""
-        steps = self._steps
-        some = list(itertools.islice(steps.values(), 0, None, math.ceil(len(steps) / _MEASURED) or 1))
-        return bool(some) and sum(map(_bytes_of, some)) / len(some) * len(steps) > _MOST_BYTES
+    def clear_if_large(self) -> None:
+        """Drop all if they take much memory, by the mean size of some of them."""
+        rows = self._rows
+        some = itertools.islice(rows.values(), 0, None, math.ceil(len(rows) / _MEASURED) or 1)
+        sizes = [sum(map(_bytes_of, row.values())) for row in some]
+        if sizes and sum(sizes) / len(sizes) * len(rows) > _MOST_BYTES:
+            self.clear()
 
-    def known(
-        self,
-        at: Snapshot,
-        action: int,
-        repeat: int,
-        rewards: RewardRange | None,
-        found: dict[Query, Step] | None = None,
-    ) -> Step | None:
-        """What follows an action, from memory; None: it is not known.
+    def name(self, at: Snapshot) -> Hashable:
+        """What the answers of a state are remembered by: without the clock, where there is one."""
+        return at.key if at.clock is None or self._at_count else at.name
+
+    def known(self, at: Snapshot, repeat: int, rewards: RewardRange | None) -> Mapping[int, Step]:
+        """What follows each action in a state of which that is known.
 
         Args:
-            rewards: between which numbers the reward must be.
-            found: more steps, that may turn out to be random.
+            repeat: how often each action is taken.
+            rewards: between which numbers the rewards must be.
         """
-        step = self._steps.get((at.name, action, repeat))
-        if step is None and self._at_count is not None:
-            assert at.clock is not None
-            query = at.key, action, repeat
-            step = self._steps.get(query) or (found or {}).get(query)
-            if step is not None and at.clock + 1 != step.child.snapshot.clock:
-                return self._at_count(step, at.clock + 1, rewards)
-        return step
+        row = self._rows.get((self.name(at), repeat), _NOTHING)
+        if self._at_count is None:
+            return row
+        # What is true at one count only is remembered by the count, too.
+        alone = self._rows.get((at.name, repeat), _NOTHING)
+        return {**alone, **{action: self._now(step, at, rewards) for action, step in row.items()}}
 
-    def remember(
-        self, at: Snapshot, action: int, repeat: int, step: Step, found: dict[Query, Step] | None = None
-    ) -> None:
-        """Keep a step, or put it among those `found`, for `add`."""
-        found = self._steps if found is None else found
-        found[at.key if step.reading else at.name, action, repeat] = step
-        if step.reading:
+    def _now(self, step: Step, at: Snapshot, rewards: RewardRange | None) -> Step:
+        """What was found at some count, at that of this state."""
+        assert self._at_count is not None
+        assert at.clock is not None
+        after = at.clock + 1
+        return step if after == step.child.snapshot.clock else self._at_count(step, after, rewards)
+
+    def remember(self, at: Snapshot, action: int, repeat: int, step: Step) -> None:
+        """Keep a step beside which nothing else may follow."""
+        name = at.name if self._at_count and step.reading is None else self.name(at)
+        self._rows.setdefault((name, repeat), {})[action] = step
+        if step.reading is not None:
             first = self._first.setdefault(step.child.snapshot.key, step.child)
             step.child.like = None if first is step.child else first
 
-    def add(self, found: dict[Query, Step]) -> None:
-        """Keep these for good."""
-        self._steps.update(found)
+
+@contextmanager
+def without_collector() -> Iterator[None]:
+    """Python's collector of cycles waits in this context, where a batch of answers is made. They are kept, so it would
+    look through all that is remembered and find nothing, which takes longer than many steps."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def observed(observation: Any, observe: Callable[[Any], Any] | None) -> Any:

@@ -128,9 +128,36 @@ class Things:
 
     def __init__(self) -> None:
         self._made: dict[int, tuple[Any, Template]] = {}
+        # The cells of that grid as they were, what lies in them, and what is carried.
+        self._grid: list[Any] = []
+        self._lying: list[tuple[Any, Template]] = []
+        self._cells: Cells = ()
+        self._carried: Any = None
 
-    def clear(self) -> None:
+    def lay(self, cells: Cells, count: int) -> list[Any]:
+        """So many cells, in which new objects lie."""
         self._made.clear()
+        self._cells, self._grid, self._lying, self._carried = cells, [None] * count, [], None
+        for template, where in cells:
+            thing = self.make(template)
+            self._lying.append((thing, template))
+            for i in where:
+                self._grid[i] = thing
+        return self._grid.copy()
+
+    def carry(self, template: Template | None) -> Any:
+        """A new object that is carried."""
+        self._carried = None if template is None else self.make(template)
+        return self._carried
+
+    def _are_untouched(self, grid: Sequence[Any], carried: Any) -> bool:
+        """Whether the cells hold what was laid there, as it was, and nothing else was picked up."""
+        return (
+            carried is self._carried
+            and len(grid) == len(self._grid)
+            and all(map(is_, grid, self._grid))
+            and all(template.is_of(thing) for thing, template in self._lying)
+        )
 
     def make(self, template: Template) -> Any:
         """A new object."""
@@ -145,6 +172,8 @@ class Things:
 
     def cells(self, grid: Sequence[Any], carried: Any) -> Cells:
         """What lies in the cells of a grid. NotPlain if it is the same object in two of them, except for a wall."""
+        if self._are_untouched(grid, carried):
+            return self._cells
         found: dict[bytes | int, tuple[Template, list[int]]] = {}
         # By identity: the cells of a wall, which may be many; None for what can be in one place only.
         places: dict[int, list[int] | None] = {id(carried): None}
@@ -179,15 +208,10 @@ class Compact(NamedTuple):
 
     def restored(self, things: Things) -> dict[str, Any]:
         """The attributes of an environment in this state; what a step may write into is new."""
-        things.clear()
         grid: Any = object.__new__(self.kind)
-        cells = [None] * (self.width * self.height)
-        for template, where in self.cells:
-            thing = things.make(template)
-            for i in where:
-                cells[i] = thing
+        cells = things.lay(self.cells, self.width * self.height)
         vars(grid).update(width=self.width, height=self.height, grid=cells)
         state = dict(zip(self.layout.rest, self.rest, strict=True))
         state.update(zip(MOVING, kept(self.moving), strict=True))
-        state["grid"], state["carrying"] = grid, None if self.carries is None else things.make(self.carries)
+        state["grid"], state["carrying"] = grid, things.carry(self.carries)
         return state

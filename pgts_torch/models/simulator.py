@@ -2,11 +2,10 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, final
 
-import gymnasium
 import numpy as np
 import torch
 from jaxtyping import Bool, Int
@@ -15,19 +14,19 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, check_count, failure
 from pgts_torch.models.adapters import methods_for
-from pgts_torch.models.answers import Answers, Query, Step
+from pgts_torch.models.answers import Answers, Step, without_collector
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.clocks import trusted_clock
 from pgts_torch.models.environments import Given
 from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, ExactModel, Happened, step_text
 from pgts_torch.models.provenance import draws_its_own
 from pgts_torch.models.snapshot_model import SnapshotModel
-from pgts_torch.models.snapshots import SnapshotAdapter, env_name
+from pgts_torch.models.snapshots import SnapshotAdapter
 from pgts_torch.models.stepper import Stepper
 from pgts_torch.seeding import SharedGenerators
 
-_ANY_KEY = 0
-"""The key of steps of which it matters only whether they are random."""
+_ANY_KEY, _CALLS_OF_A_PART = 0, 1024
+"""The key of steps of which it matters only whether they are random; how many are made before there may be garbage."""
 
 
 @final
@@ -40,9 +39,8 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
     state leads to itself with reward 0 and discount 1, under its first action alone, so that at any depth T leaves it
     the value that the critic gives it at the leaves.
 
-    Chance comes from the keys of the search, so a search cannot foresee what the environment of the agent will do. For
-    a transition that uses no chance the simulator is stepped once. The answer is kept by snapshot, so it outlives
-    `clear`; only where answers take much memory are they dropped.
+    Chance comes from the keys of the search, so a search cannot foresee what the environment of the agent will do. What
+    uses no chance is simulated once: such answers outlive `clear`, unless they take much memory.
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
@@ -91,8 +89,6 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         self._draws_its_own = draws_its_own(stepper.made)
         stepper.clock = trusted_clock(stepper) if action_repeat == 1 else None
         self._answers = Answers(stepper.at_count if stepper.clock else None)
-        # The instances whose class, map and constants were compared with the model's own.
-        self._compared: list[Any] = []
 
     @property
     def simulator_steps(self) -> int:  # type: ignore[override]
@@ -102,34 +98,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
         super().clear()
-        if self._answers.take_much_memory():
-            self._answers.clear()
-        self._compared.clear()
-
-    def root(self, env: gymnasium.Env, observation: Any = None) -> int:
-        """The number of the state that another instance of this environment is in. Nothing of that instance changes.
-
-        Args:
-            env: wrapped or not; it has been reset.
-            observation: its observation there, through its wrappers; needed only by critics that read observations.
-
-        Raises:
-            PgtsError: it is another environment, or has another map or other constants than the model's.
-        """
-        base: Any = env.unwrapped
-        if not any(base is known for known in self._compared):
-            if not self.adapter.same_world(base, self.env):
-                raise PgtsError(
-                    f"{env_name(env)} is not the environment that the model was made from ({self.name}): its class, "
-                    "map or constants differ; make both with the same arguments"
-                )
-            self._compared.append(base)
-        return self.number(self.adapter.get_state(base), observation)
-
-    def roots(self, envs: Iterable[gymnasium.Env], observations: Iterable[Any] | None = None) -> Int[Tensor, "B"]:
-        """`root` of each of several instances."""
-        pairs = zip(envs, itertools.repeat(None) if observations is None else observations, strict=False)
-        return torch.tensor([self.root(*pair) for pair in pairs], dtype=torch.int64, device=self.device)
+        self._answers.clear_if_large()
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
         """The one outcome of each (state, action), in an environment that is not random there.
@@ -138,16 +107,9 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             RandomOutcomes: chance decides what follows.
             PgtsError: the environment fails, see `sample`.
         """
-        # One step for each pair, action by action, in the order of a table [N, A].
-        states = self._checked("state", state_N, self.num_states)
+        states, part = self._checked("state", state_N, self.num_states), max(1, _CALLS_OF_A_PART // self.num_actions)
         with self._watched():
-            steps = self._certain(itertools.product(states, range(self.num_actions)))
-        if (random := next((i for i, (step, _) in enumerate(steps) if step.random), None)) is not None:
-            state, action = states[random // self.num_actions], random % self.num_actions
-            raise RandomOutcomes(
-                f"{self.name} is random in state {state} under action {action}: its outcomes cannot be "
-                "enumerated; search it by `sampled`, or make a TabularModel of it if it has a table P"
-            )
+            steps = [step for i in range(0, len(states), part) for step in self._certain(states[i : i + part])]
         # K = 1: the one outcome of each action has probability 1.
         answer, shape = self._answer(steps), (len(state_N), self.num_actions, 1)
         certain_NAK = torch.ones(shape, dtype=self.dtype, device=self.device)
@@ -212,7 +174,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
     def _outcome_of(
         self, state: int, action: int, reward: float, discount: float, next_state: int, follows: bool, query: bool
     ) -> int:
-        step = self._answers.known(self._seen[state].snapshot, action, 1, self.reward_range)
+        step = self._known(state, 1).get(action)
         if step is None:
             if not query:
                 return NOT_QUERIED
@@ -241,50 +203,85 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
                 text += f", as at another {clock.name}, on which it depends: {methods_for(self.env)}"
         return text
 
-    def _certain(self, pairs: Iterable[tuple[int, int]]) -> list[tuple[Step, int]]:
-        """`_step` for each state and action, under repeated actions. The generator is looked at once for all of them:
-        only if something was drawn are they taken again one by one, with a key, to tell which are random."""
-        found: dict[Query, Step] = {}
-        each = list(pairs)
-        self._stepper.chance.watch()
-        answers = [self._step(*pair, None, self.action_repeat, found) for pair in each]
-        if any(step.random is None for step in found.values()) and self._stepper.chance.was_drawn():
-            return [self._step(*pair, _ANY_KEY, self.action_repeat) for pair in each]
-        for step in found.values():
-            step.random = False
-        self._answers.add(found)
-        return answers
+    @without_collector()
+    def _certain(self, states: Sequence[int]) -> list[tuple[Step, int]]:
+        """What follows every action in each state, and the number of the state reached, in the order of a table [N, A].
+        What is not remembered is simulated in one batch."""
+        count, repeat = self.num_actions, self.action_repeat
+        rows = [self._known(state, repeat) for state in states]
+        while pairs := self._unknown(states, rows):
+            self._simulate(pairs)
+            rows = [row if len(row) == count else self._known(n, repeat) for n, row in zip(states, rows, strict=True)]
+        # The children get their numbers now, in this order, so that numbers do not depend on what is remembered.
+        return [self._entered(row[action]) for row in rows for action in range(count)]
 
-    def _step(
-        self, state: int, action: int, key: int | None, repeat: int, found: dict[Query, Step] | None = None
-    ) -> tuple[Step, int]:
-        """What follows an action that is taken so many times, and the number of the state reached; from memory where no
-        chance is involved.
+    def _unknown(self, states: Sequence[int], rows: Sequence[Mapping[int, Step]]) -> list[tuple[int, int]]:
+        """The states and actions that rows lack; of states that differ in the clock alone the last one."""
+        found = dict[Any, tuple[int, int]]()
+        for state, row in zip(states, rows, strict=True):
+            if len(row) < self.num_actions:
+                name = self._answers.name(self._seen[state].snapshot)
+                found |= {(name, action): (state, action) for action in range(self.num_actions) if action not in row}
+        return list(found.values())
 
-        Args:
-            key: None: nothing may be random, which the caller sees to.
-            found: where to remember it, if it is certain. Default: in `Answers`.
+    def _simulate(self, pairs: list[tuple[int, int]]) -> None:
+        """Remember what follows these states and actions.
+
+        Raises:
+            RandomOutcomes: something else may follow, too.
         """
-        seen = self._seen[state]
-        at = seen.snapshot
-        if at.cut:
-            # The state leads to itself under its first action alone, see the class.
-            return Step(-math.inf if action else 0.0, 1.0, seen, False), state
-        if (known := self._answers.known(at, action, repeat, self.reward_range, found)) is not None:
-            # The child gets its number now, so that numbers do not depend on what is remembered.
-            return known, self._enter(known.child)
-        taken = self.actions[action]
+        steps = self._simulated(pairs)
+        for (state, action), step in zip(pairs, steps, strict=True):
+            if not step.random:
+                self._answers.remember(self._seen[state].snapshot, action, self.action_repeat, step)
+        if (random := next((i for i, step in enumerate(steps) if step.random), None)) is not None:
+            raise RandomOutcomes(
+                f"{self.name} is random in state {pairs[random][0]} under action {pairs[random][1]}: its outcomes "
+                "cannot be enumerated; search it by `sampled`, or make a TabularModel of it if it has a table P"
+            )
+
+    def _simulated(self, pairs: list[tuple[int, int]]) -> list[Step]:
+        """What follows these states and actions, where nothing may be random. The generator is looked at once for all:
+        only if something was drawn are they taken again one by one, with a key, to tell which are random."""
+        requests = [(self._seen[state].snapshot.data, self.actions[action]) for state, action in pairs]
+        steps, stepper = list[Step](), self._stepper
+        stepper.chance.watch()
         try:
-            step = self._stepper.follow(at.data, taken, key, repeat, self.reward_range)
+            stepper.follow_each(requests, self.action_repeat, self.reward_range, steps)
         except BaseException as error:
-            where = f"{self.name} failed in state {state} under action {action} ({taken!r})"
-            raise failure(where if key is None else f"{where} with key {key}", error) from error
-        child = self._enter(step.child)
-        # The record by which the state is known, so that equal ones are kept in memory once.
-        step.child = self._seen[child]
-        if not step.random:
-            self._answers.remember(at, action, repeat, step, found)
-        return step, child
+            raise self._failure(*pairs[len(steps)], error) from error
+        if any(step.random is None for step in steps) and stepper.chance.was_drawn():
+            return [self._followed(*pair, _ANY_KEY, self.action_repeat) for pair in pairs]
+        return steps
+
+    def _step(self, state: int, action: int, key: int, repeat: int) -> tuple[Step, int]:
+        """What follows an action that is taken so many times, from memory where no chance is involved, and the number
+        of the state reached."""
+        if (step := self._known(state, repeat).get(action)) is None:
+            step = self._followed(state, action, key, repeat)
+            if not step.random:
+                self._answers.remember(self._seen[state].snapshot, action, repeat, step)
+        return self._entered(step)
+
+    def _followed(self, state: int, action: int, key: int, repeat: int) -> Step:
+        """What follows an action, by the simulator."""
+        try:
+            data = self._seen[state].snapshot.data
+            return self._stepper.follow(data, self.actions[action], key, repeat, self.reward_range)
+        except BaseException as error:
+            raise self._failure(state, action, error, f" with key {key}") from error
+
+    def _failure(self, state: int, action: int, error: BaseException, key: str = "") -> BaseException:
+        where = f"{self.name} failed in state {state} under action {action} ({self.actions[action]!r}){key}"
+        return failure(where, error)
+
+    def _known(self, state: int, repeat: int) -> Mapping[int, Step]:
+        """What follows in a state without a step of the simulator, by action."""
+        seen = self._seen[state]
+        if seen.snapshot.cut:
+            # It leads to itself under its first action alone, see the class.
+            return {action: Step(-math.inf if action else 0.0, 1.0, seen, False) for action in range(self.num_actions)}
+        return self._answers.known(seen.snapshot, repeat, self.reward_range)
 
     def _late(self, state: int) -> Any:
         if not self._stepper.observes_late:

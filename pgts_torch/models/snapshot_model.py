@@ -1,9 +1,11 @@
 """Models whose states are snapshots, numbered as they are met, equal ones with the same number."""
 
+import itertools
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -11,13 +13,15 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.answers import Seen, observed
+from pgts_torch.models.answers import Seen, Step, observed
 from pgts_torch.models.base import Model
-from pgts_torch.models.snapshots import Snapshot
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
 
 
 class SnapshotModel(Model):
     """Numbers snapshots, and remembers the observation of each state.
+
+    env: an instance of the environment.   adapter: of its snapshots.
 
     Args:
         name: of the environment.
@@ -25,6 +29,9 @@ class SnapshotModel(Model):
         observe: what to remember of an observation; an array, or None for nothing. Default: all.
         device: where numbers lie.
     """
+
+    env: Any
+    adapter: SnapshotAdapter
 
     def __init__(
         self, name: str, space: spaces.Space, observe: Callable[[Any], Any] | None, device: torch.device | str
@@ -35,6 +42,8 @@ class SnapshotModel(Model):
         # By number: the state. By the name of a snapshot: the number.
         self._seen: list[Seen] = []
         self._number: dict[Hashable, int] = {}
+        # The instances whose class, map and constants were compared with the model's own.
+        self._compared: list[Any] = []
 
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
@@ -42,6 +51,32 @@ class SnapshotModel(Model):
         self.num_states = 0
         self._seen.clear()
         self._number.clear()
+        self._compared.clear()
+
+    def root(self, env: gymnasium.Env, observation: Any = None) -> int:
+        """The number of the state that another instance of this environment is in. Nothing of that instance changes.
+
+        Args:
+            env: wrapped or not; it has been reset.
+            observation: its observation there, through its wrappers; needed only by critics that read observations.
+
+        Raises:
+            PgtsError: it is another environment, or has another map or other constants than the model's.
+        """
+        base: Any = env.unwrapped
+        if not any(base is known for known in self._compared):
+            if not self.adapter.same_world(base, self.env):
+                raise PgtsError(
+                    f"{env_name(env)} is not the environment that the model was made from ({self.name}): its class, "
+                    "map or constants differ; make both with the same arguments"
+                )
+            self._compared.append(base)
+        return self.number(self.adapter.get_state(base), observation)
+
+    def roots(self, envs: Iterable[gymnasium.Env], observations: Iterable[Any] | None = None) -> Int[Tensor, "B"]:
+        """`root` of each of several instances."""
+        pairs = zip(envs, itertools.repeat(None) if observations is None else observations, strict=False)
+        return torch.tensor([self.root(*pair) for pair in pairs], dtype=torch.int64, device=self.device)
 
     def number(self, snapshot: Snapshot, observation: Any = None) -> int:
         """The number of a state: a new one if no equal state was met before."""
@@ -61,6 +96,13 @@ class SnapshotModel(Model):
         else:
             seen.observation = known.observation
         return number
+
+    def _entered(self, step: Step) -> tuple[Step, int]:
+        """A step, and the number of the state reached."""
+        number = self._enter(step.child)
+        # The record by which the state is known, so that equal ones are kept in memory once.
+        step.child = self._seen[number]
+        return step, number
 
     def export(self, state_N: Int[Tensor, "N"]) -> list[tuple[Snapshot, Any]]:
         """The snapshot of each state and what `observe` made of its observation, for `adopt` in another process."""

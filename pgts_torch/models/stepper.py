@@ -14,7 +14,14 @@ from pgts_torch.models.chance import Chance
 from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.snapshots import SnapshotAdapter, env_name
-from pgts_torch.models.steps import check_observation, check_rewards, discount_of, names_discounts, number_of
+from pgts_torch.models.steps import (
+    LARGEST_REWARD,
+    check_observation,
+    check_rewards,
+    discount_of,
+    names_discounts,
+    number_of,
+)
 from pgts_torch.models.wrappers import transforms_of
 
 
@@ -116,6 +123,61 @@ class Stepper:
             reached = reached._replace(cut=True)
         seen = Seen(reached, self._kept(observation) if shown else None)
         return Step(total, discount, seen, random, reading if repeat == 1 else None)
+
+    def follow_each(
+        self, requests: Sequence[tuple[Any, Any]], repeat: int, rewards: RewardRange | None, found: list[Step]
+    ) -> None:
+        """What follows the action of each request, as `follow` without a key, added to those `found`. Where one fails,
+        its step and those after it are missing there.
+
+        Args:
+            requests: the data of a snapshot and one of `actions`, each.
+        """
+        if repeat > 1 or self._names_discounts:
+            for data, taken in requests:
+                found.append(self.follow(data, taken, None, repeat, rewards))
+            return
+        env, adapter, clock, gamma, shown = self.env, self.adapter, self.clock, self._gamma, self._show is None
+        set_state, get_state, is_random, step = adapter.set_state, adapter.get_state, adapter.is_random, env.step
+        # Rewards and observations that are plain numbers are not looked into one by one.
+        as_paid, rows = rewards is None and not self._pays, self._rows(len(requests))
+        shape, dtype = (None, None) if rows is None else (rows.shape[1:], rows.dtype)
+        for i, (data, taken) in enumerate(requests):
+            set_state(env, data)
+            if random := is_random(env, taken):
+                self.chance.seed(0)
+            observation, reward, terminated, truncated, _ = step(taken)
+            self.steps += 1
+            reading = None if clock is None else clock.reading(reward, truncated)
+            if not (as_paid and type(reward) is float and -LARGEST_REWARD <= reward <= LARGEST_REWARD):
+                reward = self._reward(reward, rewards)
+            kept = None
+            if (
+                rows is not None
+                and type(observation) is np.ndarray
+                and (observation.shape, observation.dtype) == (shape, dtype)
+            ):
+                rows[i] = observation
+                kept = rows[i]
+            elif shown:
+                check_observation(self._inner_space, observation)
+                kept = self._kept(observation)
+            reached = get_state(env)
+            if truncated and gamma and not terminated:
+                reached = reached._replace(cut=True)
+            found.append(Step(reward, 0.0 if terminated else gamma, Seen(reached, kept), random, reading))
+        if rows is not None and not np.isfinite(rows).all():
+            first = int(np.flatnonzero(~np.isfinite(rows).reshape(len(rows), -1).all(1))[0])
+            del found[first:]
+            check_observation(self._inner_space, rows[first])
+
+    def _rows(self, count: int) -> np.ndarray | None:
+        """Room for so many observations, where these are numbers that are kept as they are; else None."""
+        space = self._inner_space
+        is_plain = self._show is None and self._observe is None and not self.transforms.observations
+        if is_plain and isinstance(space, spaces.Box) and space.dtype.kind == "f":
+            return np.zeros((count, *space.shape), space.dtype)
+        return None
 
     def at_count(self, step: Step, count: int, rewards: RewardRange | None = None) -> Step:
         """What follows an action where the clock is at another count after it."""

@@ -1,6 +1,7 @@
 """A simulator as a model: the truth of tables where there are some, each pair queried once, chance in the keys."""
 
 import copy
+import gc
 import math
 import weakref
 from typing import Any, ClassVar
@@ -338,14 +339,16 @@ def counting(monkeypatch: pytest.MonkeyPatch, place: Any, name: str) -> list[Non
 
 
 @pytest.mark.parametrize("count", [1, 40])
-def test_a_batch_of_calls_reads_no_generator_and_makes_as_many_tensors_as_one(count, monkeypatch):
+def test_a_batch_of_calls_reads_no_generator_looks_into_no_single_observation_and_makes_as_many_tensors_as_one(
+    count, monkeypatch
+):
     model = SimulatorModel("CartPole-v1", gamma=0.9)
     root_B = model.roots([reset(gymnasium.make("CartPole-v1"), seed) for seed in range(count + 1)])
     model.outcomes(root_B[:1])
     states, seeds = counting(monkeypatch, chance, "generator_state"), counting(monkeypatch, snapshots, "reseed")
     checks, tensors = counting(monkeypatch, stepper, "check_observation"), counting(monkeypatch, torch, "tensor")
     model.outcomes(root_B[1:])
-    assert (len(states), len(seeds), len(checks), len(tensors)) == (0, 0, 2 * count, 3)
+    assert (len(states), len(seeds), len(checks), len(tensors)) == (0, 0, 0, 3)
 
 
 def test_a_model_that_nobody_needs_is_gone_at_once():
@@ -355,6 +358,25 @@ def test_a_model_that_nobody_needs_is_gone_at_once():
     is_alive = weakref.ref(model)
     del model
     assert is_alive() is None
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_collector_of_cycles_waits_while_a_batch_is_answered_and_is_as_before_after_it(enabled):
+    (gc.enable if enabled else gc.disable)()
+    try:
+        model = SimulatorModel("CliffWalking-v1", gamma=0.9)
+        root_B = every_state("CliffWalking-v1", model, 48)
+        seen, real = list[bool](), model.env.step
+        model.env.step = lambda action: seen.append(gc.isenabled()) or real(action)
+        model.outcomes(root_B)
+        assert seen == [False] * 4 * 48
+        assert gc.isenabled() == enabled
+        broken = SimulatorModel(lambda: Broken("raises"), gamma=0.9)
+        with pytest.raises(PgtsError, match="division by zero"):
+            expectimax(broken, torch.tensor([broken.root(reset(Broken("raises"), 0))]), depth=3, v_leaf=zeros)
+        assert gc.isenabled() == enabled
+    finally:
+        gc.enable()
 
 
 class Gusty(Corridor):
@@ -581,3 +603,8 @@ def test_an_environment_that_fails_is_named_with_state_action_and_key(fault, mes
         model.sample(state_N, torch.tensor([1]), key_N=key_N)
     assert raised.value.__cause__ is not None
     assert model.sample(state_N, torch.tensor([0]), key_N=key_N).discount_N.item() == 0.9
+    # In a batch it is the same step, without a key, and what comes after it does not matter.
+    whole = SimulatorModel(lambda: Broken(fault), gamma=0.9)
+    state_N = whole.roots([reset(Broken(fault), 0), broken, reset(Broken(fault), 0)])
+    with pytest.raises(PgtsError, match=rf"^Broken failed in state 1 under action 1 \(6\): {message}"):
+        whole.outcomes(state_N)
