@@ -72,6 +72,26 @@ def played(count: int, seed: int = 0) -> Experience:
     return Experience(*(torch.from_numpy(np.array(column)) for column in zip(*rows, strict=True)))
 
 
+@pytest.mark.fault("loss that is not finite")
+def test_a_fit_in_which_a_loss_is_not_finite_is_taken_back(monkeypatch):
+    model = untrained(Latent(network=CNN(channels=[4], hidden=[8]), size=8, hidden=[8], first_updates=5, unroll=2))
+    model.learn(played(50), generator=stream(0, "learn"))
+    before, steps, calls = model.state_dict(), played(50, seed=1), iter(range(100))
+
+    def spoiled(unrolled: Unrolled) -> torch.Tensor:
+        return consistency_loss(unrolled) * (torch.nan if next(calls) == 3 else 1.0)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pgts_torch.agent.latent.consistency_loss", spoiled)
+        with pytest.raises(NotFinite, match="the model loss is nan; no parameter was changed"):
+            model.learn(steps, generator=stream(1, "learn"))
+    after = model.state_dict()
+    for name in ("representation", "dynamics", "optimiser"):
+        torch.testing.assert_close(after[name], before[name], rtol=0, atol=0)
+    model.learn(steps, generator=stream(1, "learn"))
+    assert model.state_dict()["optimiser"]["num_steps"] > before["optimiser"]["num_steps"]
+
+
 def untrained(options: Latent = SMALL, *, seed: int = 0, **more) -> LatentModel:
     model = LatentModel(small_catch().observation_space, 3, gamma=GAMMA, options=options, seed=seed, **more)
     vectors = spaces.Box(-np.inf, np.inf, (options.size,))
