@@ -72,20 +72,22 @@ def unmerged_nodes(mdp: TabularMDP, root: int, expansions: int) -> float:
     return nodes
 
 
-def take_turns(forms: dict[str, Form], repeats: int) -> dict[str, list[float]]:
+def take_turns(
+    forms: dict[str, Form], repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, list[float]]:
     """Milliseconds of each form in each repeat; a first repeat, in which caches fill, does not count."""
-    rounds = [{name: milliseconds(form) for name, form in forms.items()} for _ in range(repeats + 1)]
+    rounds = [{name: milliseconds(form, clock) for name, form in forms.items()} for _ in range(repeats + 1)]
     return {name: [times[name] for times in rounds[1:]] for name in forms}
 
 
-def milliseconds(form: Form) -> float:
+def milliseconds(form: Form, clock: Callable[[], float] = time.perf_counter) -> float:
     """One call of the form, the mean of as many as fill `SECONDS`."""
-    calls, begin, end = 0, time.perf_counter(), 0.0
+    calls, begin, end = 0, clock(), 0.0
     while end < begin + SECONDS:
         form()
         if torch.cuda.is_initialized():
             torch.cuda.synchronize()
-        calls, end = calls + 1, time.perf_counter()
+        calls, end = calls + 1, clock()
     return (end - begin) / calls * 1e3
 
 

@@ -158,12 +158,14 @@ class TensorModel(EnumeratingModel, SamplingModel):
         for _ in range(self.action_repeat - 1):
             # on: the pairs whose action is taken once more, and then those of them where it is allowed.
             on = torch.nonzero((discount_N > 0) & (reward_N > -torch.inf)).flatten()
-            more_N, then_N, ahead_ND = self._stepped(next_ND[on], action_N[on])
+            more_N, then_N, ahead_ND = self._stepped(next_ND.index_select(0, on), action_N.index_select(0, on))
             allowed_N = more_N > -torch.inf
-            on, weight_N = on[allowed_N], discount_N[on[allowed_N]]
-            reward_N = reward_N.index_add(0, on, weight_N * more_N[allowed_N])
-            discount_N = discount_N.index_copy(0, on, weight_N * then_N[allowed_N])
-            next_ND = next_ND.index_copy(0, on, ahead_ND[allowed_N])
+            if not bool(allowed_N.all()):
+                on, more_N, then_N, ahead_ND = (x[allowed_N] for x in (on, more_N, then_N, ahead_ND))
+            weight_N = discount_N.index_select(0, on)
+            reward_N = reward_N.index_add(0, on, weight_N * more_N)
+            discount_N = discount_N.index_copy(0, on, weight_N * then_N)
+            next_ND = next_ND.index_copy(0, on, ahead_ND)
         # Next states that count get a number; a terminal one may be anything, and is no state of the model.
         counts_N = (discount_N > 0) & (reward_N > -torch.inf)
         if bool(counts_N.all()):
