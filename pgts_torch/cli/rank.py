@@ -6,6 +6,7 @@ its exit code, leaves it in REPORTS and exits with 0; one that has lost another 
 
 import json
 import sys
+import warnings
 from pathlib import Path
 
 from pgts_torch.cli.commands import COMMANDS, Arguments
@@ -25,6 +26,8 @@ def main() -> int:
             lost = str(error)
             raise SystemExit(LOST) from None
 
+    if rank():
+        warnings.simplefilter("ignore")  # the first process says them, which runs the same code
     code = exit_code(train, sys.argv[2:])
     report.write_text(json.dumps({"code": code, "lost": lost}), encoding="utf-8")
     return LOST if lost else 0

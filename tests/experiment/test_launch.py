@@ -1,5 +1,6 @@
 """`pgts train --processes`: what is refused before anything starts, and what becomes of processes that end."""
 
+import importlib
 import json
 import os
 import signal
@@ -7,12 +8,17 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from pgts_torch.cli import rank
+from pgts_torch.cli.commands import COMMANDS
 from pgts_torch.cli.main import main
-from pgts_torch.errors import LOST, RankLost
+from pgts_torch.errors import LOST, NotFinite, RankLost
 from pgts_torch.experiment import checkpoint, launch
 from pgts_torch.experiment.locking import RunLock
 from tests.experiment.pretended import starts
@@ -127,6 +133,38 @@ def test_a_signal_reaches_each_process_and_is_no_loss(number, code, tmp_path):
 
     assert in_child(work) == code
     assert starts(tmp_path, 0) == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "report"),
+    [
+        (None, 0, {"code": 0, "lost": ""}),
+        (NotFinite("no number"), 0, {"code": 1, "lost": ""}),
+        (RankLost("rank 0 has lost another one"), LOST, {"code": LOST, "lost": "rank 0 has lost another one"}),
+    ],
+)
+def test_a_process_leaves_its_exit_code_and_only_the_first_one_speaks(
+    error, code, report, tmp_path, monkeypatch, capfd
+):
+    def trained(given: Sequence[str]) -> None:
+        assert list(given) == ["--seed=3"]
+        warnings.warn("the table is odd", stacklevel=1)
+        if error is not None:
+            raise error
+
+    def work(number: str) -> int:
+        os.environ.update(TORCHELASTIC_RUN_ID="x", RANK=number)
+        importlib.reload(warnings)  # pytest keeps them to itself
+        warnings.resetwarnings()
+        return rank.main()
+
+    monkeypatch.setitem(COMMANDS, "train", trained)
+    monkeypatch.setattr(sys, "argv", ["rank", str(tmp_path), "--seed=3"])
+    said = "error: no number\n" if isinstance(error, NotFinite) else ""
+    for number, text in {"0": f"warning: the table is odd\n{said}", "1": ""}.items():
+        assert in_child(partial(work, number)) == code
+        assert json.loads((tmp_path / number).read_text()) == report
+        assert capfd.readouterr() == ("", text)
 
 
 FATAL = ["--env.id=tests.experiment.fatal:Fatal-v0", "--search.depth=0", "--estimator.type=sampled", *SHORT, *OFTEN]
