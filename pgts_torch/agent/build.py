@@ -29,7 +29,7 @@ from pgts_torch.options.critics import (
     TabularValues,
 )
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import MLP, AutoPolicy, Network, Simplex, Softmax
+from pgts_torch.options.policies import AutoPolicy, Network, Simplex, Softmax
 from pgts_torch.options.replay import UniformReplay
 from pgts_torch.options.rollouts import Estimator, LookaheadAdvantages, SampledAdvantages
 from pgts_torch.options.search import MCTS, Auto, Expectimax, Kind, Sampled
@@ -84,9 +84,7 @@ def chosen(options: Training, world: World) -> Training:
     numbered, replayed = isinstance(world, TabularWorld), isinstance(options.replay, UniformReplay)
     latent = isinstance(world.model, LatentModel)
     if isinstance(policy, AutoPolicy):
-        network = default_network(world.perceived_space)
-        if isinstance(network, MLP) and replayed and not latent:
-            network = MLP(normalize=True)
+        network = default_network(world.perceived_space, normalize=replayed and not latent)
         policy = Softmax() if numbered else network
     if isinstance(critic, AutoCritic):
         fits = _FITS if replayed else NetworkValues()

@@ -21,6 +21,7 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
+from pgts_torch.agent.observations import Observations
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError
@@ -36,6 +37,7 @@ from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.trial import compare
 from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_of, wrappers_of
+from pgts_torch.options.environment import Observed
 from pgts_torch.seeding import SharedGenerators, numpy_stream
 from pgts_torch.tabular.mdp import TabularMDP, check_gamma
 
@@ -53,7 +55,7 @@ def make_world(
     *,
     num_envs: int,
     gamma: float | None,
-    observation_key: str | None,
+    observed: Observed,
     plain: bool,
     action_repeat: int = 1,
     device: torch.device | str,
@@ -64,7 +66,7 @@ def make_world(
     Args:
         source: makes `num_envs` environments, unless it was given a VectorEnv.
         gamma: discount; None: the environment's own (pgts/*), else 0.99.
-        observation_key: the entry of dictionary observations that is used.
+        observed: what is seen of observations.
         plain: whether no model is needed: then only a table is looked for, and without one the world has no model.
         action_repeat: how often an action is taken in one outcome of the model (`TensorModel`).
         other: makes the world of environments and their discount, with a model that is learned or the caller's own.
@@ -82,7 +84,7 @@ def make_world(
         _check_memories(env)
         own = getattr(each_of(env)[0].unwrapped, "mdp", None)
         return other(env, float(own.outcomes.discount_NAK.max()) if isinstance(own, TabularMDP) else discount)
-    request = _Request(source, env, discount, observation_key, action_repeat, torch.device(device))
+    request = _Request(source, env, discount, observed, action_repeat, torch.device(device))
     with SharedGenerators(0, "models"):
         world, reasons = _first_model(request, (_table,) if plain else (_table, _dynamics, _simulator))
     if world is not None:
@@ -91,7 +93,7 @@ def make_world(
         raise MissingModel("; ".join(reversed(reasons)) + _WAYS_OUT)
     _check_memories(env)
     _check_single(action_repeat, "without a model")
-    return World(env, gamma=discount, observation_key=observation_key, device=device)
+    return World(env, gamma=discount, observed=observed, device=device)
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class _Request:
     source: EnvSource
     env: VectorEnv
     gamma: float
-    observation_key: str | None
+    observed: Observed
     action_repeat: int
     device: torch.device
 
@@ -144,7 +146,7 @@ def _first_model(
     env, reasons = request.env, list[str]()
     if type(env) is TabularVectorEnv:
         _check_single(request.action_repeat, "in a table")
-        return TabularWorld(env, env.mdp, observation_key=request.observation_key, device=request.device), []
+        return TabularWorld(env, env.mdp, observed=request.observed, device=request.device), []
     if type(env) is not SyncVectorEnv:
         return None, [f"{request.name} is a VectorEnv of unknown kind; a simulator needs a SyncVectorEnv ({SLOW})"]
     try:
@@ -196,7 +198,7 @@ def _check_alike(request: _Request) -> None:
 def _table(request: _Request) -> TabularWorld | None:
     """The world of a published table; None where there is none, or observations are not its states."""
     discrete = isinstance(request.env.single_observation_space, spaces.Discrete)
-    if request.observation_key is not None or not discrete or not publishes_table(request.envs.envs[0]):
+    if request.observed.observation_keys is not None or not discrete or not publishes_table(request.envs.envs[0]):
         return None
     if own := request.own_to_each & {"P", "mdp", "initial_state_distrib"}:
         raise MissingModel(
@@ -229,12 +231,12 @@ def _dynamics(request: _Request) -> DynamicsWorld | None:
     except ModelMismatch as off:
         raise MissingModel(f"{unused}: {off}") from off
     model = kind(env, gamma=request.gamma, action_repeat=request.action_repeat, device=request.device)
-    return DynamicsWorld(request.envs, model, observation_key=request.observation_key)
+    return DynamicsWorld(request.envs, model, observed=request.observed)
 
 
 def _simulator(request: _Request) -> SimulatedWorld:
     """The world of a simulator that is restored from snapshots; MissingModel where it cannot be."""
-    key, env = request.observation_key, request.envs.envs[0]
+    env = request.envs.envs[0]
     known = known_adapter(env)
     adapter = known or PickledAttributes()
     if adapter.restored is not None and (why := _own(request, request.own_to_each)):
@@ -257,15 +259,16 @@ def _simulator(request: _Request) -> SimulatedWorld:
         if isinstance(error, MissingModel):
             raise MissingModel(f"{request.name} cannot serve as a model: {error}") from error
         # an error of the environment is reported when it stops a training
+    seen = Observations(request.env, request.observed, request.device)
     model = SimulatorModel(
         request.fresh,
         gamma=request.gamma,
         action_repeat=request.action_repeat,
         adapter=adapter,
-        observe=None if key is None else lambda observation: observation[key],
+        observe=None if seen.as_given else seen.rows,
         device=request.device,
     )
-    return SimulatedWorld(request.envs, model, observation_key=key, device=request.device)
+    return SimulatedWorld(request.envs, model, observed=request.observed, device=request.device)
 
 
 def _own(request: _Request, names: Iterable[str]) -> str:

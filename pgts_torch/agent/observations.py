@@ -1,80 +1,176 @@
 """Observations of an environment as tensors, the inputs of policies and critics."""
 
+from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.spaces import Space
 from gymnasium.vector import VectorEnv
-from jaxtyping import Int
 from torch import Tensor
 
+from pgts_torch.agent.components import (
+    Component,
+    Path,
+    counts,
+    found_in,
+    has_channels_first,
+    num_combinations,
+    plainly,
+    row_dtype,
+)
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.options.environment import Observed
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A component, with the way to it in an observation, as the environment declares it and as rows have it."""
+
+    path: Path
+    declared: Component
+    seen: Component
+    channels_first: bool
+
+    def read(self, observation: Any) -> np.ndarray:
+        """Return it of an observation, or of several, as rows have it: [..., *shape]."""
+        part = observation
+        try:
+            for step in self.path:
+                part = part[step]
+        except (KeyError, IndexError, TypeError) as error:
+            raise PgtsError(f"an observation is {observation!r}; it has no part {self.path}") from error
+        try:
+            array = np.asarray(part)
+        except ValueError as error:
+            raise PgtsError(f"an observation is {part!r}; its space is {self.declared}") from error
+        shape = self.declared.shape or ()
+        if array.shape[max(0, array.ndim - len(shape)) :] != shape:
+            raise PgtsError(f"an observation has shape {array.shape}; its space is {self.declared}")
+        if not isinstance(self.declared, spaces.Box):
+            return _from_zero(array, self.declared)
+        array = _cast(array, self.declared)
+        return np.moveaxis(array, -3, -1) if self.channels_first else array
 
 
 @final
 class Observations:
-    """Makes tensors of the observations of an environment: numbers, vectors or images.
+    """Makes tensors of the observations of an environment, a row of each (`components`).
 
-    space: of these tensors.
+    space: of rows. Numbers are counted from 0, and the channels of images come last.
+    as_given: whether rows are the observations themselves, in their dtype.
 
     Args:
         env: the environments.
-        key: the entry of dictionary observations that is used.
+        options: what is seen of dictionaries, and where images have their channels.
+        numbered: whether the combinations of several numbers are numbered in their turn: then rows are Discrete.
 
     Raises:
-        PgtsError: dictionary observations without a key, a key that they do not have, or another kind of space.
+        PgtsError: a key that the observations do not have, images that may have their channels first or last, or a
+            kind of observation that no network takes.
     """
 
-    def __init__(self, env: VectorEnv, key: str | None, device: torch.device) -> None:
-        space, what = env.single_observation_space, f"the observations of {env_name(env)}"
-        if isinstance(space, spaces.Dict):
-            known = ", ".join(map(str, space.keys()))
-            if key is None:
-                raise PgtsError(f"{what} are dictionaries of {known}: set observation_key to the one to learn from")
-            if key not in space.spaces:
-                raise PgtsError(f"{what} have no part {key!r}; they have {known}")
-            space = space[key]
-        elif key is not None:
-            raise PgtsError(f"{what} are {space}; they have no part {key!r}")
-        if not isinstance(space, spaces.Discrete | spaces.Box):
-            raise PgtsError(f"{what} are {space}; a policy takes numbers, vectors or images")
-        self.key, self.device, self._first = key, device, 0
-        self.space: spaces.Discrete | spaces.Box = space
-        if isinstance(space, spaces.Discrete):  # as tensors, numbers are counted from 0
-            self._first, self.space = int(space.start), spaces.Discrete(int(space.n))
+    def __init__(self, env: VectorEnv, options: Observed, device: torch.device, *, numbered: bool = False) -> None:
+        self.options, self.device, self.numbered = options, device, numbered
+        self._what = f"the observations of {env_name(env)}"
+        space, channels = env.single_observation_space, options.image_channels
+        self._parts = [
+            _Part(path, part, plainly(part, channels), has_channels_first(part, channels))
+            for path, part in self._known(self._selected(space))
+        ]
+        seen: list[Component] = [part.seen for part in self._parts]
+        self._row: Space[Any] = seen[0] if len(seen) == 1 else spaces.Tuple(seen)
+        self._dtype = row_dtype(self._row)
+        self.space = spaces.Discrete(num_combinations(self._row) or 0) if numbered else self._row
+        self.as_given = isinstance(space, spaces.Box | spaces.Discrete) and self.space == space
+        if channels is not None and not any(len(part.shape or ()) == 3 for part in seen):
+            raise PgtsError(f"image_channels is {channels!r}; {self._what} are {space}, without an image of three axes")
 
-    def part(self, observation: Any) -> Any:
-        """The entry of a dictionary observation that is used; other observations are returned as they are."""
-        return observation if self.key is None else observation[self.key]
+    def _selected(self, space: Space[Any]) -> Space[Any]:
+        """The space without the entries that are not seen."""
+        keys = self.options.observation_keys
+        if keys is None:
+            return space
+        known = list(space.spaces) if isinstance(space, spaces.Dict) else []
+        for key in keys:
+            if key not in known:
+                has = f"have {', '.join(map(str, known))}" if known else f"are {space}"
+                raise PgtsError(f"{self._what} have no part {key!r}; they {has}")
+        selected = spaces.Dict()
+        selected.spaces = {key: space[key] for key in keys}  # type: ignore[index]  # in this order, not by name
+        return selected
+
+    def _known(self, space: Space[Any]) -> list[tuple[Path, Component]]:
+        """The components of a space; PgtsError where a part of it is none."""
+        known: list[tuple[Path, Component]] = []
+        for path, part in found_in(space):
+            if isinstance(part, Component):
+                known.append((path, part))
+                continue
+            strange = f"{self._what} are {type(part).__name__}, which no network takes"
+            if not path or not isinstance(space, spaces.Dict):
+                raise PgtsError(f"{strange}: make numbers of them by a wrapper")
+            fine = [key for key, one in space.items() if all(isinstance(leaf, Component) for _, leaf in found_in(one))]
+            raise PgtsError(
+                f"{strange}, in their part {path[0]!r}: set observation_keys to those to learn from, {fine}"
+            )
+        return known
 
     def encode(self, observation: Any) -> Tensor:
         """As `World.encode`."""
-        return self.encode_part(self.part(observation))
+        return torch.from_numpy(self.rows(observation)).to(self.device)
 
-    def encode_part(self, part: Any) -> Tensor:
-        """As `encode`, from the result of `part`."""
-        if isinstance(self.space, spaces.Discrete):
-            return states_of(part, self._first, int(self.space.n)).to(self.device)
-        try:
-            array = np.asarray(part)
-        except ValueError as error:
-            raise PgtsError(f"an observation is {part!r}; its space is {self.space}") from error
-        if array.shape[max(0, array.ndim - len(self.space.shape)) :] != self.space.shape:
-            raise PgtsError(f"an observation has shape {array.shape}; its space is {self.space}")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            off = array[~np.isfinite(array)][:3].tolist()
-            raise NotFinite(f"an observation is not finite: {off}", what="observation")
-        return torch.from_numpy(np.array(array)).to(self.device)
+    def rows(self, observation: Any) -> np.ndarray:
+        """Return the rows of `encode` as an array of its own."""
+        found = [part.read(observation) for part in self._parts]
+        if len(found) == 1 and not self.numbered:
+            return np.array(found[0], self._dtype)
+        # [..., *shape] -> [..., entries]; before the shape comes how many observations there are
+        flat = [array.reshape(*self._before(array, part), -1) for array, part in zip(found, self._parts, strict=True)]
+        if len({array.shape[:-1] for array in flat}) > 1:
+            raise PgtsError(f"the parts of an observation have the shapes {[array.shape for array in found]}")
+        return self._numbers(flat) if self.numbered else np.concatenate(flat, -1, dtype=self._dtype, casting="unsafe")
+
+    @staticmethod
+    def _before(array: np.ndarray, part: _Part) -> tuple[int, ...]:
+        return array.shape[: array.ndim - len(part.seen.shape or ())]
+
+    def _numbers(self, flat: list[np.ndarray]) -> np.ndarray:
+        """The numbers of combinations, in mixed radix; the last entry counts fastest."""
+        number = np.zeros(flat[0].shape[:-1], np.int64)
+        for part, array in zip(self._parts, flat, strict=True):
+            for k, count in enumerate(counts(part.seen).tolist()):
+                number = number * count + array[..., k]
+        return np.asarray(number)
 
 
-def states_of(observation: Any, first: int, num_states: int) -> Int[Tensor, "..."]:
-    """Observations that are counted from `first` on as int64 states, counted from 0; PgtsError unless they are such."""
-    state = np.asarray(observation)
-    if not np.issubdtype(state.dtype, np.integer):
-        raise PgtsError(f"observation is of {state.dtype}; states are integers")
-    off = state[(state < first) | (state >= first + num_states)]
-    if off.size:
-        raise PgtsError(f"state {off.flat[0]} does not exist; states are {first} to {first + num_states - 1}")
-    return torch.from_numpy(np.asarray(state.astype(np.int64) - first))
+def _from_zero(array: np.ndarray, space: spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary) -> np.ndarray:
+    """Numbers or bits of a space, counted from 0, as int64; PgtsError unless they are such."""
+    if array.dtype.kind not in "biu":
+        raise PgtsError(f"observation is of {array.dtype}; states are integers")
+    first = np.asarray(0 if isinstance(space, spaces.MultiBinary) else space.start)
+    number, count = array.astype(np.int64) - first, counts(space).reshape(space.shape or ())
+    off = (number < 0) | (number >= count)
+    if not off.any():
+        return number
+    if isinstance(space, spaces.Discrete):
+        raise PgtsError(f"state {array[off].flat[0]} does not exist; states are {first} to {first + count - 1}")
+    raise PgtsError(f"an observation holds {array[off].flat[0]}, where its space {space} has no such value")
+
+
+def _cast(array: np.ndarray, space: spaces.Box) -> np.ndarray:
+    """Numbers in the dtype of their space; PgtsError where they are none of it, NotFinite where they are not finite."""
+    if array.dtype != space.dtype:
+        if array.dtype.kind not in "biuf":
+            raise PgtsError(f"an observation is of {array.dtype}; its space is {space}")
+        given = array
+        with np.errstate(over="ignore", invalid="ignore"):
+            array = given.astype(space.dtype)
+        if array.dtype.kind != "f" and (array != given).any():
+            raise PgtsError(f"an observation holds {given[array != given].flat[0]}, which {space.dtype} cannot hold")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        off = array[~np.isfinite(array)][:3].tolist()
+        raise NotFinite(f"an observation is not finite: {off}", what="observation")
+    return array

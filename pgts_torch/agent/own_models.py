@@ -7,10 +7,12 @@ from typing import Any, final
 
 import torch
 from gymnasium import spaces
+from gymnasium.spaces import Space
 from gymnasium.vector import VectorEnv
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
+from pgts_torch.agent.components import image_shape, num_combinations
 from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.world import ModelWorld, TabularWorld, VectorStates, World
 from pgts_torch.errors import MissingModel, PgtsError, failure
@@ -20,8 +22,12 @@ from pgts_torch.models.ensemble import EnsembleModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.tensor import TensorModel
+from pgts_torch.options.environment import Observed
 from pgts_torch.options.models import Counts, Ensemble, Latent, OwnModel
 from pgts_torch.trust import import_named
+
+_MOST_STATES = 2**20
+"""Combinations of several numbers are counted up to so many."""
 
 
 @final
@@ -31,13 +37,13 @@ class VectorWorld(VectorStates):
     Args:
         env: the environments.
         model: its states are observations, or what it makes of them.
-        observation_key: the entry of dictionary observations that is used.
+        observed: what is seen of observations.
     """
 
     def __init__(
-        self, env: VectorEnv, model: TensorModel, *, gamma: float, observation_key: str | None, device: torch.device
+        self, env: VectorEnv, model: TensorModel, *, gamma: float, observed: Observed, device: torch.device
     ) -> None:
-        super().__init__(env, gamma=gamma, observation_key=observation_key, device=device)
+        super().__init__(env, gamma=gamma, observed=observed, device=device)
         self.model: TensorModel = model
         if isinstance(model, LatentModel):
             self.perceive, self.perceived_space = model.represent, model.space
@@ -56,7 +62,7 @@ def learned_world(
     options: Counts | Ensemble | Latent,
     *,
     gamma: float,
-    observation_key: str | None,
+    observed: Observed,
     action_repeat: int,
     capacity: int,
     seed: int,
@@ -71,18 +77,22 @@ def learned_world(
     Raises:
         MissingModel: it does not learn from such observations.
     """
-    world = World(env, gamma=gamma, observation_key=observation_key, device=device)
+    world = World(env, gamma=gamma, observed=observed, device=device)
     space = world.observation_space
+    if (kind := _learned_by(space)) is not type(options):
+        needed = {Counts: "numbers", Ensemble: "vectors of numbers", Latent: "images"}[type(options)]
+        way_out = "make them such by a wrapper" if kind is None else f"take {kind().type!r}"
+        raise MissingModel(
+            f"model is {options.type!r}, which learns from {needed}; observations of {env_name(env)} are {space}: "
+            f"{way_out}"
+        )
     if isinstance(options, Counts):
-        if not isinstance(space, spaces.Discrete):
-            raise MissingModel(
-                f"model is 'counts', which needs numbered states; observations of {env_name(env)} are {space}: take "
-                "'ensemble' if they are vectors, 'latent' if they are images"
-            )
         if action_repeat > 1:
             raise PgtsError(f"action_repeat is {action_repeat}; in a table it must be 1")
-        table = CountsModel(int(space.n), world.num_actions, gamma=gamma, options=options, device=device)
-        return TabularWorld(env, None, model=table, gamma=gamma, observation_key=observation_key, device=device)
+        num_states = num_combinations(space)
+        assert num_states is not None
+        table = CountsModel(num_states, world.num_actions, gamma=gamma, options=options, device=device)
+        return TabularWorld(env, None, model=table, gamma=gamma, observed=observed, numbered=True, device=device)
     given: dict[str, Any] = {
         "gamma": gamma,
         "options": options,
@@ -91,19 +101,22 @@ def learned_world(
         "device": device,
         "action_repeat": action_repeat,
     }
-    axes = len(space.shape) if isinstance(space, spaces.Box) else 0
-    if axes != (needed := 3 if isinstance(options, Latent) else 1):
-        kind = {1: "vectors of numbers", 3: "images (height, width, channels)"}[needed]
-        other = {0: "take 'counts'", 1: "take 'ensemble'", 3: "take 'latent'"}.get(axes, "make them such by a wrapper")
-        raise MissingModel(
-            f"model is {options.type!r}, which learns from {kind}; observations of {env_name(env)} are {space}: {other}"
-        )
     assert isinstance(space, spaces.Box)
     if isinstance(options, Latent):
         model: TensorModel = LatentModel(space, world.num_actions, **given)
     else:
         model = EnsembleModel(space.shape[0], world.num_actions, **given)
-    return VectorWorld(env, model, gamma=gamma, observation_key=observation_key, device=device)
+    return VectorWorld(env, model, gamma=gamma, observed=observed, device=device)
+
+
+def _learned_by(space: Space[Any]) -> type[Counts | Ensemble | Latent] | None:
+    """Which model learns from such observations; None: no model does."""
+    count = num_combinations(space)
+    if isinstance(space, spaces.Discrete) or (count is not None and count <= _MOST_STATES):
+        return Counts
+    if not isinstance(space, spaces.Box):
+        return None
+    return Ensemble if len(space.shape) == 1 else Latent if image_shape(space) is not None else None
 
 
 def own_model(options: OwnModel) -> Model:
@@ -123,15 +136,13 @@ def own_model(options: OwnModel) -> Model:
     return made
 
 
-def world_of(
-    env: VectorEnv, model: Model, *, gamma: float, observation_key: str | None, device: torch.device
-) -> ModelWorld:
+def world_of(env: VectorEnv, model: Model, *, gamma: float, observed: Observed, device: torch.device) -> ModelWorld:
     """Return the environments with a model of the caller's own, whose states are observations.
 
     Raises:
         PgtsError: the model does not fit the environments.
     """
-    world = World(env, gamma=gamma, observation_key=observation_key, device=device)
+    world = World(env, gamma=gamma, observed=observed, device=device)
     space, name = world.observation_space, type(model).__name__
     if model.num_actions != world.num_actions:
         raise PgtsError(f"{name} has {model.num_actions} actions; {env_name(env)} has {world.num_actions}")
@@ -141,14 +152,14 @@ def world_of(
         if model.num_states != space.n:
             raise PgtsError(f"{name} has {model.num_states} states; {env_name(env)} has {space.n}")
         mdp = model.mdp if isinstance(model, TabularModel) else None
-        return TabularWorld(env, mdp, model=model, gamma=gamma, observation_key=observation_key, device=device)
+        return TabularWorld(env, mdp, model=model, gamma=gamma, observed=observed, device=device)
     if isinstance(space, spaces.Box) and isinstance(model, TensorModel):
         if space.shape != (model.state_size,):
             raise PgtsError(
                 f"states of {name} have {model.state_size} numbers; observations of {env_name(env)} have the shape "
                 f"{space.shape}: both must be the same vectors"
             )
-        return VectorWorld(env, model, gamma=gamma, observation_key=observation_key, device=device)
+        return VectorWorld(env, model, gamma=gamma, observed=observed, device=device)
     raise PgtsError(
         f"{name} does not fit {env_name(env)}, whose observations are {space}: numbered observations need a model over "
         "their numbers, vectors a TensorModel over such vectors"

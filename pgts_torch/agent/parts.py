@@ -184,7 +184,7 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
     assert options.rollout.num_envs is not None
     num_envs, given = options.rollout.num_envs, ("gamma", "actions_per_dimension")
     model, device = arguments["model"], torch.device(arguments["device"])
-    shared = {"observation_key": arguments["observation_key"], "device": device}
+    shared = {"observed": options.env, "device": device}
     other = None
     if isinstance(model, Model):
         other = partial(_with_model, model, shared)
@@ -204,7 +204,7 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
             source,
             num_envs=ranks.count(num_envs),
             gamma=arguments["gamma"],
-            observation_key=arguments["observation_key"],
+            observed=options.env,
             plain=isinstance(options.estimator, SampledAdvantages),
             action_repeat=options.search.action_repeat,
             device=device,

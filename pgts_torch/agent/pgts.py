@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from pgts_torch.agent import saved, saving
 from pgts_torch.agent.build import Description, make_device, plain
+from pgts_torch.agent.components import row_shape
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.iteration import Iteration, PolicyBatch
 from pgts_torch.agent.model_check import Mode
@@ -69,7 +70,8 @@ class PGTS:
             continuous actions; None: actions are discrete, or MultiDiscrete, whose combinations are numbered.
         action_repeat, model_check: how often the model repeats each action, and whether it is checked against steps of
             the environment: see there too.
-        observation_key: the entry of dictionary observations that policy and critic use.
+        observation_keys, image_channels: the entries of dictionary observations that are seen (default: all), and where
+            images have their channels ("first", "last"; default: as their shape tells).
         reward_range: the lowest and the highest reward of a single step; a reward outside of it is an error. `stop_at`
             and an adaptive depth need it where the model has no largest reward (simulators).
         gamma: discount. Default: the environment's own (pgts/*), else 0.99. A VectorEnv of pgts/* has its own.
@@ -104,7 +106,8 @@ class PGTS:
         actions_per_dimension: int | None = None,
         action_repeat: int = 1,
         model_check: Mode = "error",
-        observation_key: str | None = None,
+        observation_keys: Sequence[str] | None = None,
+        image_channels: Literal["first", "last"] | None = None,
         reward_range: Sequence[float] | None = None,
         gamma: float | None = None,
         seed: int | None = 0,
@@ -252,7 +255,7 @@ class PGTS:
             generator: for sampling; default: one with this model's seed, which continues from call to call.
         """
         observation_N = self.world.encode(observation)
-        shape = observation_N.shape[: observation_N.ndim - len(self.world.observation_space.shape or ())]
+        shape = observation_N.shape[: observation_N.ndim - len(row_shape(self.world.observation_space))]
         observation_N = self.world.perceive(observation_N.reshape(-1, *observation_N.shape[len(shape) :]))
         if deterministic:
             action_N = self.policy.probs(observation_N).argmax(-1)

@@ -27,6 +27,7 @@ from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import each_of
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.tensor import TensorModel
+from pgts_torch.options.environment import Observed
 from pgts_torch.tabular.mdp import TabularMDP
 
 
@@ -50,7 +51,8 @@ class World:
     Args:
         env: the environments, with discrete actions.
         gamma: discount of a step that names none.
-        observation_key: the entry of dictionary observations that is used.
+        observed: what is seen of observations.
+        numbered: whether the combinations of several numbers are numbered, so that observations are Discrete.
         device: where observations and states are.
     """
 
@@ -67,12 +69,13 @@ class World:
         env: VectorEnv,
         *,
         gamma: float,
-        observation_key: str | None = None,
+        observed: Observed = Observed(),  # noqa: B008 - frozen
+        numbered: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
         self.env, self.gamma, self.device = env, gamma, torch.device(device)
         self.num_actions = int(env.single_action_space.n)  # type: ignore[attr-defined]  # checked before
-        self.observations = Observations(env, observation_key, self.device)
+        self.observations = Observations(env, observed, self.device, numbered=numbered)
         self.observation_space = self.perceived_space = self.observations.space
         self.perceive = _as_it_is
 
@@ -83,7 +86,8 @@ class World:
 
     def of(self, env: VectorEnv) -> "World":
         """A world without a model for other environments of the same kind; warnings are not repeated in it."""
-        world = World(env, gamma=self.gamma, observation_key=self.observations.key, device=self.device)
+        seen = self.observations
+        world = World(env, gamma=self.gamma, observed=seen.options, numbered=seen.numbered, device=self.device)
         world.warned, world.perceive, world.perceived_space = True, self.perceive, self.perceived_space
         return world
 
@@ -165,7 +169,7 @@ class TabularWorld(ModelWorld):
         gamma: discount; default: that of the table.
         starts_known: whether the start distribution of the table is that of the environment; False: it was
             estimated from resets.
-        env, observation_key, device: as in `World`.
+        env, observed, numbered, device: as in `World`.
     """
 
     keeps_numbers = True
@@ -218,7 +222,7 @@ class SimulatedWorld(ModelWorld):
 
     Args:
         model: a simulator of the same environment.
-        env, observation_key, device: as in `World`.
+        env, observed, numbered, device: as in `World`.
     """
 
     def __init__(self, env: SyncVectorEnv, model: SimulatorModel, **options: Any) -> None:
@@ -234,8 +238,12 @@ class SimulatedWorld(ModelWorld):
         return read_N
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
-        """The observations that the simulator made in these states."""
-        return self.observations.encode_part(self.model.observations(state_N))
+        """The observations that the simulator made in these states: of which it keeps rows, where these are something
+        else than what the environment gives."""
+        kept_N = self.model.observations(state_N)
+        return (
+            self.observations.encode(kept_N) if self.observations.as_given else torch.from_numpy(kept_N).to(self.device)
+        )
 
     def export(self, state_N: Int[Tensor, "N"]) -> list[Any]:
         """The snapshot and observation of each state; those of equal states are one object, which is pickled once."""
@@ -275,11 +283,11 @@ class DynamicsWorld(VectorStates):
     """Environments whose dynamics, `model`, are written in torch.
 
     Args:
-        observation_key: the entry of dictionary observations that is used, where a wrapper makes dictionaries.
+        observed: what is seen of observations, where a wrapper makes something else of them.
     """
 
-    def __init__(self, env: SyncVectorEnv, model: DynamicsModel, *, observation_key: str | None = None) -> None:
-        super().__init__(env, gamma=model.gamma, observation_key=observation_key, device=model.device)
+    def __init__(self, env: SyncVectorEnv, model: DynamicsModel, *, observed: Observed = Observed()) -> None:  # noqa: B008
+        super().__init__(env, gamma=model.gamma, observed=observed, device=model.device)
         self.model: DynamicsModel = model
         self._envs = env.envs
 
@@ -291,5 +299,5 @@ class DynamicsWorld(VectorStates):
         inner_NO = self.model.observe(self.model.states(state_N))
         if not self.model.transforms.observations:
             return inner_NO
-        rows = [self.observations.part(self.model.transforms.observation(row)) for row in inner_NO.cpu().numpy()]
-        return self.observations.encode_part(np.array(rows, self.observations.space.dtype))
+        rows = [self.observations.rows(self.model.transforms.observation(row)) for row in inner_NO.cpu().numpy()]
+        return torch.from_numpy(np.array(rows)).to(self.device)

@@ -17,6 +17,8 @@ LARGEST_REWARD = float(np.finfo(np.float64).max) ** (1 / 3)
 """The largest size of a reward that is learned from: means of squares of returns stay numbers."""
 
 
+_NUMBERS = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+
 _SHORT = 32
 """Up to so many numbers of an observation are added one by one, to see whether all are finite."""
 
@@ -142,7 +144,7 @@ def check_observation(space: spaces.Space, value: Any) -> None:
             raise PgtsError(f"the observation is no tuple of {len(space)} parts")
         for part, content in zip(space, value, strict=True):
             check_observation(part, content)
-    elif isinstance(space, spaces.Discrete) and not space.contains(value):
+    elif isinstance(space, _NUMBERS) and not space.contains(value):
         raise PgtsError(f"the observation is {value!r}, which is not in {space}")
 
 

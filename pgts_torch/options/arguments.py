@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from pgts_torch.errors import PgtsError
+from pgts_torch.options.environment import Observed
 from pgts_torch.options.mistakes import explain
 from pgts_torch.options.part import Part
 from pgts_torch.options.rollouts import Rollouts
@@ -14,7 +15,7 @@ from pgts_torch.options.search import LookaheadOptions
 from pgts_torch.options.training import Training
 
 _FLAT = {
-    "env": ("observation_key",),
+    "env": tuple(Observed.model_fields),
     "rollout": tuple(Rollouts.model_fields),
     "search": tuple(LookaheadOptions.model_fields),
 }

@@ -41,6 +41,9 @@ def _text(pattern: str, requirement: str, max_length: int) -> Any:
 Name = Annotated[str, _text(r"^[A-Za-z0-9][A-Za-z0-9._-]*$", "letters, digits, '.', '_', '-', at most 100", 100)]
 EnvId = Annotated[str, _text(r"^[A-Za-z0-9_.:/-]+$", "the id of a Gymnasium environment", 200)]
 Key = Annotated[str, _text(r"^[A-Za-z0-9_.:-]+$", "a key of dictionary observations", 100)]
+Keys = Annotated[
+    list[Key], Field(min_length=1, json_schema_extra={"requirement": "a list of keys"}), BeforeValidator(_as_list)
+]
 Entry = Annotated[str, _text(r"^[A-Za-z_][A-Za-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*$", "MODULE:NAME", 200)]
 Folder = Annotated[str, _text(r"^[^\x00-\x1f\x7f]+$", "a folder", 4000)]
 Device = Annotated[str, _text(r"^(cpu|cuda(:[0-9]{1,3})?)$", "cpu, cuda or cuda:N", 8)]

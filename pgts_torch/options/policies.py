@@ -36,7 +36,7 @@ Init = Uniform | Random | Biased
 
 
 class AutoPolicy(Part):
-    """By the environment: softmax where observations are numbered states, cnn for images, else mlp."""
+    """By the environment: softmax where observations are numbered states, cnn where there are images, else mlp."""
 
     type: Literal["auto"] = "auto"
 
@@ -71,7 +71,7 @@ class Simplex(TabularPolicy):
 
 
 class MLP(Part):
-    """Fully connected layers over numbered states or vectors."""
+    """Fully connected layers over observations of any kind, as one vector."""
 
     type: Literal["mlp"] = "mlp"
 
@@ -82,11 +82,11 @@ class MLP(Part):
     """The activation function after each hidden layer."""
 
     normalize: bool = False
-    """Subtract the running mean of the observations and divide by their running deviation; not for numbered states."""
+    """Subtract the running mean of vectors and divide by their running deviation; only where there are some."""
 
 
 class CNN(Part):
-    """Convolutions over images (height, width, channels), then fully connected layers."""
+    """Convolutions over images, then fully connected layers over what they return and all else that is seen."""
 
     type: Literal["cnn"] = "cnn"
 
@@ -106,10 +106,10 @@ class CNN(Part):
     """The activation function after each layer."""
 
     normalize: bool = False
-    """Subtract the running mean of each channel and divide by its running deviation."""
+    """Subtract the running mean of each channel, or entry of a vector, and divide by its running deviation."""
 
     scale: Positive | None = None
-    """By which observations are divided; null: 255 for bytes, else 1. MiniGrid's codes are at most 10."""
+    """By which images are divided; null: the largest value that they declare. MiniGrid's codes are at most 10."""
 
 
 Table = Softmax | Simplex

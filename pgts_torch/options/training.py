@@ -1,12 +1,13 @@
 """All options of a training, and the rules between them."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues, TabularValues
-from pgts_torch.options.fields import Ascending, EnvId, Key, Kwargs, UnitInterval, conflict
+from pgts_torch.options.environment import Env
+from pgts_torch.options.fields import conflict
 from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Latent, Model, OwnModel
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, NETWORKS, TABLES, AutoPolicy, Biased, Network, Simplex, Softmax, Table
@@ -23,30 +24,6 @@ from pgts_torch.options.rollouts import (
 )
 from pgts_torch.options.search import AutoSection, ExpectimaxSection, SearchSection
 from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient, Update
-
-
-class Env(Part):
-    """The environment."""
-
-    id: EnvId = "pgts/Ladder-v0"
-    """Gymnasium environment."""
-
-    gamma: UnitInterval | None = None
-    """Discount factor; null: the environment's own, else 0.99."""
-
-    kwargs: Kwargs = Field(default={})
-    """Arguments for gymnasium.make, for instance --env.kwargs.n 7."""
-
-    actions_per_dimension: Annotated[int, Field(ge=2, le=10_000)] | None = None
-    """The number of evenly spaced values of each dimension of continuous actions; null: actions are discrete."""
-
-    observation_key: Key | None = None
-    """The entry of dictionary observations that policy and critic use, for instance image; null: observations are no
-    dictionaries."""
-
-    reward_range: Ascending | None = None
-    """The lowest and the highest reward of a single step, for instance [0, 1]; a reward outside of it is an error.
-    search.stop_at and search.depth adaptive need it where the model has no largest reward; null: the model's own."""
 
 
 class Training(Part):
@@ -90,28 +67,17 @@ class Training(Part):
             rollout = rollout.model_copy(update={"horizon": horizon})
         return self.model_copy(update={"replay": replay, "rollout": rollout.filled(rollout.horizon.type)})
 
-    @field_validator("policy")
-    @classmethod
-    def _sees_observations(cls, policy: Any, info: ValidationInfo) -> Any:
-        key = _observation_key(info)
-        if key is not None and isinstance(policy, Table):
-            raise conflict(
-                f"env.observation_key is {key}, a part of dictionary observations; policy.type {policy.type} is a "
-                "table of numbered states, it must be mlp or cnn"
-            )
-        return policy
-
     @field_validator("critic")
     @classmethod
     def _sees_what_the_policy_sees(cls, critic: Any, info: ValidationInfo) -> Any:
-        policy, observation_key = info.data.get("policy"), _observation_key(info)
+        policy = info.data.get("policy")
         if policy is None or isinstance(critic, AutoCritic):
             return critic
         if not isinstance(critic, NetworkValues):
-            cause = "policy.type cnn" if policy.type == "cnn" else f"env.observation_key {observation_key}"
-            if policy.type == "cnn" or observation_key is not None:
+            if policy.type == "cnn":
                 raise conflict(
-                    f"critic.type is {critic.type}, which needs numbered states; with {cause} it must be network"
+                    f"critic.type is {critic.type}, which needs numbered states; with policy.type cnn it must be "
+                    "network"
                 )
             return critic
         network = critic.network.type
@@ -119,10 +85,10 @@ class Training(Part):
             raise conflict(
                 f"critic.network.type is shared; policy.type {policy.type} is a table, which has no network to share"
             )
-        if {network, policy.type} in ({"cnn", kind} for kind in ("mlp", "softmax", "simplex")):
+        if network == "cnn" and isinstance(policy, Table):
             raise conflict(
-                f"critic.network.type is {network} and policy.type is {policy.type}; a cnn takes images, the others do "
-                "not"
+                f"critic.network.type is cnn, which takes images; policy.type is {policy.type}, a table of numbered "
+                "states"
             )
         return critic
 
@@ -259,11 +225,6 @@ MOVES: dict[type[Part], tuple[type[Table | Network], ...]] = {
     CMPO: (MLP, CNN),
 }
 """The policies that each update can move."""
-
-
-def _observation_key(info: ValidationInfo) -> str | None:
-    """Return env.observation_key; None where `env` itself was refused."""
-    return info.data["env"].observation_key if "env" in info.data else None
 
 
 def _check_mirror(update: Mirror, policy: Any) -> None:

@@ -15,8 +15,9 @@ from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.environments import EnvSource
+from pgts_torch.options.environment import Observed
 
-KEYWORDS: dict[str, Any] = {"num_envs": 2, "gamma": 0.9, "observation_key": None, "plain": False, "device": "cpu"}
+KEYWORDS: dict[str, Any] = {"num_envs": 2, "gamma": 0.9, "observed": Observed(), "plain": False, "device": "cpu"}
 N = 6
 
 

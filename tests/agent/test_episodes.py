@@ -13,6 +13,7 @@ from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.rollout import Horizon, Rollout, rollout
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.options import FixedHorizon, GeometricHorizon
+from pgts_torch.options.environment import Observed
 from pgts_torch.seeding import stream
 
 
@@ -44,7 +45,7 @@ def envs_of(kind: type[SyncVectorEnv] = SyncVectorEnv) -> SyncVectorEnv:
 
 
 def made(env: VectorEnv, horizon: Horizon = FixedHorizon(length=100)) -> Rollout:  # noqa: B008 - frozen
-    world = make_world(EnvSource.of(env), num_envs=6, gamma=0.9, observation_key=None, plain=True, device="cpu")
+    world = make_world(EnvSource.of(env), num_envs=6, gamma=0.9, observed=Observed(), plain=True, device="cpu")
     policy = NetworkPolicy(world.observation_space, 2, seed=1)
     return rollout(world, policy, horizon, seed=0, names=("test",), generator=stream(0, "test"))
 

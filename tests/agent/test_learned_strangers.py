@@ -154,7 +154,7 @@ def test_imagined_episodes_need_all_actions():
 
 def test_a_run_that_could_not_be_saved_does_not_begin(tmp_path):
     pytest.importorskip("minigrid")
-    arguments = ["--env.id", "MiniGrid-Empty-5x5-v0", "--env.observation_key", "image", "--replay.type", "uniform"]
+    arguments = ["--env.id", "MiniGrid-Empty-5x5-v0", "--env.observation_keys", "[image]", "--replay.type", "uniform"]
     config = load(None, [*arguments, "--run.dir", str(tmp_path / "run")])
     with pytest.raises(PgtsError, match="cannot be saved"):
         train(config)
@@ -198,9 +198,9 @@ def test_states_may_be_counted_from_any_number():
     assert training.predict(3) == 1
     with pytest.raises(PgtsError, match="state 8 does not exist; states are 3 to 7"):
         training.predict(8)
-    with pytest.raises(PgtsError, match=r"observation_key is cell.* must be mlp"):
-        PGTS(lambda: Corridor("cell"), model="counts", observation_key="cell")
-    PGTS(lambda: Corridor("cell"), **ONGOING, model="counts", policy="mlp", observation_key="cell").learn(100)
+    inside = PGTS(lambda: Corridor("cell"), depth=4, model="counts", replay=REPLAY, horizon=StepsHorizon(length=30))
+    assert torch.equal(inside.learn(600).policy_table(), training.policy_table())
+    PGTS(lambda: Corridor("cell"), **ONGOING, model="counts", policy="mlp", observation_keys=["cell"]).learn(100)
 
 
 def test_a_model_that_would_never_learn_is_refused():

@@ -128,7 +128,7 @@ def test_a_cnn_learns_to_walk_to_the_goal_that_it_sees():
     model = PGTS(
         "MiniGrid-Empty-5x5-v0",
         depth=2,
-        observation_key="image",
+        observation_keys=["image"],
         policy=network,
         critic={"type": "network", "network": network, "learning_rate": 3e-3},
         update={"type": "mirror", "temperature": 0.01, "learning_rate": 3e-3},

@@ -8,7 +8,8 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch.agent import networks
-from pgts_torch.agent.networks import Encoder, Network, RunningNorm, default_network, make_trunk
+from pgts_torch.agent.encoders import Encoder, RunningNorm
+from pgts_torch.agent.networks import Network, default_network, make_trunk
 from pgts_torch.errors import PgtsError
 from pgts_torch.options import CNN, MLP
 from pgts_torch.seeding import stream
@@ -138,7 +139,7 @@ def test_observations_that_are_not_finite_spoil_no_statistics(value):
 
 
 def test_each_channel_of_an_image_has_statistics_of_its_own():
-    encoder = Encoder(VIEWS, normalize=True)
+    encoder = Encoder(VIEWS, CNN(normalize=True))
     image_N = views(20) // torch.tensor([1, 2, 50], dtype=torch.uint8)
     encoder.absorb(image_N)
     input_N = encoder(image_N)
@@ -153,7 +154,9 @@ def test_computing_outputs_changes_no_statistics():
     net.outputs(x_ND)
     assert all(torch.equal(value, before[name]) for name, value in net.plain_state().items())
     net.trunk.encoder.absorb(x_ND)
-    assert not torch.equal(net.plain_state()["trunk.encoder.norm.mean_D"], before["trunk.encoder.norm.mean_D"])
+    assert not torch.equal(
+        net.plain_state()["trunk.encoder.parts.0.norm.mean_D"], before["trunk.encoder.parts.0.norm.mean_D"]
+    )
 
 
 def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_changes_nothing():
@@ -166,7 +169,7 @@ def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_cha
         state | {"head.bias": torch.zeros(3)},
         state | {"head.bias": state["head.bias"].double()},
         state | {"more": torch.zeros(1)},
-        {name: value for name, value in state.items() if name != "trunk.encoder.norm.count"},
+        {name: value for name, value in state.items() if name != "trunk.encoder.parts.0.norm.count"},
     ]:
         with pytest.raises(
             PgtsError, match=r"is None|head.bias is torch.float(32 of shape \(3,\)|64)|more belongs to another network"
@@ -185,12 +188,10 @@ def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_cha
         (lambda: MLP(activation="gelu"), "activation is 'gelu'"),
         (lambda: CNN(channels=[16, 2.5]), "channels holds 2.5"),
         (lambda: CNN(scale=0), "scale is 0"),
-        (lambda: network(MLP(), VIEWS), "use a cnn"),
         (lambda: network(CNN(), VECTORS), "use an mlp"),
         (lambda: network(CNN(kernel_size=5), VIEWS), "too small"),
-        (lambda: network(MLP(normalize=True), STATES), "states are numbers without a scale"),
-        (lambda: network(MLP(), spaces.MultiDiscrete([2, 3])), "observations are MultiDiscrete"),
-        (lambda: network(MLP(), spaces.Discrete(3, start=1)), "observations are Discrete"),
+        (lambda: network(MLP(normalize=True), STATES), "without a scale: it must be False"),
+        (lambda: network(MLP(), spaces.Text(3)), "observations are Text"),
         (lambda: network(MLP(), VECTORS).outputs(torch.zeros(2, 4)), r"shape \(4,\); it must be \(3,\)"),
     ],
 )

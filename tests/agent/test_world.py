@@ -19,12 +19,15 @@ from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, Ta
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel, with_torques
 from pgts_torch.options import MLP, FixedHorizon
+from pgts_torch.options.environment import Observed
 from pgts_torch.seeding import sample_keys, seed_sequence, stream
 from tests.agent import cells
 from tests.agent.helpers import same_bits
 from tests.support import same_values
 
-KEYWORDS = {"num_envs": 3, "gamma": None, "observation_key": None, "plain": False, "device": "cpu"}
+KEYWORDS = {"num_envs": 3, "gamma": None, "observed": Observed(), "plain": False, "device": "cpu"}
+
+SEES_X = Observed(observation_keys=["x"])
 
 DYNAMICS = ["CartPole-v1", "Acrobot-v1", "MountainCar-v0", "Pendulum-v1"]
 
@@ -85,7 +88,7 @@ WORLDS = {
     "tabular": lambda: world_of("pgts/Ladder-v0"),
     "tabular, from P": lambda: world_of("FrozenLake-v1"),
     "simulated": lambda: world_of(vector_of(Cart)),
-    "simulated, by parts": lambda: world_of(vector_of(Parts), observation_key="map"),
+    "simulated, by parts": lambda: world_of(vector_of(Parts), observed=Observed(observation_keys=["map"])),
     **{name: lambda name=name: world_of(name) for name in DYNAMICS},
 }
 
@@ -195,11 +198,10 @@ def test_actions_are_those_of_the_environments_also_in_a_simulator():
     [
         (lambda: world_of("FrozenLake-v1", action_repeat=2), "action_repeat is 2; in a table it must be 1"),
         (lambda: world_of("CartPole-v1", plain=True, action_repeat=2), "action_repeat is 2; without a model it must"),
-        (lambda: world_of("CartPole-v1", observation_key="x"), "they have no part 'x'"),
-        (lambda: world_of("CartPole-v1", plain=True, observation_key="x"), "they have no part 'x'"),
-        (lambda: world_of(vector_of(Parts)), "the observations of Parts are dictionaries of .*: set observation_key"),
-        (lambda: world_of(vector_of(Parts), observation_key="x"), "no part 'x'; they have"),
-        (lambda: world_of("pgts/Ladder-v0", observation_key="x"), "they have no part 'x'"),
+        (lambda: world_of("CartPole-v1", observed=SEES_X), "no part 'x'; they are Box"),
+        (lambda: world_of("CartPole-v1", plain=True, observed=SEES_X), "no part 'x'; they are Box"),
+        (lambda: world_of(vector_of(Parts), observed=SEES_X), "no part 'x'; they have map, place"),
+        (lambda: world_of("pgts/Ladder-v0", observed=SEES_X), "no part 'x'; they are Discrete"),
         (lambda: world_of(SyncVectorEnv([Cart])), "the environment resets by"),
         (lambda: world_of("CartPole-v1", num_envs=0), "num_envs is 0"),
     ],
@@ -418,7 +420,7 @@ def test_images_of_a_minigrid_are_learned_from_with_a_lookahead():
         "MiniGrid-Empty-5x5-v0",
         depth=1,
         policy={"type": "cnn", "scale": 10.0},
-        observation_key="image",
+        observation_keys=["image"],
         num_envs=2,
         horizon={"type": "fixed", "length": 4},
     )

@@ -175,6 +175,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a number in [0, 1] or null": st.none() | st.floats(0, 1),
     "a number in (0, 1] or mean": st.just("mean") | st.floats(0, 1, exclude_min=True),
     "true or false": st.booleans(),
+    "a list of keys or null": st.sampled_from([None, ["image"], ["image", "at:1"]]),
     "a folder or null": st.none() | st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"]), min_size=1),
     "the id of a Gymnasium environment": st.from_regex(r"[A-Za-z0-9_.:/-]{1,20}", fullmatch=True),
     "letters, digits, '.', '_', '-', at most 100": st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", fullmatch=True),
@@ -231,8 +232,6 @@ def configurations(draw: st.DrawFn) -> Config:
         if option.exists(types):
             words = st.sampled_from(_words(option))
             given[option.key] = types.get(option.key) or draw(SAMPLES.get(option.requirement, words))
-    if is_table or types["critic.type"] != "network":
-        given["env.observation_key"] = None
     if types["update.type"] == "mirror":
         used = {"type", *Mirror.standing("tables" if is_table else "networks")}
         ignored = [key for key in given if key.startswith("update.") and key.removeprefix("update.") not in used]

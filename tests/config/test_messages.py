@@ -159,25 +159,16 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
             "a policy with policy.init.probability 1 would never move",
         ),
         (
-            "{env: {observation_key: image}, policy: {type: softmax}}",
-            "env.observation_key is image, a part of dictionary observations; "
-            "policy.type softmax is a table of numbered states, it must be mlp or cnn",
-        ),
-        (
             "{policy: {type: cnn}, critic: {type: tabular}}",
             "critic.type is tabular, which needs numbered states; with policy.type cnn it must be network",
-        ),
-        (
-            "{env: {observation_key: image}, policy: {type: mlp}, critic: {type: exact}}",
-            "critic.type is exact, which needs numbered states; with env.observation_key image it must be network",
         ),
         (
             "{policy: {type: softmax}, critic: {type: network, network: {type: shared}}}",
             "critic.network.type is shared; policy.type softmax is a table, which has no network to share",
         ),
         (
-            "{policy: {type: cnn}, critic: {network: {type: mlp}}}",
-            "critic.network.type is mlp and policy.type is cnn; a cnn takes images, the others do not",
+            "{policy: {type: softmax}, critic: {type: network, network: {type: cnn}}}",
+            "critic.network.type is cnn, which takes images; policy.type is softmax, a table of numbered states",
         ),
         (
             "{policy: {type: mlp}, estimator: {type: sampled}}",

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 NETWORK = [*QUIET, "--rollout.num_envs", "2", "--rollout.horizon.length", "10", "--search.depth", "1"]
 SMALL_MLP = ["--policy.type", "mlp", "--policy.hidden", "[8]", "--total_steps", "80", "--env.id", "CartPole-v1"]
 SMALL_CNN = "{type: cnn, scale: 10, channels: [4], hidden: [8]}"
-MINIGRID = ["--env.id", "MiniGrid-Empty-5x5-v0", "--env.observation_key", "image", "--policy", SMALL_CNN]
+MINIGRID = ["--env.id", "MiniGrid-Empty-5x5-v0", "--env.observation_keys", "[image]", "--policy", SMALL_CNN]
 KINDS: dict[str, list[str]] = {
     "certified": [*QUIET, "--search.depth", "2", "--search.stop_at", "5.9", "--critic", "{type: exact}"],
     "tree": [*QUIET, "--search.kind", "mcts", "--search.simulations", "4"],

@@ -15,6 +15,7 @@ from gymnasium import spaces, wrappers
 from pgts_torch.agent.world import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import MissingModel
 from pgts_torch.models import SimulatorModel
+from pgts_torch.options.environment import Observed
 from tests.agent.cells import FIRST, Cells, Walk, agrees, reached, refusal_of, row_of_cells, world_of
 
 
@@ -256,5 +257,5 @@ def test_images_and_dictionaries_are_seen_through_wrappers():
     assert agrees(world, [2, 1, 2])
     # What this one shows depends on more of the environment than on the observation inside.
     assert "is wrapped in FullyObsWrapper" in refusal_of(
-        lambda: FullyObsWrapper(gymnasium.make("MiniGrid-Empty-5x5-v0")), observation_key="image"
+        lambda: FullyObsWrapper(gymnasium.make("MiniGrid-Empty-5x5-v0")), observed=Observed(observation_keys=["image"])
     )
