@@ -1,0 +1,127 @@
+"""Which observations and environments work, and how: docs/environments.md, from what the tests do.
+
+`python -m tests.environments` writes the page. `python -m tests.environments ID...` first trains in these environments,
+where their packages are installed (with others than a training here needs, in an environment of their own), and
+records what came of it.
+"""
+
+import json
+import re
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+from tests.agent.kinds import KINDS
+
+ROOT = Path(__file__).parents[1]
+DOCUMENT = ROOT / "docs" / "environments.md"
+RESULTS = ROOT / "tests" / "environment_results.json"
+
+TRIED: dict[str, tuple[str, dict[str, Any]]] = {
+    "FrozenLake-v1": ("gymnasium", {}),
+    "Taxi-v4": ("gymnasium", {}),
+    "Blackjack-v1": ("gymnasium", {"depth": 1}),
+    "Blackjack-v1, counted": ("gymnasium", {"model": "counts"}),
+    "MiniGrid-Empty-5x5-v0": ("minigrid", {"depth": 1, "observation_keys": ["image", "direction"]}),
+    "highway_env:highway-v0": ("highway-env", {"depth": 1}),
+    "gym_simplegrid:SimpleGrid-4x4-v0": ("gym-simplegrid", {"depth": 1}),
+    "gymnasium_2048:gymnasium_2048/TwentyFortyEight-v0": ("gymnasium-2048", {"depth": 1}),
+    "tetris_gymnasium.envs:tetris_gymnasium/Tetris": ("tetris-gymnasium", {"depth": 1}),
+}
+"""By id: the package, and the arguments of `PGTS`."""
+
+
+def tried(name: str) -> dict[str, Any]:
+    """Train for one short iteration, with the lookahead, or without where there is no model for it."""
+    from pgts_torch import PGTS
+    from pgts_torch.errors import MissingModel
+
+    arguments: dict[str, Any] = {"num_envs": 1, "seed": 0} | TRIED[name][1]
+    if "model" not in arguments:
+        arguments["horizon"] = {"type": "fixed", "length": 3}
+    env = name.partition(",")[0]
+    with warnings.catch_warnings(record=True):
+        warnings.simplefilter("always")
+        why = ""
+        try:
+            training = PGTS(env, **arguments)
+        except MissingModel as missing:
+            why = str(missing).partition(";")[0]
+            arguments |= {"depth": 0, "estimator": "sampled"}
+            training = PGTS(env, **arguments)
+        training.iterate()
+    model = "none" if training.world.model is None else type(training.world.model).__name__
+    return {
+        "observations": _shown(training.world.env.single_observation_space),
+        "policy": training.options.policy.type,
+        "model": model,
+        "why": why,
+    }
+
+
+def _shown(space: Any) -> str:
+    """A space in one line, without addresses."""
+    return " ".join(re.sub(r"<function [^>]*>", "...", str(space)).split())
+
+
+def results() -> dict[str, dict[str, Any]]:
+    """What was recorded, by id."""
+    found: dict[str, dict[str, Any]] = json.loads(RESULTS.read_text(encoding="utf-8"))
+    return found
+
+
+def record(names: list[str]) -> None:
+    """Try these, and keep what came of it."""
+    RESULTS.write_text(
+        json.dumps(results() | {name: tried(name) for name in names}, indent=2, sort_keys=True) + "\n", encoding="utf-8"
+    )
+
+
+def document() -> str:
+    """The text of docs/environments.md."""
+    lines = [
+        "# What can be observed",
+        "",
+        "Each kind of observation below is trained on without a lookahead, saved, loaded, evaluated and resumed by",
+        "[tests/agent/test_spaces.py](../tests/agent/test_spaces.py); all but other shapes and dtypes of the same also",
+        "with a lookahead and a learned model. Kinds may be nested in dictionaries and tuples in any way; dictionaries",
+        "are seen whole, or by `observation_keys`. Text, graphs and sequences are refused.",
+        "`python -m tests.environments` writes this page from these cases; a test compares it with them.",
+        "",
+        "| observation | space | network by default | others | model that is learned |",
+        "|---|---|---|---|---|",
+    ]
+    for kind, (space, _, policies, learned) in KINDS.items():
+        shown = _shown(space)
+        others = ", ".join([*policies[1:], *(["a table, with counts"] if learned == "counts" else [])])
+        lines.append(f"| {kind} | `{shown}` | {policies[0]} | {others} | {learned or 'none'} |")
+    lines += [
+        "",
+        "## Environments that were tried",
+        "",
+        "`python -m tests.environments ID` trains for one short iteration, no more, and records what came of it. The",
+        "model is that of the lookahead; where there is none the training was one without, and the reason is given.",
+        "",
+        "| environment | package | observations | policy | model |",
+        "|---|---|---|---|---|",
+    ]
+    known = results()
+    for name, (package, arguments) in TRIED.items():
+        if (result := known.get(name)) is None:
+            continue
+        call = ", ".join([f'"{name.partition(",")[0]}"', *(f"{key}={value!r}" for key, value in arguments.items())])
+        shown, why = result["observations"].replace("|", "\\|"), f": {result['why']}" if result["why"] else ""
+        lines.append(f"| `PGTS({call})` | {package} | `{shown}` | {result['policy']} | {result['model']}{why} |")
+    return "\n".join(lines) + "\n"
+
+
+def write() -> None:
+    """Write the page."""
+    DOCUMENT.write_text(document(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:]:
+        record(sys.argv[1:])
+    write()
