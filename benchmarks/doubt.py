@@ -23,6 +23,7 @@ from torch import Tensor
 
 from pgts_torch import PGTS
 from pgts_torch.agent.advantages import gae
+from pgts_torch.agent.draws import Draws
 from pgts_torch.bellman import backup
 from pgts_torch.models.base import EnumeratingModel, FallibleModel
 from pgts_torch.models.tensor import TensorModel
@@ -64,7 +65,7 @@ def leaving(model: Any, v: Leaf, state_N: Tensor, levels: int, most: float) -> T
 def critic_error(training: PGTS) -> float:
     """The root mean square of return - v in imagined episodes."""
     assert training.dyna is not None
-    draws = training.ranks.draws(training.seed, training.num_iterations, training.device)
+    draws = Draws.of(training.ranks, training.seed, training.num_iterations, training.device)
     imagined, _ = next(training.dyna.rollouts(draws))
     returns_TB = gae(imagined, *training.critic.values(imagined), 1.0)
     return float(returns_TB[imagined.alive_TB].square().mean().sqrt())

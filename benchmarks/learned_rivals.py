@@ -64,7 +64,7 @@ class _Planner:
         """The optimal action of each state in what has been seen so far."""
         if self.steps:
             columns = [torch.from_numpy(np.array(column)) for column in zip(*self.steps, strict=True)]
-            self.model.learn(Experience(*columns), generator=self._generator)
+            self.model.learn(Experience(*columns), generator=self._generator)  # type: ignore[arg-type]
             self.steps.clear()
         outcomes = self.model.outcomes(torch.arange(self.model.num_states))
         while True:

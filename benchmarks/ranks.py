@@ -3,9 +3,10 @@
     python benchmarks/ranks.py [--json FILE] [--quick]
 
 The first iterations of shipped configurations, with episodes of at most 50 steps, by one process and by two under
-torchrun, in turns, with one thread each: milliseconds of an iteration (the median over iterations, then over repeats),
-the share of it that is the critic's fit and the update, which all processes make, and model calls, of which two
-processes need more where their searches meet.
+torchrun, in turns, with one thread each, but for the first iteration, in which code is compiled. Speed is the time of
+one process divided by that of two, by the clock on the wall and in CPU time of the slower one: the latter is what
+a machine would show on which nothing else runs and no process waits for another. Beside it stand the exchanges of an
+iteration and the kilobytes that a process puts into them.
 
 It needs two cores.
 """
@@ -22,38 +23,40 @@ from typing import Any
 import common
 import torch
 
-from pgts_torch import PGTS
-from pgts_torch.agent.ranks import joined_ranks
 from pgts_torch.config import load
 from pgts_torch.experiment.run import build
+from pgts_torch.ranks import joined_ranks
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
-NAMES = ("taxi", "cartpole", "acrobot", "mountain_car", "door_key")
+SHORT = ["--rollout.horizon.length", "50"]
+NAMES = {
+    "taxi": SHORT,
+    "cartpole": SHORT,
+    "acrobot": SHORT,
+    "mountain_car": SHORT,
+    "door_key": SHORT,
+    "learned/cartpole": ["--rollout.num_envs", "2", "--rollout.horizon", "{type: steps, length: 50, first: 250}"],
+}
 WORLD_SIZES = (1, 2)
 ITERATIONS, REPEATS = 5, 3
-SHORT = ["--rollout.horizon.length", "50"]
 
 
 def iterations(name: str, count: int) -> dict[str, float]:
-    """A training of some iterations, seen by the first process."""
+    """A training of some iterations: medians over them, of all processes together."""
     torch.set_num_threads(1)
-    clock = time.perf_counter
-    with joined_ranks("cpu"):
-        model = build(load(str(CONFIGS / f"{name}.yaml"), SHORT))
-        critic, update = type(model.critic), type(model.update)
-        with (
-            common.timed(PGTS, "iterate", clock) as whole,
-            common.timed(critic, "fit", clock) as fits,
-            common.timed(update, "__call__", clock) as updates,
-        ):
-            for _ in range(count):
-                model.iterate()
-        shares = [(fit + move) / all_of_it for fit, move, all_of_it in zip(fits, updates, whole, strict=True)]
-        return {
-            "milliseconds": 1e3 * statistics.median(whole),
-            "learning": statistics.median(shares),
-            "model_calls": model.num_model_calls / model.num_env_steps,
-        }
+    with joined_ranks("cpu") as ranks:
+        model = build(load(str(CONFIGS / f"{name}.yaml"), NAMES[name]))
+        rows, exchange = [], ranks.exchange
+        for _ in range(count + 1):
+            before = (0, 0) if exchange is None else (exchange.num_calls, exchange.num_bytes)
+            wall, cpu = time.perf_counter(), time.process_time()
+            model.iterate()
+            wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+            after = (0, 0) if exchange is None else (exchange.num_calls, exchange.num_bytes)
+            slower = float(ranks.each("CPU time", cpu).max())
+            rows.append((1e3 * wall, 1e3 * slower, after[0] - before[0], (after[1] - before[1]) / 1e3))
+        columns = [statistics.median(column) for column in zip(*rows[1:], strict=True)]
+        return dict(zip(("wall_ms", "cpu_ms", "exchanges", "kilobytes"), columns, strict=True))
 
 
 def launched(name: str, world_size: int, count: int) -> dict[str, float]:
@@ -83,16 +86,19 @@ def main() -> None:
     args = common.parser(__doc__).parse_args()
     count, repeats = (1, 1) if args.quick else (ITERATIONS, REPEATS)
     rows: dict[str, Any] = {}
-    print("| configuration | 1 process, ms | 2 processes, ms | ratio | learning, of 1 | model calls a step, 1 | 2 |")
-    print("|---|---|---|---|---|---|---|")
+    print("| configuration | CPU, 1, ms | CPU, 2 | speed | wall, 1, ms | wall, 2 | speed | exchanges | kB |")
+    print("|---|---|---|---|---|---|---|---|---|")
     for name in NAMES:
         turns = [[launched(name, size, count) for size in WORLD_SIZES] for _ in range(repeats)]
         one, two = ({key: statistics.median(turn[i][key] for turn in turns) for key in turns[0][0]} for i in (0, 1))
-        ratio = statistics.median(turn[0]["milliseconds"] / turn[1]["milliseconds"] for turn in turns)
-        rows[name] = {"one": one, "two": two, "ratio": ratio}
+        cpu, wall = (
+            common.median_ratio([turn[0][key] for turn in turns], [turn[1][key] for turn in turns])
+            for key in ("cpu_ms", "wall_ms")
+        )
+        rows[name] = {"one": one, "two": two, "cpu": cpu, "wall": wall}
         print(
-            f"| {name} | {one['milliseconds']:.1f} | {two['milliseconds']:.1f} | {ratio:.2f} | {one['learning']:.0%} "
-            f"| {one['model_calls']:.1f} | {two['model_calls']:.1f} |",
+            f"| {name} | {one['cpu_ms']:.0f} | {two['cpu_ms']:.0f} | {cpu:.2f} | {one['wall_ms']:.0f} "
+            f"| {two['wall_ms']:.0f} | {wall:.2f} | {two['exchanges']:.0f} | {two['kilobytes']:.0f} |",
             flush=True,
         )
     common.write(common.about(args) | {"rows": rows}, args.json)

@@ -189,7 +189,7 @@ def lookahead(config: str, changes: list[str], depth: int, device: str) -> dict[
     found: dict[str, list[float]] = {"seconds": [], "looking": [], "calls": [], "states": []}
     while len(found["seconds"]) < ITERATIONS and sum(found["seconds"]) < MOST_SECONDS:
         begin = time.process_time()
-        with common.timed(PolicyLookahead, "in_parts") as looks:
+        with common.timed(PolicyLookahead, "__call__") as looks:
             iteration = model.iterate()
         found["seconds"].append(time.process_time() - begin)
         found["looking"].append(sum(looks))

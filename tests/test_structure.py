@@ -25,6 +25,8 @@ ROOMS = [
     "bellman_kernels",
     "bellman",
     "seeding",
+    "exchange",
+    "ranks",
     "tabular",
     "envs",
     "models",

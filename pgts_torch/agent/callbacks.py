@@ -75,7 +75,7 @@ class EvalCallback:
     def __call__(self, algorithm: PGTS, iteration: Iteration) -> bool:
         """Evaluate if it is due. Return whether training goes on."""
         now = algorithm.num_env_steps
-        if now // self.every == (now - iteration.experience.num_steps) // self.every:
+        if now // self.every == (now - iteration.num_steps) // self.every:
             return True
         evaluation = algorithm.ranks.first(
             "an evaluation",

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from pgts_torch.agent.critics import Critic, ExactCritic
 from pgts_torch.agent.policies import fitting
-from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
+from pgts_torch.agent.roots import Roots
 from pgts_torch.agent.world import ModelWorld
 from pgts_torch.errors import PgtsError
+from pgts_torch.ranks import Ranks
 from pgts_torch.search.engine import Search
 from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.search.upper import UpperBound
@@ -75,7 +76,8 @@ class Certificates:
     the mean of v - v^pi over the sampled starts. It is infinite where the bound is no smaller than the trivial one, w -
     l, and where the lookahead has pruned nodes, because T^n w would then depend on the other start states.
 
-    Each rank has queried different states. Each computes v_hat from its own, and the smallest is used.
+    Processes that train together have queried different states, and each computes v_hat from its own. Where they number
+    states alike the smallest is used; else each has it at the states that it has visited, and sums are over all.
 
     Args:
         world: gives the start distribution.
@@ -143,35 +145,52 @@ class Certificates:
             "stop_at"
         )
 
-    def starts(self, experience: Rollout, state_N: Int[Tensor, "N"], v_N: Float[Tensor, "N"]) -> _Starts:
+    def starts(self, experience: Rollout, roots: Roots, v_N: Float[Tensor, "N"]) -> _Starts:
         """Return the start states and v there: all of them where mu is known, else those of the episodes, if the
         lookahead starts from them.
 
         Args:
             experience: the episodes of the iteration.
-            state_N, v_N: the visited states, ascending, and v there from the lookahead of depth 0.
+            roots: the visited states that this process looks ahead from.
+            v_N: v there, from the lookahead of depth 0.
         """
-        start_S, num_episodes = self._world.start_S, experience.num_episodes
+        start_S, num_episodes, ranks = self._world.start_S, experience.whole.episodes, experience.ranks
         if start_S is None:
             first_B = experience.state_TB[0]
             if experience.searched_TB is not None:
                 first_B = first_B[experience.searched_TB[0]]
+            if self._world.keeps_numbers:
+                [first_B] = ranks.rows("first states", first_B)
             starts, count_N = first_B.unique(return_counts=True)
-            v_of_starts = v_N[torch.searchsorted(state_N, starts)]
-            return _Starts(starts, count_N.double() / len(first_B), v_of_starts.double(), len(first_B))
+            total = len(first_B) if self._world.keeps_numbers else int(ranks.totals("starts", len(first_B))[0])
+            v_of_starts = self._of_visited(roots, v_N, ranks)(starts)
+            assert v_of_starts is not None
+            return _Starts(starts, count_N.double() / total, v_of_starts.double(), total)
         starts = torch.nonzero(start_S).flatten()
         if not self._critic.samples_when_queried:
             v_of_starts = self._critic.v(self._world.observe(starts))
-        elif bool(torch.isin(starts, state_N).all()):
-            v_of_starts = v_N[torch.searchsorted(state_N, starts)]
         else:
-            return _Starts(starts, start_S[starts], None, num_episodes)
-        return _Starts(starts, start_S[starts], v_of_starts.double(), num_episodes)
+            v_of_starts = self._of_visited(roots, v_N, ranks)(starts)
+        return _Starts(starts, start_S[starts], None if v_of_starts is None else v_of_starts.double(), num_episodes)
+
+    def _of_visited(self, roots: Roots, v_N: Tensor, ranks: Ranks) -> Callable[[Tensor], Tensor | None]:
+        """v of states, from its values at those that were visited; None where some were not."""
+        state_N = roots.state_N
+        if self._world.keeps_numbers and ranks.size > 1:
+            state_N, v_N = ranks.rows("values", state_N, v_N)
+            state_N, order_N = state_N.sort()
+            v_N = v_N[order_N]
+
+        def read(asked_N: Tensor) -> Tensor | None:
+            return v_N[torch.searchsorted(state_N, asked_N)] if bool(torch.isin(asked_N, state_N).all()) else None
+
+        return read
 
     def bound(
         self,
         starts: _Starts,
-        visited: tuple[Int[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N"]],
+        roots: Roots,
+        root_v_N: Float[Tensor, "N"],
         look: Lookahead,
         depth: int,
         number: int,
@@ -180,7 +199,8 @@ class Certificates:
 
         Args:
             starts: what `starts` returned.
-            visited: the visited states, v there, and their occupancy.
+            roots: the visited states.
+            root_v_N: v where this process looks ahead.
             look: the lookahead.
             depth: its depth m; n is m, or m + 1 where the critic learns v.
             number: of the iteration, from 1.
@@ -189,29 +209,33 @@ class Certificates:
         if self._search.topology is None:
             return Bound(math.inf, math.inf)
         expansions = depth + (self._critic.target == "v")
-        visited_N, v_of_visited_N, occupancy_N = visited
-        both_N = torch.cat([state_N, visited_N])
+        both_N = torch.cat([state_N, roots.visited_M])
 
         def tightened(upper: UpperBound) -> Tensor:
             upper.tighten(expansions)
             return upper.at(both_N)
 
-        upper_N, upper_of_visited_N = self._smallest(tightened).split([len(state_N), len(visited_N)])
-        gap = float(occupancy_N.double() @ (upper_of_visited_N - v_of_visited_N.double()).abs())
+        upper_N, upper_M = self._smallest(tightened).split([len(state_N), len(roots.visited_M)])
+        above_N = (upper_M[roots.own_N] - root_v_N.double()).abs()
+        [gap] = self._ranks.totals("missing", roots.occupancy_N.double() @ above_N)
         if v_N is None:
             return Bound(math.inf, gap)
         if self._world.start_S is not None:
             return Bound(self._over_all(prob_N, upper_N, v_N), gap)
-        estimate = float(prob_N @ (upper_N - v_N).abs())
+        estimate = self._sum(prob_N @ (upper_N - v_N).abs())
         span = self._search.model.highest_value - self._search.model.lowest_value
         width = self.width(num_episodes, number)
-        is_complete = float(look.pruned_BA.max()) == 0
+        is_complete = self._ranks.totals("pruned", (look.pruned_BA > 0).sum()) == [0]
         # T^n w is no smaller than v_hat
         if not (self._samples_starts and is_complete and estimate + width < span):
             return Bound(math.inf, gap)
         swept_N = self._smallest(lambda upper: upper.swept(state_N, expansions))
-        certificate = float(prob_N @ (swept_N - v_N).abs()) + width
+        certificate = self._sum(prob_N @ (swept_N - v_N).abs()) + width
         return Bound(certificate if certificate < span else math.inf, gap)
+
+    def _sum(self, missing: Tensor) -> float:
+        """What is missing at all start states, from that at those of this process."""
+        return float(missing) if self._world.keeps_numbers else self._ranks.totals("starts", missing)[0]
 
     def width(self, num_episodes: int, number: int = 1) -> float:
         """The confidence term (w - l) sqrt( ln(1 / alpha_k) / 2n ); no certificate from sampled starts is below it."""
@@ -260,9 +284,10 @@ class Certificates:
             )
 
     def _smallest(self, read: Callable[[UpperBound], Tensor]) -> Float[Tensor, "N"]:
-        """The elementwise minimum over ranks of the values that `read` returns of their upper bounds."""
-        each = self._ranks.gather("certificate", lambda: read(self._own_bound()).cpu())
-        return torch.stack(each).amin(0).to(self._world.device)
+        """The values that `read` returns of the upper bound; where all processes number states alike, the elementwise
+        minimum over theirs."""
+        own_N = read(self._own_bound())
+        return self._ranks.least("upper bounds", own_N) if self._world.keeps_numbers else own_N
 
     def _own_bound(self) -> UpperBound:
         """The upper bound from what this rank has queried; a new one after the search was reset."""

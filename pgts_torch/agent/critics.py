@@ -161,15 +161,21 @@ class TabularCritic(Critic):
         cell_V = rollout.observation_V
         if self.target == "q":
             cell_V = cell_V * self.num_actions + rollout.of_visits(rollout.action_TB)
-        loss = float((target_V - value_C[cell_V]).square().mean())
+        loss = rollout.share.mean("squared errors", (target_V - value_C[cell_V]).square())
         # the number of visits to each cell in this rollout, and the sum of their targets
         count_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, torch.ones_like(target_V))
         sum_C = torch.zeros_like(self._count_C).index_add_(0, cell_V, target_V)
+        if rollout.ranks.size > 1:
+            own = torch.nonzero(count_C).flatten()
+            cell_N, count_N, sum_N = rollout.ranks.rows("visited cells", own, count_C[own], sum_C[own])
+            count_C, sum_C = (
+                torch.zeros_like(x_C).index_add_(0, cell_N, x_N) for x_C, x_N in ((count_C, count_N), (sum_C, sum_N))
+            )
         self._count_C += count_C
         alpha_C = count_C / self._count_C.clamp(min=1) if self.options.step_size == "mean" else self.options.step_size
         mean_C = sum_C / count_C.clamp(min=1)
         self._value_C = torch.where(count_C > 0, value_C + alpha_C * (mean_C - value_C), value_C)
-        return {"value": loss}
+        return {"value": float(loss)}
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         """The values in the table; for a table of Q, sum_a pi(a|s) Q(s, a)."""
@@ -208,8 +214,8 @@ class TabularCritic(Critic):
         """
         seen_C = (self._count_C > 0).double()
         unrewarded = replace(rollout, reward_TB=torch.zeros_like(rollout.reward_TB))
-        a = self._targets(rollout, self._value_C * seen_C).mean()
-        b = self._targets(unrewarded, 1 - seen_C).mean()
+        a = rollout.share.mean("targets", self._targets(rollout, self._value_C * seen_C))
+        b = rollout.share.mean("targets without rewards", self._targets(unrewarded, 1 - seen_C))
         return torch.where(b < 1, a / (1 - b), 0.0)
 
 

@@ -7,9 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgts_torch.agent.certificate import Certificates
+from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
-from pgts_torch.agent.ranks import Draws
 from pgts_torch.agent.rollout import Rollout
+from pgts_torch.agent.roots import Roots
 from pgts_torch.bellman import policy_mean
 from pgts_torch.readings import Readings
 from pgts_torch.search.lookahead import Lookahead, check_finite
@@ -62,35 +63,34 @@ class DepthChoice:
         self.look, self._certificates = look, certificates
         self.depths, self.tolerance, self.stop_at = depths, tolerance, stop_at
 
-    def __call__(self, experience: Rollout, pi_NA: Float[Tensor, "N A"], draws: Draws) -> Chosen:
-        """Return the lookahead from the distinct visited states.
+    def __call__(self, experience: Rollout, roots: Roots, pi_NA: Float[Tensor, "N A"], draws: Draws) -> Chosen:
+        """Return the lookahead from distinct visited states. All processes choose the same depth.
 
         Args:
             experience: episodes of the policy.
-            pi_NA: the policy in these states, ascending.
+            roots: the states.
+            pi_NA: the policy there.
             draws: the random generators of the iteration; all its searches get the same samples, so that their
                 differences are not noise.
 
         Raises:
             NotFinite: v(s) = <pi(.|s), Q(s, .)> is not finite.
         """
-        state_N, occupancy_N = experience.visits("occupancy")
-        readings = Readings()
-        shallow = self.look.in_parts(state_N, 0, draws.search(), readings)
+        state_N, ranks, readings = roots.state_N, experience.ranks, Readings()
+        shallow = self.look(state_N, depth=0, generator=draws.search(), readings=readings)
         v_N = policy_mean(pi_NA, shallow.q_BA)
         check_finite("value", "the policy's value", v_N, state_N, readings)
         readings.read()
-        starts = self._certificates.starts(experience, state_N, v_N)
+        starts = self._certificates.starts(experience, roots, v_N)
         for depth in self.depths:
-            look = self.look.in_parts(state_N, depth, draws.search(), readings) if depth else shallow
+            look = self.look(state_N, depth=depth, generator=draws.search(), readings=readings) if depth else shallow
             readings.read()
             gap_N = (look.q_BA.amax(-1) - v_N).clamp(min=0)
-            bound = self._certificates.bound(starts, (state_N, v_N, occupancy_N), look, depth, draws.number + 1)
+            bound = self._certificates.bound(starts, roots, v_N, look, depth, draws.number + 1)
             is_enough = self.stop_at is not None and bound.certificate <= self.stop_at
-            if (
-                is_enough
-                or depth == self.depths[-1]
-                or float(gap_N.double() @ occupancy_N) > self.tolerance * bound.visited
-            ):
+            if is_enough or depth == self.depths[-1]:
+                break
+            [gap] = ranks.totals("gap", gap_N.double() @ roots.occupancy_N)
+            if gap > self.tolerance * bound.visited:
                 break
         return Chosen(depth, look, gap_N, bound.certificate, is_enough)

@@ -6,12 +6,12 @@ from typing import Any, final
 
 import torch
 
+from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.explorer import Explorer
 from pgts_torch.agent.imagine import imagine
 from pgts_torch.agent.model_check import ModelCheck
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.ranks import Draws
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import ModelWorld, SimulatedWorld
 from pgts_torch.errors import PgtsError, check_count
@@ -26,7 +26,8 @@ class Dyna:
     """Fits a model that can learn to each rollout of the environment, and makes the rollouts that the policy is updated
     from: episodes in the model that start in states sampled from those visited so far (Sutton 1990).
 
-    All ranks imagine the same rollouts, from the same states.
+    Each of several processes keeps the states that it has visited itself, and imagines its part of the episodes from
+    these. In tables, where all keep all states, they begin in its part of them.
 
     policy: the policy that imagined episodes follow. For a network it is a slow copy of the trained one, a moving
         average that steps toward it by `polyak` after each update; with polyak 1, and for a table, the trained policy.
@@ -76,10 +77,15 @@ class Dyna:
         """
         self._model_check(experience, draws.number)
         model, losses = self._model, {}
+        is_table = self._world.keeps_numbers
         if self._owns_replay:
-            self.replay.add(state=self._world.export(experience.state_TB[experience.alive_TB]))
+            states = self._world.export(experience.state_TB[experience.alive_TB])
+            if is_table:
+                assert isinstance(states, torch.Tensor)
+                [states] = draws.ranks.rows("visited states", states)
+            self.replay.add(state=states)
         if isinstance(model, LearningModel):
-            losses = model.learn(experience.steps(), generator=draws.common)
+            losses = model.learn(experience.steps(), generator=draws.common if is_table else draws.own)
         return {f"model_{name}": value for name, value in losses.items()}
 
     def rollouts(self, draws: Draws) -> Iterator[tuple[Rollout, Draws]]:
@@ -91,20 +97,23 @@ class Dyna:
         assert self.options.updates_per_step is not None
         assert self.options.length is not None
         assert self.options.search_every is not None
-        due = int(self.options.updates_per_step * self.replay.num_added) - self.num_updates
-        every = self.replay.rows("state").unique() if self.options.starts == "all" else None
+        is_table, ranks = self._world.keeps_numbers, draws.ranks
+        added = self.replay.num_added if is_table else int(ranks.totals("visits", self.replay.num_added)[0])
+        due = int(self.options.updates_per_step * added) - self.num_updates
+        every = ranks.part(self.replay.rows("state").unique()) if self.options.starts == "all" else None
+        kept_R = None if is_table else ranks.each("kept states", len(self.replay))[:, 0].tolist()
         for number in range(max(due, 1)):
             own = draws.update(number)
             self._world.reset_numbers()
-            start_B = self._world.adopt(self._sampled(own) if every is None else every)
+            start_B = self._world.adopt(self._sampled(own, kept_R) if every is None else every)
             imagined = imagine(
                 self._world,
                 self.policy,
                 start_B,
                 self.options.length,
                 search_every=self.options.search_every,
-                generator=own.common,
-            )
+                generator=own.own,
+            ).shared(ranks)
             self._steps += imagined.num_steps
             yield imagined, own
             self.num_updates += 1
@@ -115,10 +124,19 @@ class Dyna:
                 assert isinstance(self._trained, NetworkPolicy)
                 self.policy.network.follow(self._trained.network, self.options.polyak)
 
-    def _sampled(self, draws: Draws) -> Any:
-        """A sample of the visited states, as the world exports them."""
+    def _sampled(self, draws: Draws, kept_R: list[float] | None) -> Any:
+        """This process's part of a sample of the visited states, as the world exports them.
+
+        Args:
+            kept_R: how many states each process keeps; None: all keep the same.
+        """
         assert isinstance(self.options.starts, int)
-        return self.replay.rows("state", self.replay.sample(self.options.starts, generator=draws.common))
+        if kept_R is None:
+            return self.replay.rows(
+                "state", draws.ranks.part(self.replay.sample(self.options.starts, generator=draws.common))
+            )
+        count = draws.ranks.portion(self.options.starts, kept_R)
+        return self.replay.rows("state", self.replay.sample(count, generator=draws.own))
 
     def state_dict(self) -> dict[str, Any]:
         """Return what was kept and learned, as tensors on the CPU and plain values.

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from pgts_torch.agent.components import Component, components, counts, image_shape, row_shape
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.options.policies import CNN, MLP
+from pgts_torch.ranks import ALONE, Ranks
 
 _CLIP = 10.0
 
@@ -44,16 +45,17 @@ class RunningNorm(nn.Module):
         return ((x - self.mean_D) / std_D).clamp(-_CLIP, _CLIP)
 
     @torch.no_grad()
-    def absorb(self, x: Tensor) -> None:
-        """Add the rows of x to the statistics; NotFinite, and nothing is added, unless they are finite."""
-        x_ND = x.reshape(-1, x.shape[-1]).double()
-        mean_D, total = x_ND.mean(0), self.count + len(x_ND)
+    def absorb(self, x: Tensor, ranks: Ranks = ALONE) -> None:
+        """Add the rows of x, in all ranks, to the statistics; NotFinite, and nothing is added, unless they are
+        finite."""
+        rows, mean_D, square_D = ranks.moments("observations", x.reshape(-1, x.shape[-1]).double())
+        total = self.count + rows
         if not bool(mean_D.isfinite().all()):
             message = f"the mean of the observations is {mean_D.tolist()}; observations must be finite"
             raise NotFinite(message, what="observation")
         apart_D = mean_D - self.mean_D
-        self.square_D += (x_ND - mean_D).square().sum(0) + apart_D.square() * self.count * len(x_ND) / total
-        self.mean_D += apart_D * len(x_ND) / total
+        self.square_D += square_D + apart_D.square() * self.count * rows / total
+        self.mean_D += apart_D * rows / total
         self.count.copy_(total)
 
 
@@ -101,10 +103,10 @@ class Values(nn.Module):
         x = (x if self.norm is None else self.norm(x)).float()
         return x.permute(0, 3, 1, 2) if len(self.shape) == 3 else x
 
-    def absorb(self, x_N: Tensor) -> None:
+    def absorb(self, x_N: Tensor, ranks: Ranks) -> None:
         """Add these to the running statistics, where there are any."""
         if self.norm is not None:
-            self.norm.absorb(self._scaled(x_N))
+            self.norm.absorb(self._scaled(x_N), ranks)
 
     def _scaled(self, x_N: Tensor) -> Tensor:
         x = x_N.reshape(len(x_N), *self._layout)
@@ -159,11 +161,11 @@ class Encoder(nn.Module):
             raise PgtsError(f"an observation has shape {tuple(observation_N.shape[1:])}; it must be {self.row_shape}")
         return (observation_N,) if len(self.parts) == 1 else observation_N.split(self._sizes, 1)
 
-    def absorb(self, observation_N: Tensor) -> None:
-        """Add these observations to the running statistics, where there are any."""
+    def absorb(self, observation_N: Tensor, ranks: Ranks = ALONE) -> None:
+        """Add these observations, in all ranks, to the running statistics, where there are any."""
         for part, x_N in zip(self.parts, self._split(observation_N), strict=True):
             if isinstance(part, Values):
-                part.absorb(x_N)
+                part.absorb(x_N, ranks)
 
     @property
     def norm(self) -> RunningNorm | None:

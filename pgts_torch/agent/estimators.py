@@ -2,17 +2,18 @@
 
 import math
 from abc import ABC, abstractmethod
-from typing import final
+from typing import Any, final
 
 import torch
 
 from pgts_torch.agent.advantages import gae, score_function
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.depth import DepthChoice
+from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.iteration import PolicyBatch
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.ranks import Draws
 from pgts_torch.agent.rollout import Rollout, StateWeight
+from pgts_torch.agent.roots import roots_of
 from pgts_torch.tabular.ascent import centred
 
 _ROUNDINGS = 16
@@ -54,21 +55,25 @@ class LookaheadEstimator(Estimator):
 
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
         self._look.restart()
-        state_N, weight_N = experience.visits(self._weight)
-        observation_N = experience.first_observation_N
-        pi_NA = self._look.policy.probs(observation_N)
-        chosen = self._choose(experience, pi_NA, draws)
-        q_NA = chosen.look.q_BA
+        roots, ranks = roots_of(experience, self._look.world, self._weight), experience.ranks
+        pi_NA = self._look.policy.probs(roots.observation_N)
+        chosen = self._choose(experience, roots, pi_NA, draws)
+        q_NA, count = chosen.look.q_BA, chosen.look.q_BA.numel()
+        size: Any = torch.where(q_NA.isfinite(), q_NA, 0.0).abs().amax().double() if count else 0.0
+        noise = chosen.look.noise if count else 0.0
+        if ranks.size > 1:
+            size_R, square_R, count_R = ranks.each("lookahead", size, noise**2 * count, count).T
+            size, noise = float(size_R.max()), math.sqrt(square_R.sum() / count_R.sum())
         # Differences that rounding may have caused are no advantages.
         eps = max(torch.finfo(dtype).eps for dtype in (q_NA.dtype, self._look.critic.dtype))
-        rounding = _ROUNDINGS * eps * torch.where(q_NA.isfinite(), q_NA, 0.0).abs().amax().double()
         return PolicyBatch(
-            observation_N,
-            centred(q_NA, pi_NA, rounding=rounding),
-            weight_N,
-            chosen.look.noise,
+            roots.observation_N,
+            centred(q_NA, pi_NA, rounding=_ROUNDINGS * eps * size),
+            roots.weight_N,
+            noise,
             self._look.policy,
-            state_N=state_N,
+            ranks,
+            state_N=roots.state_N,
             pi_NA=pi_NA,
             **chosen._asdict(),
         )
@@ -105,6 +110,7 @@ class SampledEstimator(Estimator):
             observation_N,
             score_function(experience.of_visits(experience.action_TB), experience.of_visits(advantage_TB), pi_NA),
             weight_N,
+            ranks=experience.ranks,
             state_N=None,
             pi_NA=pi_NA,
             depth=0,

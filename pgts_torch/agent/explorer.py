@@ -6,10 +6,10 @@ from jaxtyping import Int
 from torch import Tensor
 
 from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.estimators import Estimator
 from pgts_torch.agent.imagine import imagine
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.ranks import Draws
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import ModelWorld
 from pgts_torch.search.engine import Search
@@ -40,7 +40,7 @@ class Explorer:
 
     def improve(self, start_B: Int[Tensor, "B"], length: int, draws: Draws) -> None:
         """Update the policy from episodes that are imagined in the model, from these states on."""
-        imagined = imagine(self.world, self.policy, start_B, length, generator=draws.common)
+        imagined = imagine(self.world, self.policy, start_B, length, generator=draws.own).shared(draws.ranks)
         self._steps += imagined.num_steps
         self._estimator.evaluate(imagined, draws)
         self._update(self.policy, self._estimator(imagined, draws), generator=draws.common)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
+from pgts_torch.ranks import ALONE, Ranks
 from pgts_torch.search.lookahead import Lookahead
 
 
@@ -21,6 +22,7 @@ class Batch:
     noise: the standard error of the advantages of a sampled lookahead (root mean square), in reward units, by which
         normalised steps divide at least; 0 where nothing was sampled or no standard errors are computed.
     policy: the policy pi that the batch is of, from which updates of networks start; None: the one that is updated.
+    ranks: the processes that have the other rows: an update is that from the rows of all.
     """
 
     observation_N: Shaped[Tensor, "N ..."]
@@ -28,6 +30,7 @@ class Batch:
     weight_N: Float[Tensor, "N"]
     noise: float = 0.0
     policy: Policy | None = None
+    ranks: Ranks = ALONE
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,7 +62,8 @@ class PolicyBatch(Batch):
 class Iteration(PolicyBatch):
     """The results of one iteration of Algorithm 1.
 
-    experience: the episodes of pi_k.
+    experience: the episodes of pi_k; like the rows of the batch, those of this process.
+    num_steps: the environment steps of all processes.
     losses: the critic's and the update's, by name.
     model_calls: the number of (state, action) that lookahead and critic have queried in this iteration.
     posterior: a bound on J* - J^{pi_{k+1}} from a learned table alone (`PosteriorCertificate`), by which `is_enough` is
@@ -67,6 +71,7 @@ class Iteration(PolicyBatch):
     """
 
     experience: Rollout
+    num_steps: int
     losses: dict[str, float]
     model_calls: int
     posterior: float | None = None

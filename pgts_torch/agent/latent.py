@@ -23,6 +23,7 @@ from pgts_torch.models.state_index import hash_rows
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options.models import Latent
 from pgts_torch.options.policies import CNN, MLP
+from pgts_torch.ranks import Ranks
 from pgts_torch.seeding import stream, uniform
 
 _SELDOM = 0.02
@@ -159,23 +160,30 @@ class LatentModel(TensorModel, LearningModel):
             next_state=experience.next_observation_N,
             follows=experience.follows_N,
         )
-        self._representation.trunk.encoder.absorb(experience.observation_N.to(self.device))
-        self._measure_rewards()
+        ranks = experience.ranks
+        self._representation.trunk.encoder.absorb(experience.observation_N.to(self.device), ranks)
+        self._measure_rewards(ranks)
         held_out = held_out_rows(self.replay)
-        count = self.options.updates_per_step * len(discount_N)
-        losses = self._fit(held_out, self.options.first_updates if is_first else round(count), generator)
+        count = self.options.updates_per_step * ranks.totals("steps", len(discount_N))[0]
+        losses = self._fit(held_out, self.options.first_updates if is_first else round(count), generator, ranks)
         self.generation += 1
-        return {**losses, **self._errors(held_out)}
+        return {**losses, **self._errors(held_out, ranks)}
 
-    def _measure_rewards(self) -> None:
+    def _measure_rewards(self, ranks: Ranks) -> None:
         rewards = self.replay.rows("reward")
         mean, scale = float(rewards.mean()), float(rewards.std(correction=0))
+        if ranks.size > 1:
+            number, mean_1, square_1 = ranks.moments("rewards", rewards.double()[:, None])
+            mean, scale = float(mean_1), math.sqrt(square_1 / number)
         if not mean + scale < float("inf"):
             raise NotFinite(f"the mean of rewards is {mean}; what a model learns must be finite", what="model")
         self._reward_mean, self._reward_scale = mean, scale
 
-    def _fit(self, held_out: Bool[Tensor, "R"], count: int, generator: torch.Generator) -> dict[str, float]:
-        """Take so many gradient steps. Return the means of the losses, by name."""
+    def _fit(
+        self, held_out: Bool[Tensor, "R"], count: int, generator: torch.Generator, ranks: Ranks
+    ) -> dict[str, float]:
+        """Take so many gradient steps. Return the means of the losses, by name. A minibatch has a part of each rank, in
+        proportion to the steps that it keeps; losses compare all of it, so the vectors of all are exchanged."""
         trained = torch.nonzero(~held_out).flatten()
         ended = trained[self.replay.rows("end", trained) > 0]
         weights, num_counted = self._representation.weights + self._dynamics.weights, 0
@@ -183,26 +191,32 @@ class LatentModel(TensorModel, LearningModel):
         def sampled(rows: Tensor, number: int) -> Tensor:
             return rows[torch.randint(len(rows), (number,), generator=generator, device=generator.device).cpu()]
 
-        extra = round(_ENDS * self.options.minibatch_size * self.options.unroll) if len(ended) else 0
+        trained_R, ended_R = ranks.each("kept steps", len(trained), len(ended)).T.tolist()
+        extra = round(_ENDS * self.options.minibatch_size * self.options.unroll) if sum(ended_R) else 0
+        own = ranks.portion(self.options.minibatch_size, trained_R)
+        own_extra = ranks.portion(extra, ended_R) if extra else 0
         with self._optimiser.attempt(self._representation.tensors + self._dynamics.tensors) as readings:
             for _ in range(count):
-                starts = sampled(trained, self.options.minibatch_size)
+                starts = sampled(trained, own)
                 at_KN, counts_KN = sequences(self.replay, held_out, starts, self.options.unroll)
-                losses = self._losses(at_KN, counts_KN, sampled(ended, extra) if extra else starts[:0])
+                more = sampled(ended, own_extra) if own_extra else starts[:0]
+                losses, num_rows = self._losses(at_KN, counts_KN, more, ranks)
                 loss = torch.stack(list(losses.values())).sum()
-                self._optimiser.step(weights, torch.autograd.grad(loss, weights), loss, "model")
+                gradients, _ = ranks.summed("the gradient of the model", torch.autograd.grad(loss, weights))
+                self._optimiser.step(weights, gradients, loss, "model")
                 readings.add(**losses)
-                num_counted += int(counts_KN.sum())
+                num_counted += num_rows - extra
         if extra and count:
             # By how much the log odds of an end are larger than among all steps (King and Zeng 2001).
-            share = len(ended) / len(trained)
+            share = sum(ended_R) / sum(trained_R)
             self._log_odds_added = min(_MOST_ADDED, math.log1p(extra * count / (num_counted * share)))
         return readings.means
 
     def _losses(
-        self, at_KN: Int[Tensor, "K N"], counts_KN: Bool[Tensor, "K N"], ended_M: Int[Tensor, "M"]
-    ) -> dict[str, Tensor]:
-        """The losses of sequences of rows, and of M more rows with ends, by name."""
+        self, at_KN: Int[Tensor, "K N"], counts_KN: Bool[Tensor, "K N"], ended_M: Int[Tensor, "M"], ranks: Ranks
+    ) -> tuple[dict[str, Tensor], int]:
+        """The losses of sequences of rows, and of M more rows with ends, of all ranks: by name, and how many rows count
+        for rewards and ends."""
         steps, output_C3 = self._unrolled(at_KN, counts_KN)
         at_C = at_KN[counts_KN]
         if len(ended_M):
@@ -210,9 +224,10 @@ class LatentModel(TensorModel, LearningModel):
             output_M3 = self._advanced(latent_MD, self._rows("action", ended_M))[1]
             at_C, output_C3 = torch.cat([at_C, ended_M]), torch.cat([output_C3, output_M3])
         reward_C, end_C = self._rows("reward", at_C) - self._reward_mean, self._rows("end", at_C)
+        steps, (output_C3, reward_C, end_C) = steps.of_all(ranks), ranks.rows("outcomes", output_C3, reward_C, end_C)
         losses = outcome_losses(output_C3, reward_C / (self._reward_scale or 1.0), end_C)
         losses["consistency"] = consistency_loss(steps)
-        return losses | equivalence_losses(steps, self._values, self._logits)
+        return losses | equivalence_losses(steps, self._values, self._logits), len(end_C)
 
     def _rows(self, name: str, at_N: Int[Tensor, "N"]) -> Tensor:
         rows: Tensor = self.replay.rows(name, at_N)
@@ -270,20 +285,21 @@ class LatentModel(TensorModel, LearningModel):
         return Transitions(reward_N, self.gamma * goes_on_N.double(), self.number(next_ND))
 
     @torch.no_grad()
-    def _errors(self, held_out: Bool[Tensor, "R"]) -> dict[str, float]:
-        """The errors on held-out steps after which the episode goes on, by name (`learn`)."""
+    def _errors(self, held_out: Bool[Tensor, "R"], ranks: Ranks) -> dict[str, float]:
+        """The errors on held-out steps of all ranks after which the episode goes on, by name (`learn`)."""
         errors = {}
         for steps in _AHEAD:
             starts = runs(held_out, self.replay.rows("follows"), steps)
             last = (starts + steps - 1) % self.replay.capacity
             starts = starts[self.replay.rows("end", last) == 0][-_MOST_MEASURED:]
-            if len(starts) < 2:
+            if ranks.totals("held-out steps", len(starts))[0] < 2:
                 continue
             latent_ND = self.represent(self.replay.rows("state", starts))
             for ahead in range(steps):
                 at_N = (starts + ahead) % self.replay.capacity
                 latent_ND = self._advanced(latent_ND, self._rows("action", at_N))[0]
             true_ND = self.represent(self.replay.rows("next_state", at_N))
+            latent_ND, true_ND = ranks.rows("held-out vectors", latent_ND, true_ND)
             spread = float(true_ND.var(0, correction=0).mean())
             errors[f"error_{steps}"] = float((latent_ND - true_ND).square().mean() / max(spread, 1e-12)) ** 0.5
         return errors

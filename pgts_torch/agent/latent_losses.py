@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from pgts_torch.agent.networks import Network
+from pgts_torch.ranks import Ranks
 
 TEMPERATURE = 0.1
 """Of the contrastive loss, in mean squared differences of two vectors; those of two independent ones are 2."""
@@ -25,6 +26,11 @@ class Unrolled(NamedTuple):
     seen_KND: Float[Tensor, "K N D"]
     image_KN: Int[Tensor, "K N"]
     goes_on_KN: Bool[Tensor, "K N"]
+
+    def of_all(self, ranks: Ranks) -> "Unrolled":
+        """The steps of all processes, of which those of this one keep their gradient."""
+        columns = (column.transpose(0, 1) for column in self)
+        return Unrolled(*(column.transpose(0, 1) for column in ranks.rows("vectors", *columns)))
 
 
 def outcome_losses(

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from pgts_torch.agent.frequencies import MARGINS, Frequencies
-from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import DynamicsWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.errors import ModelMismatch, PgtsError
@@ -18,6 +17,7 @@ from pgts_torch.models.adapters_generic import PickledAttributes
 from pgts_torch.models.exact_model import CONTRADICTED, RANDOM, ExactModel, Happened
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
+from pgts_torch.ranks import Ranks
 from pgts_torch.seeding import numpy_stream
 
 Mode = Literal["error", "warn", "off"]
@@ -100,7 +100,7 @@ class ModelCheck:
         """Check the episodes of an iteration against the model.
 
         Args:
-            experience: of all ranks, after the lookahead from its states.
+            experience: those of this process, after the lookahead from its states.
             iteration: its number, which names the stream for the sample of steps.
 
         Raises:
@@ -108,9 +108,7 @@ class ModelCheck:
         """
         if self._model is None:
             return
-        results = self._ranks.gather("model check", lambda: self._check_steps(experience, iteration))
-        # Cheap models are checked by every rank against all steps, with the same result; others in parts.
-        for each in results[:1] if self._model.is_cheap else results:
+        for each in self._ranks.gather("model check", lambda: self._check_steps(experience, iteration)):
             self.model_calls += each.calls
             if each.samples_only:
                 self._warn(
@@ -120,22 +118,21 @@ class ModelCheck:
                 )
             if each.contradictions:
                 self._contradicted("steps", each.text, each.contradictions)
-        if isinstance(self._world, DynamicsWorld) and not self._world.model.transforms.observations:
-            self._check_observations(self._world, experience)
+            if each.shown[0]:
+                self._contradicted("observations", each.shown[1], each.shown[0])
         if isinstance(self._model, TabularModel):
-            self._check_starts(experience.start_state_N.cpu().numpy())
+            [start_B] = self._ranks.rows("first states", experience.start_state_N.cpu())
+            self._check_starts(start_B.numpy())
             self._check_frequencies()
 
     def _check_steps(self, experience: Rollout, iteration: int) -> "_Result":
-        """Check this rank's part of the steps; outcomes of tables are added to the test of their probabilities."""
+        """Check the steps of this rank; outcomes of tables, in all ranks, are added to the test of their
+        probabilities."""
         model, query_N = self._model, None
         assert model is not None
         # Tables and dynamics have no time limit, so whether an episode went on cannot contradict them.
         happened = _steps(experience, follows="alive_TB" if model.is_cheap else "follows_TB")
         if not model.is_cheap:
-            if self._ranks.size > 1:
-                mine = self._ranks.part(torch.from_numpy(np.unique(happened.state_N))).numpy()
-                happened = happened.part(np.isin(happened.state_N, mine))
             random = numpy_stream(self._seed, "iteration", iteration, "model check", *self._ranks.names)
             query_N = random.random(len(happened.state_N)) < _QUERY_PROB
         steps_before = model.simulator_steps
@@ -143,25 +140,31 @@ class ModelCheck:
         calls, agrees = model.simulator_steps - steps_before, not len(outcome_N) or outcome_N.min() >= 0
         if isinstance(model, TabularModel) and self._frequencies["steps"].has_chance:
             known = slice(None) if agrees else outcome_N >= 0
-            self._frequencies["steps"].observe(model.rows(happened)[known], outcome_N[known])
+            rows = (torch.from_numpy(x_N[known]) for x_N in (model.rows(happened), outcome_N))
+            self._frequencies["steps"].observe(*(x_N.numpy() for x_N in self._ranks.rows("outcomes", *rows)))
+        shown = self._other_observations(experience)
         if agrees:
-            return _Result(calls)
+            return _Result(calls, shown=shown)
         wrong = np.flatnonzero(outcome_N == CONTRADICTED)
         text = model.contradiction(happened.part(wrong)) if len(wrong) else ""
-        return _Result(calls, len(wrong), text, bool((outcome_N == RANDOM).any()))
+        return _Result(calls, len(wrong), text, bool((outcome_N == RANDOM).any()), shown)
 
-    def _check_observations(self, world: DynamicsWorld, experience: Rollout) -> None:
-        """Check that critics see at the leaves of a lookahead what the environment shows in such states."""
+    def _other_observations(self, experience: Rollout) -> tuple[int, str]:
+        """In how many visits dynamics show critics, at the leaves of a lookahead, something else than the environment;
+        and the first of these in words."""
+        world = self._world
+        if not isinstance(world, DynamicsWorld) or world.model.transforms.observations:
+            return 0, ""
         state_V, seen_VO = experience.state_TB[experience.alive_TB], experience.observation_V
         told_VO = world.observe(state_V)
         wrong_V = ((seen_VO - told_VO).abs() > _OBSERVATION_TOLERANCE * (1 + told_VO.abs())).any(-1)
-        if wrong_V.any():
-            first = int(wrong_V.nonzero()[0, 0])
-            what = (
-                f"{world.model.state_text(int(state_V[first]))} shows {seen_VO[first].tolist()}; the {self._kind} says "
-                f"{told_VO[first].tolist()}"
-            )
-            self._contradicted("observations", what, int(wrong_V.sum()))
+        if not wrong_V.any():
+            return 0, ""
+        first = int(wrong_V.nonzero()[0, 0])
+        return int(wrong_V.sum()), (
+            f"{world.model.state_text(int(state_V[first]))} shows {seen_VO[first].tolist()}; the {self._kind} says "
+            f"{told_VO[first].tolist()}"
+        )
 
     def _check_starts(self, start_B: np.ndarray) -> None:
         """Check that episodes begin in states of positive start probability."""
@@ -256,12 +259,14 @@ class _Result:
     calls: of the simulator.
     contradictions: the number of steps that are no outcome of the model.   text: the message about the first of them.
     samples_only: whether there are steps whose outcomes the model only samples.
+    shown: the number of visits in which the model shows another observation, and the message about the first of them.
     """
 
     calls: int
     contradictions: int = 0
     text: str = ""
     samples_only: bool = False
+    shown: tuple[int, str] = (0, "")
 
 
 def _steps(experience: Rollout, *, follows: str) -> Happened:

@@ -22,6 +22,7 @@ from pgts_torch.options.critics import NetworkValues
 from pgts_torch.options.fields import limit
 from pgts_torch.options.policies import CNN, MLP
 from pgts_torch.options.schedules import value_at
+from pgts_torch.ranks import Ranks, Share
 from pgts_torch.readings import Readings
 from pgts_torch.seeding import stream
 
@@ -139,8 +140,9 @@ class NetworkCritic(Critic):
             with self._optimiser.attempt(tensors) as readings:
                 v_TB, target_V = self._targets(rollout, readings)
                 error_V = target_V - self._before_fit(rollout, v_TB)
-                readings.add(value=error_V.square().mean())
-                readings.add(spread=target_V.var(correction=0), unexplained=error_V.var(correction=0))
+                error, unexplained = mean_and_variance("errors", error_V, rollout.ranks)
+                readings.add(value=error_V.square().mean() if rollout.ranks.size == 1 else error**2 + unexplained)
+                readings.add(spread=mean_and_variance("targets", target_V, rollout.ranks)[1], unexplained=unexplained)
                 self._fit_all(rollout, target_V, generator, readings)
         except PgtsError:
             self._num_fits = num_fits
@@ -166,38 +168,46 @@ class NetworkCritic(Critic):
         observation_V, action_V = rollout.observation_V, rollout.of_visits(rollout.action_TB)
         encoder = self.network.trunk.encoder
         if encoder.fresh or not _shares_trunk(self._policy, self.network):
-            encoder.absorb(observation_V)
+            encoder.absorb(observation_V, rollout.ranks)
         input_V = self.network.encode(observation_V)
         fits, passes = (self.options.num_epochs, 1) if self.options.fresh_targets else (1, self.options.num_epochs)
-        self._fit(input_V, action_V, target_V, passes, generator, readings)
+        self._fit((input_V, action_V, target_V), rollout.share, passes, generator, readings)
         for _ in range(fits - 1):
-            self._fit(input_V, action_V, self._targets(rollout, readings)[1], passes, generator, readings)
+            target_V = self._targets(rollout, readings)[1]
+            self._fit((input_V, action_V, target_V), rollout.share, passes, generator, readings)
 
     def _fit(
         self,
-        input_V: Float[Tensor, "V ..."],
-        action_V: Int[Tensor, "V"],
-        target_V: Float[Tensor, "V"],
+        visits: tuple[Tensor, Tensor, Tensor],
+        share: Share,
         num_passes: int,
         generator: torch.Generator,
         readings: Readings,
     ) -> None:
-        """Fit the network to given targets."""
+        """Fit the network to given targets.
+
+        Args:
+            visits: the encoded observations, the actions and the targets of this process.
+            share: which of all visits these are.
+        """
+        input_V, action_V, target_V = visits
         if self.options.normalize_returns:
-            self._rescale(target_V)
+            self._rescale(target_V, share.ranks)
         y_V = torch.where(self._scale == 0, 0.0, (target_V - self._mean) / self._scale)
         columns = input_V, action_V, y_V.float()
         for _ in range(num_passes):
-            for input_N, action_N, y_N in minibatches(columns, self.options.minibatch_size, generator=generator):
+            made_of = minibatches(columns, self.options.minibatch_size, share, generator=generator)
+            for count, (input_N, action_N, y_N) in made_of:
                 made = Forward(self.network, input_N)
                 off_N = self._taken(made.output_ND, action_N) - y_N
                 # The gradient of mean_n off_n^2 in the outputs, of which each row has one that counts.
-                down_N1 = (2 / len(off_N) * off_N)[:, None]
+                down_N1 = (2 / count * off_N)[:, None]
                 if self.target == "v":
                     down_ND = down_N1
                 else:
                     down_ND = torch.zeros_like(made.output_ND).scatter_(-1, action_N[:, None], down_N1)
-                gradients, loss = made.gradients(down_ND), off_N.square().mean()
+                own = made.gradients(down_ND), off_N.square().sum() / count
+                gradients, (loss,) = share.ranks.summed("the gradient of values", *own)
                 readings.add(value_grad_norm=self._optimiser.step(self.network.weights, gradients, loss, "value"))
         self._num_fits += 1
         self._move_target_network()
@@ -272,16 +282,17 @@ class NetworkCritic(Critic):
         return v_TB, critic_targets(rollout, next_v_TB, self.options.method, readings)
 
     @torch.no_grad()
-    def _rescale(self, target_V: Float[Tensor, "V"]) -> None:
+    def _rescale(self, target_V: Float[Tensor, "V"], ranks: Ranks) -> None:
         """Update mean and scale by the targets, and rescale the heads so that values in reward units stay the same."""
         rate = max(1 / (self._num_fits + 1), _SLOWEST_RATE)
         old_mean, old_scale = self._mean.clone(), self._scale.clone()
-        new_mean, new_var = target_V.mean().double(), target_V.var(correction=0).double()
+        new_mean, new_var = (x.double() for x in mean_and_variance("new targets", target_V, ranks))
         mean = old_mean + rate * (new_mean - old_mean)
         spread = (1 - rate) * (old_scale**2 + (old_mean - mean) ** 2) + rate * (new_var + (new_mean - mean) ** 2)
         # A deviation below the rounding error of the targets is replaced by it. If all targets are 0, so is the scale.
         self._mean.copy_(mean)
-        self._scale.copy_(torch.maximum(spread.sqrt(), _ROUNDING * target_V.abs().max()))
+        largest = -ranks.least("the largest target", -target_V.abs().max())
+        self._scale.copy_(torch.maximum(spread.sqrt(), _ROUNDING * largest))
         if self._num_fits:
             factor = torch.where(self._scale == 0, 1.0, old_scale / self._scale)
             shift = torch.where(self._scale == 0, 0.0, (old_mean - mean) / self._scale)
@@ -294,6 +305,14 @@ class NetworkCritic(Critic):
         if not self._lags or self._num_fits % self.options.target_period:
             return
         self._target_network.follow(self.network, self.options.polyak)
+
+
+def mean_and_variance(what: str, x_V: Float[Tensor, "V"], ranks: Ranks) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Mean and variance over the rows of all ranks; `what` names the exchange."""
+    if ranks.size == 1:
+        return x_V.mean(), x_V.var(correction=0)
+    count, mean_D, square_D = ranks.moments(what, x_V.double()[:, None])
+    return mean_D[0], square_D[0] / count
 
 
 def _shares_trunk(policy: Policy | None, network: Network) -> bool:

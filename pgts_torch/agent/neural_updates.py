@@ -28,6 +28,7 @@ from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.options.fields import limit
 from pgts_torch.options.schedules import at
 from pgts_torch.options.updates import PPO, Gradient
+from pgts_torch.ranks import Ranks, Share
 from pgts_torch.readings import Readings
 from pgts_torch.search.lookahead import check_finite
 
@@ -68,18 +69,20 @@ class NetworkUpdate(Update):
         network, encoder = policy.network, policy.network.trunk.encoder
         self.now = at(self.options, self.num_env_steps)
         self._optimiser.learning_rate = self.now.learning_rate
+        ranks = batch.ranks
         with self._optimiser.attempt(network.tensors) as readings:
-            _check_numbers(batch.advantage_NA, batch.weight_N, readings)
+            _check_numbers(batch, readings)
             if fresh := encoder.fresh:
-                encoder.absorb(batch.observation_N)
+                encoder.absorb(batch.observation_N, ranks)
             weight_N = batch.weight_N.float()
             input_N = network.encode(batch.observation_N)
             old_NA, new_NA = self.move(network, input_N, replace(batch, weight_N=weight_N), generator, readings)
             readings.check(new_NA.sum(), lambda _: check_finite("probability", "the next policy", new_NA, None))
-            weight_N = weight_N / weight_N.sum()
-            readings.add(entropy=weight_N @ entropy(new_NA), kl=weight_N @ divergence(old_NA, new_NA))
+            weight_N = weight_N / ranks.sum("weights", weight_N.sum())
+            found = torch.stack([weight_N @ entropy(new_NA), weight_N @ divergence(old_NA, new_NA)])
+            readings.add(**dict(zip(("entropy", "kl"), ranks.sum("the next policy", found), strict=True)))
             if not fresh:
-                encoder.absorb(batch.observation_N)
+                encoder.absorb(batch.observation_N, ranks)
         return readings.means
 
     def state_dict(self) -> dict[str, Any]:
@@ -100,16 +103,30 @@ class NetworkUpdate(Update):
         """Take the gradient steps of this kind of update, and add losses and diagnostics to the readings.
 
         Args:
-            input_N: the encoded observations of the batch.
+            input_N: the encoded observations of the batch, as all its rows those of this process.
 
         Returns:
             log pi before and after the steps, without gradient.
         """
 
-    def step(self, network: Network, made: Forward, loss: Tensor, down_NA: Float[Tensor, "N A"]) -> Tensor:
-        """Take one step down a loss (see `Optimiser.step`), whose gradient in the logits of `made` is given. Return the
-        norm of its gradient."""
-        return self._optimiser.step(network.weights, made.gradients(down_NA), loss, "policy")
+    def step(
+        self, made: Forward, down_NA: Float[Tensor, "N A"], ranks: Ranks, *losses: Tensor, most: float | None = None
+    ) -> tuple[Tensor, Sequence[Tensor]] | None:
+        """Take one step (see `Optimiser.step`) down the sum of a loss over ranks.
+
+        Args:
+            made: the pass of the rows of this process.
+            down_NA: the gradient of its part of the loss in the logits.
+            losses: its parts of the loss and of other numbers.
+            most: if the sum of the last one is above it no step is taken; None: one is.
+
+        Returns:
+            The norm of the gradient, and the sums of `losses`; None where no step was taken.
+        """
+        gradients, sums = ranks.summed("the gradient of the policy", made.gradients(down_NA), *losses)
+        if most is not None and float(sums[-1]) > most:
+            return None
+        return self._optimiser.step(made.network.weights, gradients, sums[0], "policy"), sums
 
 
 @final
@@ -138,8 +155,9 @@ class GradientUpdate(NetworkUpdate):
             # sum_a pi (adv - coef (log pi + 1)) d log pi  is the change of the objective of a state.
             loss, slope_NA = loss - coef * (batch.weight_N @ entropy(log_NA)), slope_NA - coef * (log_NA + 1)
         down_NA = -batch.weight_N[:, None] * slope_NA * pi_NA
-        norm = self.step(network, made, loss, through_log_softmax(log_NA, down_NA))
-        readings.add(policy=policy_loss, grad_norm=norm)
+        stepped = self.step(made, through_log_softmax(log_NA, down_NA), batch.ranks, loss, policy_loss)
+        assert stepped is not None
+        readings.add(policy=stepped[1][1], grad_norm=stepped[0])
         return log_NA, log_probs(network, input_N)
 
 
@@ -167,26 +185,26 @@ class PPOUpdate(NetworkUpdate):
         """Losses: policy, minus the objective without entropy, mean over the steps; grad_norm, mean, before clipping;
         clip_fraction, the probability of actions whose rho is out of range after the steps; num_steps."""
         old_NA, advantage_NA = log_probs_before(network, input_N, batch), batch.advantage_NA.float()
-        weight_N = batch.weight_N / batch.weight_N.mean()
+        share, most = batch.ranks.share("rows", len(input_N)), self.options.target_kl
+        weight_N = batch.weight_N / share.mean("weights", batch.weight_N)
         if self.options.normalize_advantage:
-            advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N)
+            advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N, share)
         columns, num_steps = (input_N, old_NA, advantage_NA, weight_N), 0
-        made = passes(network, columns, self.options.num_epochs, self.options.minibatch_size, generator)
-        for forward, log_NA, (_, before_NA, part_NA, part_N) in made:
-            if (
-                self.options.target_kl is not None
-                and mean(part_N, divergence(before_NA, log_NA)) > self.options.target_kl
-            ):
+        made = passes(network, columns, share, self.options.num_epochs, self.options.minibatch_size, generator)
+        for forward, log_NA, count, (_, before_NA, part_NA, part_N) in made:
+            gain_NA, down_NA = self.objective(log_NA, before_NA, part_NA, part_N, count)
+            losses = [-mean(part_N, gain_NA.sum(-1), count)]
+            if most is not None:
+                losses.append(mean(part_N, divergence(before_NA, log_NA), count))
+            stepped = self.step(forward, through_log_softmax(log_NA, down_NA), batch.ranks, *losses, most=most)
+            if stepped is None:
                 break
-            gain_NA, down_NA = self.objective(log_NA, before_NA, part_NA, part_N)
-            loss = -mean(part_N, gain_NA.sum(-1))
-            norm = self.step(network, forward, loss, through_log_softmax(log_NA, down_NA))
-            readings.add(policy=loss, grad_norm=norm)
+            readings.add(policy=stepped[1][0], grad_norm=stepped[0])
             num_steps += 1
         new_NA = log_probs(network, input_N)
         outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.now.clip_range
         readings.add(
-            clip_fraction=mean(weight_N, (old_NA.exp() * outside_NA).sum(-1)),
+            clip_fraction=batch.ranks.sum("clipped", mean(weight_N, (old_NA.exp() * outside_NA).sum(-1), share.total)),
             num_steps=num_steps,
         )
         return old_NA, new_NA
@@ -197,29 +215,31 @@ class PPOUpdate(NetworkUpdate):
         old_NA: Float[Tensor, "N A"],
         advantage_NA: Float[Tensor, "N A"],
         weight_N: Float[Tensor, "N"],
+        count: int,
     ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
         """Return pi_old min(rho adv, clip(rho) adv), and the gradient of the loss, minus the objective, in log pi(a|s):
 
-            -w(s) / N pi(a|s) ( adv(s, a) 1(not clipped) - entropy_coef (log pi(a|s) + 1) )
+            -w(s) / count pi(a|s) ( adv(s, a) 1(not clipped) - entropy_coef (log pi(a|s) + 1) )
 
+        with the number of rows in the minibatch, these and those of other processes.
         It is written out because autograd through these operations would cost as much as the network itself.
         """
         ratio_NA, pi_NA, before_NA = (log_NA - old_NA).exp(), log_NA.exp(), old_NA.exp()
-        low, high, coef = 1 - self.options.clip_range, 1 + self.options.clip_range, self.options.entropy_coef
+        low, high, coef = 1 - self.now.clip_range, 1 + self.now.clip_range, self.now.entropy_coef
         if self._optimiser.compiles:
             from pgts_torch.agent import step_kernels
 
             gain_NA, down_NA = torch.empty_like(log_NA), torch.empty_like(log_NA)
             given = (log_NA, ratio_NA, pi_NA, before_NA, advantage_NA, weight_N)
             arrays = tuple(each.numpy() for each in given)
-            step_kernels.clipped_objective(arrays, low, high, coef, gain_NA.numpy(), down_NA.numpy())
+            step_kernels.clipped_objective(arrays, count, low, high, coef, gain_NA.numpy(), down_NA.numpy())
             return gain_NA, down_NA
         free_NA = ratio_NA * advantage_NA
         least_NA = torch.minimum(free_NA, ratio_NA.clamp(low, high) * advantage_NA)
         slope_NA = torch.where(least_NA == free_NA, advantage_NA, 0.0)
         if coef:
             slope_NA = slope_NA - coef * (log_NA + 1)
-        return before_NA * least_NA, -(pi_NA * slope_NA) * (weight_N / len(weight_N))[:, None]
+        return before_NA * least_NA, -(pi_NA * slope_NA) * (weight_N / count)[:, None]
 
 
 def entropy(log_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
@@ -244,31 +264,37 @@ def log_probs(network: Network, input_N: Float[Tensor, "N ..."]) -> Float[Tensor
 
 
 def passes(
-    network: Network, columns: Sequence[Tensor], num_epochs: int, minibatch_size: int, generator: torch.Generator
-) -> Iterator[tuple[Forward, Float[Tensor, "N A"], tuple[Tensor, ...]]]:
-    """Yield minibatches of the columns, the first of which are inputs, with their pass through the current network and
-    log pi, without gradient."""
+    network: Network,
+    columns: Sequence[Tensor],
+    share: Share,
+    num_epochs: int,
+    minibatch_size: int,
+    generator: torch.Generator,
+) -> Iterator[tuple[Forward, Float[Tensor, "N A"], int, tuple[Tensor, ...]]]:
+    """Yield minibatches of the columns, the first of which are inputs: their pass through the current network and log
+    pi, without gradient; how many rows the minibatch has in all processes; and those of this one."""
     for _ in range(num_epochs):
-        for part in minibatches(columns, minibatch_size, generator=generator):
+        for count, part in minibatches(columns, minibatch_size, share, generator=generator):
             made = Forward(network, part[0])
-            yield made, made.output_ND.log_softmax(-1), part
+            yield made, made.output_ND.log_softmax(-1), count, part
 
 
-def mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"]) -> Float[Tensor, ""]:
-    """mean_n w_n value_n."""
-    return weight_N @ value_N / len(value_N)
+def mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"], count: int) -> Float[Tensor, ""]:
+    """The part of these rows in mean_n w_n value_n over `count` rows."""
+    return weight_N @ value_N / count
 
 
 def _scale(
-    old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]
+    old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"], share: Share
 ) -> Float[Tensor, ""]:
     size_N = (old_NA.exp() * advantage_NA.abs()).sum(-1)
-    return mean(weight_N, size_N.square()).sqrt() + 1e-8
+    return share.ranks.sum("advantages", mean(weight_N, size_N.square(), share.total)).sqrt() + 1e-8
 
 
-def _check_numbers(advantage_NA: Tensor, weight_N: Tensor, readings: Readings) -> None:
-    total = weight_N.sum()
-    is_weight = (total > 0) & (weight_N.min() >= 0)
+def _check_numbers(batch: Batch, readings: Readings) -> None:
+    advantage_NA, weight_N = batch.advantage_NA, batch.weight_N
+    total = batch.ranks.sum("weights of rows", weight_N.sum())
+    is_weight = (total > 0) & (weight_N >= 0).all()
     readings.check(advantage_NA.sum(), lambda _: _refuse_off("advantage", "advantage_NA", advantage_NA))
     readings.check(torch.where(is_weight, total, torch.nan), lambda _: _refuse_weights(weight_N))
 

@@ -177,7 +177,7 @@ class OngoingEpisodes:
         weight_TP = np.concatenate([np.ones((1, len(parts))), discount_TP[:-1].cumprod(0)]) * alive_TP
         columns = (action_TP, reward_TP, discount_TP, alive_TP, weight_TP, discount_TP)
         device = self._world.device
-        tensors = {n: torch.from_numpy(c).to(device) for n, c in zip(COLUMNS, columns, strict=True)}
+        tensors: dict[str, Any] = {n: torch.from_numpy(c).to(device) for n, c in zip(COLUMNS, columns, strict=True)}
 
         def both(before: str, after: str) -> Tensor:
             """Columns of these two fields as [T + 1, P]: `before` each step, then `after` the last, also in padding."""

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from pgts_torch.agent.policies import fitting
 from pgts_torch.compiled import can_compile
 from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.ranks import Share
 from pgts_torch.readings import Readings
 
 _BETAS = 0.9, 0.999
@@ -229,10 +230,25 @@ def _refuse(what: str, name: str, value: float) -> None:
     raise NotFinite(f"{name} is {value}; no parameter was changed", what=what)
 
 
-def minibatches(columns: Sequence[Tensor], size: int, *, generator: torch.Generator) -> Iterator[tuple[Tensor, ...]]:
-    """Yield the rows of all columns in one common random order, `size` at a time (the last batch may be smaller). If
-    there are at most `size` rows they are one batch, in their own order."""
-    if len(columns[0]) <= size:
-        return iter([tuple(columns)])
-    order_N = torch.randperm(len(columns[0]), generator=generator, device=generator.device)
-    return zip(*(column[order_N.to(column.device)].split(size) for column in columns), strict=True)
+def minibatches(
+    columns: Sequence[Tensor], size: int, share: Share, *, generator: torch.Generator
+) -> Iterator[tuple[int, tuple[Tensor, ...]]]:
+    """Yield minibatches of the rows of all processes, in one common random order, `size` at a time (the last one may be
+    smaller): how many rows it has, and in all columns those of this process. If there are at most `size` rows they are
+    one batch, in their own order.
+
+    Args:
+        share: which rows these are among those of all.
+        generator: the same in all processes.
+    """
+    if share.total <= size:
+        return iter([(share.total, tuple(columns))])
+    order_N = torch.randperm(share.total, generator=generator, device=generator.device)
+    counts = own_counts = [len(piece) for piece in order_N.split(size)]
+    if share.ranks.size > 1:
+        order_N = order_N.cpu()
+        own_N = (order_N >= share.first) & (order_N < share.first + len(columns[0]))
+        own_counts = [int(piece.sum()) for piece in own_N.split(size)]
+        order_N = order_N[own_N] - share.first
+    rows = zip(*(column[order_N.to(column.device)].split(own_counts) for column in columns), strict=True)
+    return zip(counts, rows, strict=True)

@@ -23,7 +23,6 @@ from pgts_torch.agent.own_models import learned_world, own_model, world_of
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.posterior_certificate import PosteriorCertificate
-from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import PgtsError
@@ -36,6 +35,7 @@ from pgts_torch.options.models import LEARNED, OwnModel
 from pgts_torch.options.replay import UniformReplay
 from pgts_torch.options.rollouts import SampledAdvantages, StepsHorizon, check_processes
 from pgts_torch.options.training import Training
+from pgts_torch.ranks import Ranks
 from pgts_torch.search.engine import Search
 from pgts_torch.seeding import SharedGenerators
 
@@ -154,7 +154,7 @@ def _lookahead(
         certificates.check(f"stop_at is {stop_at}")
     if options.search.depth == "adaptive":
         certificates.check("depth is adaptive")
-    look = PolicyLookahead(world, policy, critic, search, ranks)
+    look = PolicyLookahead(world, policy, critic, search)
     tolerance = options.search.filled("adaptive").tolerance
     return search, certificates, DepthChoice(look, certificates, depths=depths, tolerance=tolerance, stop_at=stop_at)
 

@@ -17,11 +17,11 @@ from pgts_torch.agent import saved, saving
 from pgts_torch.agent.build import Description, make_device, plain
 from pgts_torch.agent.components import row_shape
 from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.iteration import Iteration, PolicyBatch
 from pgts_torch.agent.model_check import Mode
 from pgts_torch.agent.parts import make_parts
 from pgts_torch.agent.policies import Policy, exact_probs
-from pgts_torch.agent.ranks import Draws, present_ranks
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
@@ -29,6 +29,7 @@ from pgts_torch.agent.world import SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.environments import Given, close_environments
+from pgts_torch.ranks import present_ranks
 from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.seeding import drawn_seed, stream
 from pgts_torch.tabular.mdp import TabularMDP
@@ -45,7 +46,7 @@ class PGTS:
 
     All random numbers of iteration k are from streams named by (seed, k), so that a loaded model continues exactly as
     the saved one would have. Where torch.distributed has a default process group, its processes train one policy
-    together (`agent.ranks`); they must make the same calls, with the same arguments.
+    together (`pgts_torch.ranks`); they must make the same calls, with the same arguments.
 
     Args:
         env: a Gymnasium id; a spec; an instance, from whose spec equal ones can be made; a function that makes one; or
@@ -140,7 +141,11 @@ class PGTS:
         """Run one iteration: visit states, estimate Q^pi, look m steps ahead, update pi.        [PGTS Alg. 1]"""
         if self.world.env.closed:
             raise PgtsError("the environments of this training are closed; make it anew, or load a saved one")
-        draws = self.ranks.draws(self.seed, self.num_iterations, self.device)
+        with self.ranks.united():
+            return self._iterate()
+
+    def _iterate(self) -> Iteration:
+        draws = Draws.of(self.ranks, self.seed, self.num_iterations, self.device)
         calls_before = self._parts.model_calls
         self.update.num_env_steps = self.critic.num_env_steps = self.num_env_steps
 
@@ -161,11 +166,16 @@ class PGTS:
         if posterior is not None and target is not None:
             batch = replace(batch, is_enough=posterior <= target)
         self.num_iterations += 1
-        self.num_env_steps += experience.num_steps
+        self.num_env_steps += experience.share.total
         model_calls = self.ranks.total(self._parts.model_calls - calls_before, self.policy.state_dict)
         self.num_model_calls += model_calls
         return Iteration(
-            **vars(batch), experience=experience, losses=losses, model_calls=model_calls, posterior=posterior
+            **vars(batch),
+            experience=experience,
+            num_steps=experience.share.total,
+            losses=losses,
+            model_calls=model_calls,
+            posterior=posterior,
         )
 
     def _improve(self, rollout: Rollout, draws: Draws) -> tuple[PolicyBatch, dict[str, float]]:
@@ -217,8 +227,8 @@ class PGTS:
         if self.depth_choice is None:
             raise PgtsError("with sampled advantages there is no lookahead")
         depth = self.depth_choice.depths[-1] if depth is None else depth
-        generator = self.ranks.draws(self.seed, self.num_iterations, self.device).search()
-        return self.depth_choice.look.alone(state_N, depth=depth, generator=generator)
+        generator = Draws.of(self.ranks, self.seed, self.num_iterations, self.device).search()
+        return self.depth_choice.look(state_N, depth=depth, generator=generator)
 
     def learn(self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool = False) -> Self:
         """Iterate until there are `total_steps` environment steps, including those before this call.
@@ -238,7 +248,7 @@ class PGTS:
         with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=not shown) as bar:
             while self.num_env_steps < total_steps:
                 iteration = self.iterate()
-                bar.update(iteration.experience.num_steps)
+                bar.update(iteration.num_steps)
                 goes_on = False not in [call(self, iteration) for call in callbacks]
                 if not all(self.ranks.gather("whether to go on", lambda: goes_on)) or iteration.is_enough:  # noqa: B023
                     break

@@ -38,9 +38,10 @@ class PosteriorCertificate:
 
     def follow(self, experience: Rollout, steps_before: int) -> float | None:
         """Count where episodes have begun; return `now` where it is due after them, else None."""
-        starts, count_N = experience.start_state_N.cpu().unique(return_counts=True)
+        [start_B] = experience.ranks.rows("first states", experience.start_state_N.cpu())
+        starts, count_N = start_B.unique(return_counts=True)
         self.start_count_S[starts] += count_N
-        powers = [int(math.log(max(n, 1), _GROWTH)) for n in (steps_before, steps_before + experience.num_steps)]
+        powers = [int(math.log(max(n, 1), _GROWTH)) for n in (steps_before, steps_before + experience.share.total)]
         return self.now() if steps_before == 0 or powers[0] < powers[1] else None
 
     def now(self) -> float:

@@ -3,9 +3,9 @@
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from pgts_torch.models.base import Experience, SamplingModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, Horizon
 from pgts_torch.options.updates import StateWeight
+from pgts_torch.ranks import ALONE, Ranks, Share
 from pgts_torch.seeding import SharedGenerators, sample_keys, seed_sequence
 
 
@@ -47,6 +48,18 @@ COLUMNS = ("action_TB", "reward_TB", "discount_TB", "alive_TB", "weight_TB", "su
 """The fields of `Rollout` with a row for each step."""
 
 
+class Totals(NamedTuple):
+    """How much all processes have made together.
+
+    visits: how many visits there are, and which of them are those of this process.
+    searched: how many visits a lookahead starts from.
+    """
+
+    visits: Share
+    searched: int
+    episodes: int
+
+
 @dataclass(frozen=True, eq=False)
 class Rollout:
     """B episodes of at most T steps. After the end of an episode its rows are padding and `alive_TB` is False.
@@ -62,6 +75,8 @@ class Rollout:
     searched_TB: the visits that a lookahead starts from; None: all.
     finished: the undiscounted return and the length of each episode that ended, where episodes go on from one rollout
         to the next; None: all begin in this one.
+    totals: what this rollout is a part of, where several processes have made episodes of the same policy; the weights
+        of visits are those in the whole. None: it is the whole.
     """
 
     observation_UB: Shaped[Tensor, "U B ..."]
@@ -75,6 +90,37 @@ class Rollout:
     begins_B: Bool[Tensor, "B"] | None = None
     searched_TB: Bool[Tensor, "T B"] | None = None
     finished: tuple[tuple[float, int], ...] | None = None
+    totals: Totals | None = None
+
+    @property
+    def ranks(self) -> Ranks:
+        """The processes that have the other episodes."""
+        return self.share.ranks
+
+    @property
+    def share(self) -> Share:
+        """The visits of this rollout among those of all processes."""
+        return self.whole.visits
+
+    @cached_property
+    def whole(self) -> Totals:
+        """How much all processes have made together."""
+        if self.totals is not None:
+            return self.totals
+        return Totals(Share(ALONE, 0, self.num_steps), self._num_searched, self.num_episodes)
+
+    def shared(self, ranks: Ranks) -> "Rollout":
+        """The same rollout as the part of one of several processes, which must all call this.
+
+        Raises:
+            PgtsError, RankLost: as `Ranks`.
+        """
+        if ranks.size == 1:
+            return self
+        own = self.num_steps, self._num_searched, self.num_episodes
+        steps_R, searched_R, episodes_R = ranks.each("episodes", *own).astype(int).T
+        visits = Share(ranks, int(steps_R[: ranks.rank].sum()), int(steps_R.sum()))
+        return replace(self, totals=Totals(visits, int(searched_R.sum()), int(episodes_R.sum())))
 
     @cached_property
     def observation_V(self) -> Shaped[Tensor, "V ..."]:
@@ -137,7 +183,7 @@ class Rollout:
 
         before_N, after_N = rows(self.observation_UB[:-1]), rows(self.observation_UB[1:])
         action_N, reward_N, discount_N = rows(self.action_TB), rows(self.reward_TB), rows(self.discount_TB)
-        return Experience(before_N, action_N, reward_N, discount_N, after_N, rows(self.follows_TB))
+        return Experience(before_N, action_N, reward_N, discount_N, after_N, rows(self.follows_TB), self.ranks)
 
     def values(self, v: Callable[[Tensor], Tensor]) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
         """Return v(s_t) and v(s_{t+1}); they have no meaning where the episode is over.
@@ -155,7 +201,8 @@ class Rollout:
         return (self.weight_TB * self.reward_TB).sum(0)
 
     def visits(self, state_weight: StateWeight) -> tuple[Int[Tensor, "N"], Float[Tensor, "N"]]:
-        """Return the distinct visited states that a lookahead starts from, ascending, and the weight w(s) of each.
+        """Return the distinct visited states that a lookahead starts from, ascending, and the weight w(s) of each. A
+        state that several processes have visited has a row in each, and its weight there is that of the visits there.
 
         occupancy:  mean over episodes of sum_t weight_t 1(s_t = s), an estimate of d^pi(s)    [PGTS Sec. 2]
         visits:     fraction of all visits that are to s
@@ -165,7 +212,7 @@ class Rollout:
         if state_weight == "uniform":
             return states, torch.ones(len(states), dtype=self.weight_TB.dtype, device=states.device)
         weight_V = self.visit_weight(state_weight)[self._searched_V]
-        weight_V = weight_V * (self.num_steps / len(weight_V))  # they stand for all visits
+        weight_V = weight_V * (self.share.total / self.whole.searched)  # they stand for all visits
         # the sum of the weights of all visits to a state
         weight_N = torch.zeros(len(states), dtype=weight_V.dtype, device=states.device)
         return states, weight_N.index_add_(0, row_V, weight_V)
@@ -184,6 +231,10 @@ class Rollout:
         """Which of the visits a lookahead starts from, as an index."""
         return slice(None) if self.searched_TB is None else self.of_visits(self.searched_TB)
 
+    @property
+    def _num_searched(self) -> int:
+        return self.num_steps if self.searched_TB is None else int(self.searched_TB[self.alive_TB].sum())
+
     @cached_property
     def _distinct(self) -> tuple[Int[Tensor, "N"], Int[Tensor, "V"]]:
         """The distinct visited states, ascending, and the index among them of the state of each visit."""
@@ -193,8 +244,8 @@ class Rollout:
         """The weight that each visit adds to w(s), in the order of `alive_TB`; with "uniform" it is 1."""
         weight_V = self.of_visits(self.weight_TB)
         if state_weight == "occupancy":
-            return weight_V / self.num_episodes
-        return torch.full_like(weight_V, 1 / len(weight_V) if state_weight == "visits" else 1.0)
+            return weight_V / self.whole.episodes
+        return torch.full_like(weight_V, 1 / self.share.total if state_weight == "visits" else 1.0)
 
 
 def rollout(

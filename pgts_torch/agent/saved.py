@@ -14,11 +14,11 @@ from pgts_torch.agent.dyna import Dyna
 from pgts_torch.agent.parts import Parts
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.posterior_certificate import PosteriorCertificate
-from pgts_torch.agent.ranks import Ranks
 from pgts_torch.agent.states import NO_STATE, check_keys, load_checked
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import ModelWorld
 from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.ranks import Ranks
 from pgts_torch.trust import check_imports
 
 COUNTERS = ("num_iterations", "num_env_steps", "num_model_calls")
@@ -39,6 +39,8 @@ def state_of(parts: Parts, ranks: Ranks) -> dict[str, Any]:
     searches = ranks.gather("searches", lambda: _search_state(parts))
     learned = {name: part.state_dict() for name, part in _learned(parts).items()}
     episodes = ranks.gather("episodes", lambda: {} if parts.episodes is None else parts.episodes.state_dict())
+    if parts.dyna is not None and ranks.size > 1:  # each process has kept steps of its own
+        learned["dyna"] = {"ranks": dict(enumerate(ranks.gather("what was kept", parts.dyna.state_dict)))}
     return {
         **learned,
         "searches": dict(enumerate(searches)),
@@ -57,6 +59,8 @@ def restore(parts: Parts, ranks: Ranks, state: dict[str, Any]) -> tuple[int, int
     """
     learned, check = _learned(parts), parts.model_check
     check_keys("the saved state", state, {*learned, "searches", "episodes", "model_check", *COUNTERS})
+    if parts.dyna is not None:
+        state = {**state, "dyna": _kept(ranks, state["dyna"])}
     for name in COUNTERS:
         check_count(name, state[name], least=0)
     before = {name: part.state_dict() for name, part in learned.items()}
@@ -78,6 +82,17 @@ def _learned(parts: Parts) -> dict[str, Policy | Critic | Update | Dyna | Poster
     """The parts that learn, of which all ranks have the same state."""
     names = ("policy", "critic", "update", "dyna", "posterior")
     return {name: part for name in names if (part := getattr(parts, name)) is not None}
+
+
+def _kept(ranks: Ranks, state: Any) -> Any:
+    """The part of a replay that is of this rank."""
+    saved = state.get("ranks", {0: state}) if isinstance(state, Mapping) else {0: state}
+    if not isinstance(saved, Mapping) or set(saved) != set(range(ranks.size)):
+        raise PgtsError(
+            f"the saved state has the replay of {len(saved)} processes, each of which has kept its own steps; this "
+            f"training has {ranks.size}: take as many"
+        )
+    return saved[ranks.rank]
 
 
 def _search_state(parts: Parts) -> dict[str, Any]:

@@ -47,16 +47,16 @@ def steps(first_D, root_D, epsilon, rate, total):  # type: ignore[no-untyped-def
 
 
 @jit
-def clipped_objective(given, low, high, coef, gain_NA, down_NA):  # type: ignore[no-untyped-def]
+def clipped_objective(given, count, low, high, coef, gain_NA, down_NA):  # type: ignore[no-untyped-def]
     """Write pi_old min(rho adv, clip(rho) adv), and the gradient of the loss in log pi (`PPOUpdate.objective`).
 
-    given: log pi, rho, pi, pi_old and the advantages [N, A], and the weights [N].
+    given: log pi, rho, pi, pi_old and the advantages [N, A], and the weights [N].   count: the rows of the minibatch.
     """
     log_NA, ratio_NA, pi_NA, old_NA, advantage_NA, weight_N = given
     number, (N, A) = log_NA.dtype.type, log_NA.shape
     low, high, coef, none = number(low), number(high), number(coef), number(0)
     for n in range(N):
-        weight = weight_N[n] / number(N)
+        weight = weight_N[n] / number(count)
         for a in range(A):
             advantage, ratio = advantage_NA[n, a], ratio_NA[n, a]
             free, clipped = ratio * advantage, min(max(ratio, low), high) * advantage

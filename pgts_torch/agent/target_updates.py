@@ -12,6 +12,7 @@ from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural_updates import NetworkUpdate, divergence, log_probs, log_probs_before, mean, passes
 from pgts_torch.options.updates import CMPO, Mirror
+from pgts_torch.ranks import ALONE, Ranks
 from pgts_torch.readings import Readings
 
 
@@ -38,20 +39,24 @@ class TargetUpdate(NetworkUpdate):
         Where step(s, a) is 0 everywhere no gradient step is taken, because Adam would turn rounding errors into one.
         """
         old_NA, exponent_NA = log_probs_before(network, input_N, batch), self.exponent(batch)
-        if not bool(exponent_NA.any()):
+        if batch.ranks.totals("rows that move", exponent_NA.any()) == [0]:
             readings.add(policy=0.0, grad_norm=0.0)
             return old_NA, old_NA
         target_NA = (old_NA + exponent_NA).log_softmax(-1)
-        weight_N = batch.weight_N / batch.weight_N.mean()
+        share = batch.ranks.share("rows", len(input_N))
+        weight_N = batch.weight_N / share.mean("weights", batch.weight_N)
         columns = input_N, target_NA, weight_N
-        made = passes(network, columns, self.options.num_epochs, self.options.minibatch_size, generator)
-        for forward, log_NA, (_, part_NA, part_N) in made:
+        made = passes(network, columns, share, self.options.num_epochs, self.options.minibatch_size, generator)
+        for forward, log_NA, count, (_, part_NA, part_N) in made:
             # Of KL(target || pi) in log pi it is -target, and so in the logits pi - target.
-            down_NA = -(part_N * (1 / len(part_N)))[:, None] * part_NA.exp()
-            loss = mean(part_N, divergence(part_NA, log_NA))
-            readings.add(grad_norm=self.step(network, forward, loss, through_log_softmax(log_NA, down_NA)))
+            down_NA = -(part_N * (1 / count))[:, None] * part_NA.exp()
+            loss = mean(part_N, divergence(part_NA, log_NA), count)
+            stepped = self.step(forward, through_log_softmax(log_NA, down_NA), batch.ranks, loss)
+            assert stepped is not None
+            readings.add(grad_norm=stepped[0])
         new_NA = log_probs(network, input_N)
-        readings.add(policy=mean(weight_N, divergence(target_NA, new_NA)))
+        after = mean(weight_N, divergence(target_NA, new_NA), share.total)
+        readings.add(policy=batch.ranks.sum("the loss of the policy", after))
         return old_NA, new_NA
 
 
@@ -88,13 +93,17 @@ class CMPOUpdate(TargetUpdate):
         super().__init__(options)
 
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
-        scale = advantage_scale(batch.advantage_NA, batch.weight_N).clamp(min=batch.noise)
+        scale = advantage_scale(batch.advantage_NA, batch.weight_N, batch.ranks).clamp(min=batch.noise)
         step_NA = batch.advantage_NA / scale / self.options.temperature
         # if all actions have the same advantage, scale is 0
         return torch.where(scale == 0, 0.0, step_NA.clamp(-self.options.clip, self.options.clip)).float()
 
 
-def advantage_scale(advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"]) -> Float[Tensor, ""]:
-    """mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|: the mean size of advantages, in reward units."""
+def advantage_scale(
+    advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"], ranks: Ranks = ALONE
+) -> Float[Tensor, ""]:
+    """mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|, over the rows of all ranks: the mean size of advantages, in
+    reward units."""
     size_N = (advantage_NA - advantage_NA.mean(-1, keepdim=True)).abs().mean(-1).double()
-    return (weight_N.double() / weight_N.double().sum()) @ size_N
+    total = ranks.sum("weights of advantages", weight_N.double().sum())
+    return ranks.sum("the size of advantages", (weight_N.double() / total) @ size_N)

@@ -68,9 +68,14 @@ class TabularUpdate(Update):
         Raises:
             NotFinite: step_size w(s) adv(s, a) is not finite for the best action of a state, or the next policy is not.
         """
-        step_NA = self.step_size * batch.weight_N[:, None] * batch.advantage_NA
-        check_finite("advantage", "the step along the advantages", step_NA, batch.observation_N)
-        self.step(policy, batch.observation_N, batch.advantage_NA, batch.weight_N, batch.noise)
+        rows = batch.ranks.rows("rows of a table", batch.observation_N, batch.advantage_NA, batch.weight_N)
+        if batch.ranks.size > 1:  # in the order in which one process would have them
+            order_N = rows[0].argsort()
+            rows = [column[order_N] for column in rows]
+        state_N, advantage_NA, weight_N = rows
+        step_NA = self.step_size * weight_N[:, None] * advantage_NA
+        check_finite("advantage", "the step along the advantages", step_NA, state_N)
+        self.step(policy, state_N, advantage_NA, weight_N, batch.noise)
         return {}
 
     @abstractmethod

@@ -89,9 +89,9 @@ def _distance(algorithm: PGTS, iteration: Iteration, other_NA: Tensor) -> float:
 
 
 def _mean(iteration: Iteration, value_N: Tensor) -> float:
-    """Return the mean over the states of an iteration, by their weights in the update."""
-    share_N = iteration.weight_N / iteration.weight_N.sum()
-    return float(value_N.to(share_N.dtype) @ share_N)
+    """Return the mean over the states of an iteration, in all processes, by their weights in the update."""
+    share_N = iteration.weight_N / iteration.ranks.sum("weights", iteration.weight_N.sum())
+    return iteration.ranks.totals("the mean of states", value_N.to(share_N.dtype) @ share_N)[0]
 
 
 def span_of(q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:

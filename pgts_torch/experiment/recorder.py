@@ -56,7 +56,7 @@ class Recorder:
         self.movement = movement
         movement.before = copy.deepcopy(algorithm.policy)
         self.progress = Progress()
-        self.truth = diagnostics.Truth(algorithm) if folder is not None and algorithm.world.mdp is not None else None
+        self.truth = None if algorithm.world.mdp is None else diagnostics.Truth(algorithm)
         self.report = Reporter(config.total_steps, shown=folder is not None)
         self._last: Iteration | None = None
         self._clock = time.perf_counter()
@@ -82,13 +82,14 @@ class Recorder:
             progress.certificate = iteration.posterior
         self._last = iteration
         self.movement.follow(algorithm, iteration)
-        if self.folder is not None and k % self.config.log.every == 0:
+        if k % self.config.log.every == 0:
             tags = diagnostics.metrics(algorithm, iteration)
             if self.truth is not None and self._pi_SA is not None and self._is_truth_due(step, iteration):
                 tags |= self.truth.metrics(self._pi_SA, iteration)
-            tags["charts/SPS"] = iteration.experience.num_steps / seconds
-            self.folder.log(step, tags)
-            self.report.line(step, tags)
+            tags["charts/SPS"] = iteration.num_steps / seconds
+            if self.folder is not None:
+                self.folder.log(step, tags)
+                self.report.line(step, tags)
         go_on = [evaluation(algorithm, iteration) for evaluation in self._evaluations.values()]
         tags = {tag: value for kind in self._evaluations for tag, value in self._scores(kind, step)}
         if self.folder is not None and tags:
@@ -109,7 +110,7 @@ class Recorder:
 
     def _is_truth_due(self, step: int, iteration: Iteration) -> bool:
         """Whether this line of metrics is the first one, the last one or the first after one of `log.exact_points`."""
-        log, total, steps = self.config.log, self.config.total_steps, iteration.experience.num_steps
+        log, total, steps = self.config.log, self.config.total_steps, iteration.num_steps
         every, before = max(1, total // log.exact_points), step - log.every * steps
         # No other line follows if the training ends before as many iterations are made again.
         is_last = step + (log.every - 1) * steps >= total

@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.agent.ranks import joined_ranks
 from pgts_torch.config import Config
 from pgts_torch.errors import Failed, ModelMismatch, NotFinite, Stopped, failure
 from pgts_torch.experiment.advice import Movement
@@ -22,6 +21,7 @@ from pgts_torch.experiment.signals import StopFlag
 from pgts_torch.experiment.summary import Summary
 from pgts_torch.experiment.tracking import event_writer
 from pgts_torch.experiment.watchdog import Watchdog
+from pgts_torch.ranks import joined_ranks
 
 A_YEAR = 365 * 24 * 3600.0
 

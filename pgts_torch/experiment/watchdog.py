@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from types import CodeType, FrameType
 from typing import Self, final
 
-from pgts_torch.agent.ranks import Ranks
 from pgts_torch.errors import LOST
+from pgts_torch.ranks import Ranks
 
 PERIOD = 5.0
 """The most seconds between two looks at the training."""
@@ -19,7 +19,7 @@ SUSPICIOUS = 1 / 4
 """The share of the time limit after which a call at the same instruction may be one that hangs."""
 
 _PACKAGE = __name__.partition(".")[0]
-_WAITS = f"{_PACKAGE}.agent.ranks"
+_WAITS = f"{_PACKAGE}.exchange"
 
 _ACTIVITIES = {
     "agent.make_world": "while environments were made",

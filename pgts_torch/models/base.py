@@ -16,6 +16,7 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.models.replay import ReplayBuffer
 from pgts_torch.models.rewards import RewardRange
+from pgts_torch.ranks import ALONE, Ranks
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,7 @@ class Experience(NamedTuple):
 
     reward_N: in reward units.   discount_N: in [0, 1], 0 where the episode terminated.
     follows_N: whether the next row is another step of the same episode.
+    ranks: the processes that have the other steps, from which a model is to learn as well; all must learn the same.
     """
 
     observation_N: Shaped[Tensor, "N ..."]
@@ -45,6 +47,12 @@ class Experience(NamedTuple):
     discount_N: Float[Tensor, "N"]
     next_observation_N: Shaped[Tensor, "N ..."]
     follows_N: Bool[Tensor, "N"]
+    ranks: Ranks = ALONE
+
+    def of_all(self) -> "Experience":
+        """The steps of all processes, those of the first one first."""
+        columns: dict[str, Any] = dict(zip(self._fields, self.ranks.rows("steps", *self[:-1]), strict=False))
+        return self._replace(**columns)
 
 
 class Model(ABC):

@@ -280,7 +280,8 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
         """Pairs, next states, discounts and rewards."""
         S, A = self.num_states, self.num_actions
         limits = {"observation_N": S, "action_N": A, "next_observation_N": S}
-        columns = {name: column.cpu().numpy() for name, column in experience._asdict().items()}
+        steps = experience.of_all()._asdict()
+        columns = {name: column.cpu().numpy() for name, column in steps.items() if name != "ranks"}
         shape = columns["action_N"].shape
         for name, limit in limits.items():
             number_N = columns[name]

@@ -3,6 +3,7 @@
 import copy
 import math
 import warnings
+from collections.abc import Sequence
 from typing import Any, final
 
 import torch
@@ -18,6 +19,7 @@ from pgts_torch.models.replay import ReplayBuffer
 from pgts_torch.models.rewards import value_range
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options.models import Ensemble
+from pgts_torch.ranks import Ranks
 from pgts_torch.seeding import stream, uniform
 
 _SELDOM = 0.02
@@ -85,6 +87,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
             state=vectors, action=whole, reward=none, end=none, next_state=vectors, follows=flags, copies=copies
         )
         self._warned, self._end_share = False, 0.0
+        self._reward_limits: tuple[float, float] | None = None  # where others have seen rewards as well
         self._networks = EnsembleNetworks(
             state_size,
             num_actions,
@@ -114,7 +117,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         Warns:
             UserWarning: once, where half of the variance of changes is unexplained: observations may not be states.
         """
-        states, ends = self._checked(experience), experience.discount_N == 0
+        states, ends, ranks = self._checked(experience), experience.discount_N == 0, experience.ranks
         is_first = self.replay.num_added == 0
         self.replay.add(
             state=states,
@@ -125,19 +128,20 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
             follows=experience.follows_N,
             copies=self._copies(ends, generator),
         )
-        self._measure_moments()
+        self._measure_moments(ranks)
         held_out = held_out_rows(self.replay)
         trained = torch.nonzero(~held_out).flatten()
         ended = trained[self.replay.rows("end", trained) > 0]
-        self._end_share = len(ended) / len(trained)
-        count = self.options.first_updates if is_first else round(self.options.updates_per_step * len(states))
-        losses = [self._fit(trained, ended, generator) for _ in range(count)]
+        new_R, *rows = ranks.each("kept steps", len(states), len(trained), len(ended)).T.tolist()
+        self._end_share = sum(rows[1]) / sum(rows[0])
+        count = self.options.first_updates if is_first else round(self.options.updates_per_step * sum(new_R))
+        losses = [self._fit(trained, ended, rows, generator, ranks) for _ in range(count)]
         found = torch.stack(losses).tolist() if losses else []
         for value in found:
             if not math.isfinite(value):
                 raise NotFinite(f"the loss of the learned model is {value}", what="model")
         self.generation += 1
-        return {"loss": sum(found) / max(count, 1), **self._errors(held_out)}
+        return {"loss": sum(found) / max(count, 1), **self._errors(held_out, ranks)}
 
     def _checked(self, experience: Experience) -> Float[Tensor, "N D"]:
         observation_N, discount_N = experience.observation_N, experience.discount_N
@@ -163,45 +167,58 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         mean_NE = torch.ones(len(end_N), self.options.members, device=generator.device)
         return torch.where(end_N[:, None].cpu(), 1.0, torch.poisson(mean_NE, generator=generator).cpu())
 
-    def _measure_moments(self) -> None:
+    def _measure_moments(self, ranks: Ranks) -> None:
         state_ND, next_ND, reward_N = (self.replay.rows(name) for name in ("state", "next_state", "reward"))
         seen = {"state": state_ND, "change": next_ND - state_ND, "reward": reward_N[:, None]}
-        self._networks.measure(seen, rescale=self.generation > 0)  # before nothing is predicted
+        self._networks.measure(seen, ranks, rescale=self.generation > 0)  # before nothing is predicted
+        if ranks.size > 1:
+            limits = ranks.least("limits of rewards", torch.stack([reward_N.min(), -reward_N.max()]))
+            self._reward_limits = float(limits[0]), -float(limits[1])
 
-    def _fit(self, trained: Int[Tensor, "R"], ended: Int[Tensor, "Q"], generator: torch.Generator) -> Tensor:
+    def _fit(
+        self,
+        trained: Int[Tensor, "R"],
+        ended: Int[Tensor, "Q"],
+        rows: Sequence[Sequence[float]],
+        generator: torch.Generator,
+        ranks: Ranks,
+    ) -> Tensor:
         """Take one gradient step, with a minibatch for each member, but none where the loss is not finite. Return the
         loss; nothing is read back from the device.
 
         Args:
             trained: the rows that are not held out.
             ended: those of them that ended an episode; if there are any, a quarter of each minibatch is of these.
+            rows: how many of both each process has. A minibatch has as large a part of each process.
         """
         E, N = self.options.members, self.options.minibatch_size
+        extra = round(N * _ENDS) if sum(rows[1]) else 0
+        own, own_extra = ranks.portion(N - extra, rows[0]), ranks.portion(extra, rows[1]) if extra else 0
 
         def sampled(rows: Tensor, count: int) -> Tensor:
             return rows[torch.randint(len(rows), (E, count), generator=generator, device=generator.device).cpu()]
 
-        extra = round(N * _ENDS) if len(ended) else 0
-        at = torch.cat([sampled(trained, N - extra), sampled(ended, extra)] if extra else [sampled(trained, N)], 1)
+        at = torch.cat([sampled(trained, own), sampled(ended, own_extra)] if own_extra else [sampled(trained, own)], 1)
         columns = ("state", "action", "reward", "end", "next_state")
         state, action, reward, end, after = (self.replay.rows(c, at.flatten()).to(self.device) for c in columns)
         # The frequency of a row among all steps, divided by that in the minibatch, where ends are oversampled. The loss
         # of ends has no such weight: their log odds are corrected by `_log_odds_added`.
         copies = self.replay.rows("copies")[at, torch.arange(E)[:, None]].flatten().to(self.device)
         weight = copies / (1 - _ENDS + _ENDS * end / self._end_share) if extra else copies
-        output = self._networks.outputs(self._networks.inputs(state, action).view(E, N, -1)).reshape(E * N, -1)
+        output = self._networks.outputs(self._networks.inputs(state, action).view(*at.shape, -1)).flatten(0, 1)
         scaled = self._networks.scaled
         aimed = torch.cat([scaled("change", after - state), scaled("reward", reward[:, None])], -1)
         changes, rewards, logits = output.split([self.state_size, 1, 1], -1)
         loss = (
-            weight @ nn.functional.smooth_l1_loss(changes, aimed[:, :-1], reduction="none").mean(-1) / len(weight)
-            + weight @ (rewards - aimed[:, -1:]).square()[:, 0] / len(weight)
-            + nn.functional.binary_cross_entropy_with_logits(logits[:, 0], end, copies)
+            weight @ nn.functional.smooth_l1_loss(changes, aimed[:, :-1], reduction="none").mean(-1) / (E * N)
+            + weight @ (rewards - aimed[:, -1:]).square()[:, 0] / (E * N)
+            + nn.functional.binary_cross_entropy_with_logits(logits[:, 0], end, copies) * (len(weight) / (E * N))
         )
         self._optimiser.zero_grad()
         loss.backward()
+        loss = self._networks.sum_gradients(loss, ranks)
         # What torch's gradient scaler sets: a step with it is left out, without a branch on the host.
-        self._optimiser.found_inf = (~loss.detach().isfinite()).float()  # type: ignore[attr-defined]  # Adam reads it
+        self._optimiser.found_inf = (~loss.detach().isfinite()).to(torch.float32)  # type: ignore[attr-defined]  # Adam reads it
         self._optimiser.step()
         return loss.detach()
 
@@ -251,13 +268,14 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         action_N = torch.arange(self.num_actions, device=self.device).repeat(len(state_N))
         said = self.members(self.states(state_N).repeat_interleave(self.num_actions, 0), action_N)
         rewards = self.replay.rows("reward")
-        low, high = value_range((float(rewards.min()), float(rewards.max())), self.gamma)
+        limits = self._reward_limits or (float(rewards.min()), float(rewards.max()))
+        low, high = value_range(limits, self.gamma)
         spread_N = said.spread(self._deviations["state"], self.gamma * (high - low))
         return spread_N.double().view(-1, self.num_actions)
 
-    def _errors(self, held_out: Tensor) -> dict[str, float]:
+    def _errors(self, held_out: Tensor, ranks: Ranks) -> dict[str, float]:
         """The errors on held-out steps, by name (`learn`)."""
-        errors = prediction_errors(self.replay, held_out, self.step, self._deviations)
+        errors = prediction_errors(self.replay, held_out, self.step, self._deviations, ranks)
         if errors.get("unexplained", 0.0) > _UNEXPLAINED and len(self.replay) >= _ENOUGH_STEPS and not self._warned:
             self._warned = True
             warnings.warn(
@@ -280,6 +298,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
             "end_share": self._end_share,
             "warned": self._warned,
             "generation": self.generation,
+            "reward_limits": self._reward_limits,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -292,3 +311,4 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         self.replay.load_state_dict(state["replay"])
         self._end_share = state["end_share"]
         self._warned, self.generation = bool(state["warned"]), state["generation"]
+        self._reward_limits = state.get("reward_limits")

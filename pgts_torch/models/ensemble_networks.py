@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.prediction import Prediction
+from pgts_torch.ranks import ALONE, Ranks
 
 _CLIP = 8.0
 """Standardised inputs are clipped to +- this."""
@@ -58,8 +59,8 @@ class EnsembleNetworks:
             for name, size in (("state", state_size), ("change", state_size), ("reward", 1))
         }
 
-    def measure(self, values: Mapping[str, Float[Tensor, "N D"]], *, rescale: bool) -> None:
-        """Take the moments of these values, by name.
+    def measure(self, values: Mapping[str, Float[Tensor, "N D"]], ranks: Ranks = ALONE, *, rescale: bool) -> None:
+        """Take the moments of these values, of all ranks, by name.
 
         Args:
             rescale: the weights, so that what is predicted stays the same.
@@ -69,6 +70,9 @@ class EnsembleNetworks:
         """
         for name, value in values.items():
             mean, deviation = value.mean(0), value.std(0, correction=0)
+            if ranks.size > 1:
+                count, mean_D, square_D = ranks.moments(f"{name}s", value.double())
+                mean, deviation = mean_D.to(mean), (square_D / count).sqrt().to(mean)
             if not bool((mean + deviation).isfinite().all()):
                 raise NotFinite(
                     f"the mean of {name}s is {mean.tolist()}; what a model learns must be finite", what="model"
@@ -95,6 +99,15 @@ class EnsembleNetworks:
         of = slice(0, self.state_size) if name == "change" else slice(self.state_size, self.state_size + 1)
         weight[..., of] /= ratio
         bias[..., of] = (bias[..., of] - shift) / ratio
+
+    def sum_gradients(self, loss: Tensor, ranks: Ranks) -> Tensor:
+        """Replace the gradients of the weights by their sums over ranks, and return the sum of the loss."""
+        gradients = [weight.grad for weight in self.weights if weight.grad is not None]
+        flat, (loss,) = ranks.summed("the gradient of the model", gradients, loss.detach())
+        if ranks.size > 1:
+            for own, piece in zip(gradients, flat[0].split([each.numel() for each in gradients]), strict=True):
+                own.copy_(piece.view_as(own))
+        return loss
 
     def scaled(self, name: str, value: Tensor) -> Tensor:
         """The standardised value: (value - mean) / deviation; 0 where it has been constant."""

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.models.replay import ReplayBuffer
+from pgts_torch.ranks import Ranks
 
 BLOCK, _HELD_OUT = 32, 10
 """Of every 10 blocks of 32 steps in a row the last one is held out."""
@@ -61,8 +62,9 @@ def prediction_errors(
     held_out_R: Bool[Tensor, "R"],
     step: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]],
     deviations: Mapping[str, Tensor],
+    ranks: Ranks,
 ) -> dict[str, float]:
-    """The errors of a model on held-out steps, by name; left out where too few are held out.
+    """The errors of a model on the held-out steps of all ranks, by name; left out where too few are held out.
 
     error_1, error_4, error_16: the root mean square error of the state predicted so many steps ahead, in standard
     deviations of states. unexplained: the share of the variance of changes that is not predicted, but for outliers.
@@ -74,7 +76,7 @@ def prediction_errors(
     errors = {}
     for steps in _AHEAD:
         starts = runs(held_out_R, buffer.rows("follows"), steps)[-_MOST_MEASURED:]
-        if len(starts) == 0:
+        if ranks.totals("held-out steps", len(starts)) == [0]:
             continue
         device = deviations["state"].device
         state_ND = buffer.rows("state", starts).to(device)
@@ -82,10 +84,19 @@ def prediction_errors(
             at_N = (starts + ahead) % buffer.capacity
             state_ND = step(state_ND, buffer.rows("action", at_N).to(device))[2]
         off_ND = state_ND - buffer.rows("next_state", at_N).to(device)
-        errors[f"error_{steps}"] = float(_squares(off_ND, deviations["state"]).mean().sqrt())
+        errors[f"error_{steps}"] = float(_mean(_squares(off_ND, deviations["state"]), ranks).sqrt())
         if steps == 1:
-            errors["unexplained"] = float(_squares(off_ND, deviations["change"]).clamp(max=_MOST_OFF).mean())
+            square_ND = _squares(off_ND, deviations["change"]).clamp(max=_MOST_OFF)
+            errors["unexplained"] = float(_mean(square_ND, ranks))
     return errors
+
+
+def _mean(x_ND: Tensor, ranks: Ranks) -> Tensor:
+    """The mean of the numbers of all ranks."""
+    if ranks.size == 1:
+        return x_ND.mean()
+    total, count = ranks.totals("errors", x_ND.sum(), x_ND.numel())
+    return torch.tensor(total / count)
 
 
 def _squares(off_ND: Tensor, deviation_D: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch import PGTS
+from pgts_torch.agent.draws import Draws
 from pgts_torch.config import load
 from pgts_torch.errors import Failed, MemoryBudgetExceeded, PgtsError
 from pgts_torch.experiment.run import train
@@ -113,7 +114,7 @@ def test_a_certificate_with_replay_is_true():
 def test_snapshots_are_replayed_and_not_saved(tmp_path):
     training = PGTS(Drift, **ONGOING, policy=MLP(hidden=[16]))
     visited = training.iterate().experience.observation_V
-    draws = training.ranks.draws(0, 1, training.device)
+    draws = Draws.of(training.ranks, 0, 1, training.device)
     imagined, _ = next(training.dyna.rollouts(draws))
     assert torch.isin(imagined.observation_UB[0], visited).all()
     steps = imagined.steps()
@@ -127,7 +128,7 @@ def test_snapshots_are_replayed_and_not_saved(tmp_path):
 
 def test_imagined_episodes_end_where_the_environment_truncates_them():
     training = PGTS(Truncated, **ONGOING, policy=MLP(hidden=[16])).learn(120)
-    draws = training.ranks.draws(0, 9, training.device)
+    draws = Draws.of(training.ranks, 0, 9, training.device)
     imagined, _ = next(training.dyna.rollouts(draws))
     assert not training.world.model.is_cut(imagined.state_TB[imagined.alive_TB]).any()
     last_B = imagined.alive_TB.sum(0)

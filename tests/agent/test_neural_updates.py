@@ -198,7 +198,7 @@ def test_the_gradient_of_the_clipped_objective_is_that_of_autograd(monkeypatch, 
     objective_N = (old_NA.exp() * gain_NA).sum(-1) - entropy_coef * (log_NA.exp() * log_NA).sum(-1)
     expected_NA = torch.autograd.grad(-(weight_N * objective_N).mean(), logits_NA, retain_graph=True)[0]
     update = PPOUpdate(PPO(clip_range=0.2, entropy_coef=entropy_coef))
-    ours_NA, down_NA = update.objective(log_NA.detach(), old_NA, advantage_NA, weight_N)
+    ours_NA, down_NA = update.objective(log_NA.detach(), old_NA, advantage_NA, weight_N, len(weight_N))
     torch.testing.assert_close(ours_NA, (old_NA.exp() * gain_NA).detach())
     down_NA = torch.autograd.grad(log_NA, logits_NA, down_NA)[0]
     torch.testing.assert_close(down_NA, expected_NA, atol=1e-6, rtol=1e-4)
@@ -214,7 +214,7 @@ def test_the_compiled_objective_has_the_bits_of_torch(monkeypatch, entropy_coef,
     log_NA, old_NA = (torch.randn(70, num_actions, generator=generator).log_softmax(-1) for _ in range(2))
     advantage_NA = torch.randn(70, num_actions, generator=generator) * 10 ** torch.arange(-3, 4, 0.1)[:, None]
     advantage_NA[:3], old_NA[3], log_NA[4] = torch.tensor([[0.0], [math.inf], [math.nan]]), log_NA[3], math.nan
-    given = log_NA, old_NA, advantage_NA, torch.rand(70, generator=generator)
+    given = log_NA, old_NA, advantage_NA, torch.rand(70, generator=generator), 70
     found = update.objective(*given)
     with torch_only():
         expected = update.objective(*given)

@@ -282,15 +282,15 @@ def test_a_policy_that_never_takes_what_is_not_allowed_is_trained(make, update, 
         policy.probs_SA[:] = torch.tensor([0.5, 0.5, 0.0])
     options = {"num_envs": 2, "horizon": {"type": "fixed", "length": 5}, "env_kwargs": {"num_actions": 3}}
     model = PGTS("pgts/Random-v0", depth=1, policy=policy, update=update, **options)
-    in_parts, allowed = PolicyLookahead.in_parts, []
+    call, allowed = PolicyLookahead.__call__, []
 
-    def denied(*args):
-        look = in_parts(*args)
+    def denied(*args, **given):
+        look = call(*args, **given)
         look.q_BA[:, 2] = -math.inf
         allowed.append(look.q_BA[:, :2])
         return look
 
-    monkeypatch.setattr(PolicyLookahead, "in_parts", denied)
+    monkeypatch.setattr(PolicyLookahead, "__call__", denied)
     seen = model.iterate()
     shallow_NA, deep_NA = allowed
     assert seen.gap_N.tolist() == pytest.approx((deep_NA.amax(-1) - shallow_NA.mean(-1)).clamp(min=0).tolist())

@@ -1,5 +1,7 @@
 """Processes that train together: what they exchange, and that their update is that of one with the whole batch."""
 
+import copy
+import math
 import os
 import time
 from collections.abc import Callable
@@ -13,11 +15,16 @@ from gymnasium import spaces
 from torch import distributed
 
 from pgts_torch import PGTS
-from pgts_torch.agent import visit
+from pgts_torch.agent import dyna, explorer, visit
 from pgts_torch.agent.callbacks import EvalCallback
-from pgts_torch.agent.ranks import Draws, Ranks, checksum, joined_ranks, present_ranks
+from pgts_torch.agent.draws import Draws
+from pgts_torch.agent.optimisers import Optimiser
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import NotFinite, PgtsError, RankLost
+from pgts_torch.models.base import Experience
+from pgts_torch.models.ensemble import EnsembleModel
+from pgts_torch.options import Ensemble
+from pgts_torch.ranks import ALONE, Ranks, checksum, joined_ranks, present_ranks
 from pgts_torch.seeding import stream
 from tests.forks import launched, on_ranks
 from tests.models.corridors import Corridor
@@ -64,6 +71,27 @@ KINDS: dict[str, Callable[..., PGTS]] = {
 }
 
 
+@pytest.fixture
+def in_float64(monkeypatch):
+    """All networks in float64, where a sum in another order is as good as the same."""
+    monkeypatch.setattr(torch.Tensor, "float", torch.Tensor.double)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(before)
+
+
+def made(make: Callable[..., PGTS]) -> PGTS:
+    """A training whose networks are in the default dtype."""
+    model = make(num_envs=5, seed=3)
+    slow = None if model.dyna is None else model.dyna.policy
+    for part in (model.policy, model.critic, slow) if torch.get_default_dtype() == torch.float64 else ():
+        for name in ("network", "_target_network"):
+            if (network := getattr(part, name, None)) is not None:
+                network.double()
+    return model
+
+
 def tensors(state: Any) -> list[torch.Tensor]:
     """All tensors of nested mappings, in the order of names."""
     if isinstance(state, torch.Tensor):
@@ -71,34 +99,84 @@ def tensors(state: Any) -> list[torch.Tensor]:
     return [each for name in sorted(state) for each in tensors(state[name])] if isinstance(state, dict) else []
 
 
-def plain(experience: Rollout, model: PGTS) -> dict[str, Any]:
-    """Episodes without their numbers of states: what stands for a state is what another process is told of it."""
-    columns = {each.name: getattr(experience, each.name) for each in fields(experience) if each.name != "state_UB"}
-    if model.dyna is not None:  # the states of a learned model are what is observed
-        states = experience.observation_UB.flatten(0, 1)
+def plain(rollout: Rollout, model: PGTS) -> dict[str, Any]:
+    """Episodes of one process, with states in a form that another one can number."""
+    columns = {each.name: getattr(rollout, each.name) for each in fields(rollout) if each.name not in NOT_PLAIN}
+    if model.dyna is not None:  # in worlds with replay here the states are what is observed
+        states = rollout.observation_UB.flatten(0, 1)
     else:
-        states = None if experience.state_UB is None else model.world.export(experience.state_UB.flatten())
+        states = None if rollout.state_UB is None else model.world.export(rollout.state_UB.flatten())
     return {"columns": columns, "states": states}
 
 
-def trained(make: Callable[..., PGTS], *, num_envs: int, iterations: int = 3) -> dict[str, Any]:
-    model, seen = make(num_envs=num_envs, seed=3), []
+NOT_PLAIN = "state_UB", "totals"
+
+
+def joined(parts: list[dict[str, Any]], world: Any) -> Rollout:
+    """One rollout with the episodes of all processes: those of each begin in the row after the last one of those
+    before. So visits are in the order of processes, as they are when these divide minibatches."""
+    lengths = [len(part["columns"]["alive_TB"]) for part in parts]
+    numbered = [None if part["states"] is None else world.adopt(part["states"]) for part in parts]
+
+    def placed(x_TB: torch.Tensor, before: int, extra: int) -> torch.Tensor:
+        after = sum(lengths) + extra - before - len(x_TB)
+        return torch.cat([x_TB[:1].expand(before, *x_TB.shape[1:]), x_TB, x_TB[-1:].expand(after, *x_TB.shape[1:])])
+
+    columns: dict[str, Any] = {}
+    for name, like in parts[0]["columns"].items():
+        if name == "finished":
+            columns[name] = None if like is None else tuple(each for part in parts for each in part["columns"][name])
+        elif like is None:
+            columns[name] = None
+        elif name == "begins_B":
+            columns[name] = torch.cat([part["columns"][name] for part in parts])
+        else:
+            extra = name.endswith("_UB")
+            pieces = [placed(part["columns"][name], sum(lengths[:rank]), extra) for rank, part in enumerate(parts)]
+            columns[name] = torch.cat(pieces, 1)
+    for rank in range(len(parts)):
+        first = sum(part["columns"]["alive_TB"].shape[1] for part in parts[:rank])
+        own = slice(first, first + parts[rank]["columns"]["alive_TB"].shape[1])
+        outside = torch.ones(sum(lengths), dtype=torch.bool)
+        outside[sum(lengths[:rank]) : sum(lengths[: rank + 1])] = False
+        for name in ("alive_TB", "weight_TB"):
+            columns[name][outside, own] = 0
+    states = [
+        placed(state_N.view(length + 1, -1), sum(lengths[:rank]), 1)
+        for rank, (state_N, length) in enumerate(zip(numbered, lengths, strict=True))
+        if state_N is not None
+    ]
+    return Rollout(**columns, state_UB=torch.cat(states, 1) if states else None)
+
+
+def trained(make: Callable[..., PGTS], *, iterations: int = 3) -> dict[str, Any]:
+    """What a process makes, and all that it has learned."""
+    model, seen = made(make), list[dict[str, Any]]()
+    rollouts, models = list[dict[str, Any]](), list[dict[str, Any]]()
+    imagine = dyna.imagine
+
+    def imagined(*args: Any, **options: Any) -> Rollout:
+        rollouts.append(plain(rollout := imagine(*args, **options), model))
+        return rollout
+
+    dyna.imagine = explorer.imagine = imagined  # in this process, which ends here
+    if isinstance(model.world.model, EnsembleModel):
+        learn = model.dyna.learn
+
+        def learned(*args: Any) -> dict[str, float]:
+            losses = learn(*args)
+            models.append(copy.deepcopy(model.world.model.state_dict()))
+            return losses
+
+        model.dyna.learn = learned
     for _ in range(iterations):
         iteration = model.iterate()
-        about = {"depth": iteration.depth, "gap": float(iteration.gap_N.sum()), "certificate": iteration.certificate}
+        gap = iteration.ranks.totals("a test", iteration.gap_N @ iteration.weight_N.to(iteration.gap_N))[0]
+        about = {"depth": iteration.depth, "gap": gap, "certificate": iteration.certificate}
+        about["losses"] = {k: v for k, v in iteration.losses.items() if not k.startswith("model_")}
         seen.append({"experience": plain(iteration.experience, model), **about})
-    return {
-        "seen": seen,
-        "policy": model.policy.state_dict(),
-        "critic": model.critic.state_dict(),
-        "dyna": learned(model),
-        "counts": counts(model),
-    }
-
-
-def learned(model: PGTS) -> dict[str, Any]:
-    """A learned model, and what is replayed."""
-    return {} if model.dyna is None else model.dyna.state_dict()
+    parts = {"policy": model.policy.state_dict(), "critic": model.critic.state_dict()}
+    return {"seen": seen, "imagined": rollouts, "models": models, "counts": counts(model), **parts}
 
 
 def counts(model: PGTS) -> tuple[int, int, int]:
@@ -106,69 +184,141 @@ def counts(model: PGTS) -> tuple[int, int, int]:
 
 
 def replayed(
-    make: Callable[..., PGTS], seen: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, within: dict[str, float]
+    make: Callable[..., PGTS], all_made: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, within: float = math.inf
 ) -> PGTS:
-    """One process that is given the episodes of all others, and what it makes of them at the depths that they took.
+    """One process that is given the episodes of all, and what it makes of them at the depths that they took.
 
     An adaptive depth may be larger in several processes than alone, never smaller: each has asked about a part of the
     states, so they bound what is missing less tightly, and the gap falls short of it more often.
     """
-    model, chooser = make(num_envs=4, seed=3), make(num_envs=4, seed=3)
-    alone = Ranks.draws
+    model, chooser = made(make), made(make)
+    alone = Draws.of
+    imagined = iter(list(zip(*(each["imagined"] for each in all_made), strict=True)))
 
-    def draws(self: Ranks, seed: int, number: int, device: torch.device) -> Draws:
+    def draws(ranks: Ranks, seed: int, number: int, device: torch.device) -> Draws:
         """With the random numbers that several ranks have in common."""
         common = stream(seed, "iteration", number, "common", device=device)
-        return replace(alone(self, seed, number, device), common=common)
+        return replace(alone(ranks, seed, number, device), common=common)
 
-    for each in seen:
+    def update(self: Draws, number: int) -> Draws:
+        common = stream(self.seed, "iteration", self.number, "update", number, "common")
+        return replace(self, common=common, _common_names=("iteration", self.number, "update", number))
 
-        def given(world: Any, *rest: Any, each=each, **options: Any) -> Rollout:
-            columns, states = each["experience"]["columns"], each["experience"]["states"]
-            state_UB = None if states is None else world.adopt(states).view(columns["observation_UB"].shape[:2])
-            return Rollout(**columns, state_UB=state_UB)
+    def learn(*_: Any) -> dict[str, float]:
+        states = [each["models"][model.num_iterations] for each in all_made]
+        model.world.model.load_state_dict(copy.deepcopy(states[0]))
+        model.dyna.replay.num_added = sum(state["replay"]["num_added"] for state in states)
+        return {}
+
+    def values(self: Rollout, v: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """Also where episodes do not begin in the first row."""
+        nobody = torch.zeros_like(self.alive_TB[:1])
+        needed_UB = torch.cat([self.alive_TB, nobody]) | torch.cat([nobody, self.alive_TB])
+        v_UB = torch.zeros_like(needed_UB, dtype=self.reward_TB.dtype)
+        v_UB[needed_UB] = v(self.observation_UB[needed_UB]).to(v_UB)
+        return v_UB[:-1], v_UB[1:]
+
+    monkeypatch.setattr(Draws, "of", draws)
+    monkeypatch.setattr(Draws, "update", update)
+    monkeypatch.setattr(Rollout, "values", values)
+    for module in (dyna, explorer):
+        monkeypatch.setattr(module, "imagine", lambda world, *_, **__: joined(next(imagined), world))
+    if isinstance(model.world.model, EnsembleModel):
+        model.dyna.learn = learn
+    for parts in zip(*(each["seen"] for each in all_made), strict=True):
+        each = parts[0]
+
+        def given(world: Any, *_: Any, parts=parts, **__: Any) -> Rollout:
+            return joined([part["experience"] for part in parts], world)
 
         monkeypatch.setattr(visit, "rollout", given)
         if model.episodes is not None:
             monkeypatch.setattr(model.episodes, "collect", partial(given, model.world))
-        monkeypatch.setattr(Ranks, "draws", draws)
         if chooser.depth_choice is not None and len(chooser.depth_choice.depths) > 1:
             chooser.load_state_dict(model.state_dict())
             assert chooser.iterate().depth <= each["depth"]
             model.depth_choice.depths = [each["depth"]]
         iteration = model.iterate()
+        if within == math.inf:
+            continue
         assert iteration.depth == each["depth"]
-        assert float(iteration.gap_N.sum()) == pytest.approx(each["gap"], **within, nan_ok=True)
+        assert float(iteration.gap_N @ iteration.weight_N.to(iteration.gap_N)) == pytest.approx(
+            each["gap"], rel=1e3 * within, nan_ok=True
+        )
+        losses = {name: value for name, value in iteration.losses.items() if not name.startswith("model_")}
+        assert losses == pytest.approx(each["losses"], rel=1e3 * within, abs=10 * within)
         assert iteration.certificate <= each["certificate"] + 1e-9  # each rank has asked about a part of the states
     return model
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("size", [2, 3])
-def test_ranks_make_the_update_of_one_process_with_the_whole_batch(kind, size, monkeypatch):
-    make = KINDS[kind]
-    # Tables are float64; networks are float32, and what they say of a state depends on its batch in the last bits.
-    within = {"rel": 1e-4, "abs": 1e-5} if "network" in kind else {"rel": 0.0, "abs": 1e-12}
-    first, *others = on_ranks(size, lambda: trained(make, num_envs=4))
+def test_ranks_make_the_update_of_one_process_with_the_whole_batch(kind, size, monkeypatch, request):
+    make, within = KINDS[kind], 1e-12
+    if "learned model" in kind:
+        within = 1e-4  # the states of an ensemble are float32
+    else:
+        request.getfixturevalue("in_float64")
+    first, *others = all_made = on_ranks(size, lambda: trained(make))
     for other in others:
         assert checksum(other["policy"]) == checksum(first["policy"])
+        assert checksum(other["critic"]) == checksum(first["critic"])
         assert other["counts"] == first["counts"]
-    widths = [each["experience"]["columns"]["reward_TB"].shape[1] for each in first["seen"]]
-    assert "learned" in kind or widths == [4] * len(widths)  # episodes that go on have a column for each part
-    alone = replayed(make, first["seen"], monkeypatch, within)
+    alone = replayed(make, all_made, monkeypatch, within)
     assert counts(alone)[:2] == first["counts"][:2]
-    parts = {"policy": alone.policy.state_dict(), "critic": alone.critic.state_dict(), "dyna": learned(alone)}
-    for part, state in parts.items():
+    for part, state in {"policy": alone.policy.state_dict(), "critic": alone.critic.state_dict()}.items():
         for mine, theirs in zip(tensors(state), tensors(first[part]), strict=True):
-            torch.testing.assert_close(mine, theirs, rtol=within["rel"], atol=within["abs"])
-    start = make(num_envs=4, seed=3)
+            torch.testing.assert_close(mine, theirs, rtol=within, atol=within)
+    start = made(make)
     assert checksum(start.policy.state_dict()) != checksum(first["policy"])
 
 
+@pytest.mark.usefixtures("in_float64")
+def test_a_part_of_the_episodes_makes_another_update(monkeypatch):
+    make = KINDS["network, torch dynamics"]
+    all_made = on_ranks(2, lambda: trained(make, iterations=1))
+    other = replayed(make, [all_made[0]] * 2, monkeypatch)
+    pairs = zip(tensors(other.policy.state_dict()), tensors(all_made[0]["policy"]), strict=True)
+    assert max(float((mine - theirs).abs().max()) for mine, theirs in pairs) > 1e-6
+
+
+@pytest.mark.usefixtures("in_float64")
+def test_an_ensemble_learns_on_ranks_as_one_process_does_from_the_steps_of_all(monkeypatch):
+    random = torch.Generator().manual_seed(0)
+    observation_ND, change_ND = (torch.rand(60, 3, generator=random) for _ in range(2))
+    number_N = torch.arange(60)
+    discount_N = torch.where(number_N % 10 == 7, 0.0, 0.9)
+    columns = [observation_ND, number_N % 2, change_ND[:, 0], discount_N, observation_ND + change_ND, discount_N > 0]
+    parts = 1
+
+    def sampled(high: int, shape: tuple[int, int], **_: Any) -> torch.Tensor:
+        """Where one process samples for two, what both sample from their halves of the steps."""
+        own = torch.arange(shape[0] * shape[1] // parts).view(shape[0], -1) * 7 % (high // parts)
+        return torch.cat([own + part * (high // parts) for part in range(parts)], 1)
+
+    def learned(ranks: Ranks, own: slice) -> tuple[dict[str, Any], dict[str, float]]:
+        options = Ensemble(members=2, hidden=[8], first_updates=6, minibatch_size=16)
+        model = EnsembleModel(3, 2, gamma=0.9, options=options)
+        losses = model.learn(Experience(*(column[own] for column in columns), ranks), generator=stream(0, "learn"))
+        state = model.state_dict()
+        return {name: state[name] for name in ("weights", "moments")}, losses
+
+    monkeypatch.setattr(torch, "randint", sampled)
+    monkeypatch.setattr(torch, "poisson", lambda mean, **_: mean.clone())
+    made_of = on_ranks(2, lambda: learned(ranks := present_ranks(), slice(30 * ranks.rank, 30 * ranks.rank + 30)))
+    parts = 2
+    (alone, losses), (half, _) = learned(ALONE, slice(60)), learned(ALONE, slice(30))
+    for state, found in made_of:
+        assert found["loss"] == pytest.approx(losses["loss"], rel=1e-12)
+        for mine, theirs in zip(state["weights"], alone["weights"], strict=True):
+            torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
+    assert (half["weights"][0] - alone["weights"][0]).abs().max() > 1e-4
+
+
 def test_ranks_make_different_episodes(monkeypatch):
-    [first, _] = on_ranks(2, lambda: trained(KINDS["network, torch dynamics"], num_envs=4, iterations=1))
-    state_UBD = first["seen"][0]["experience"]["states"].view(-1, 4, 4)
-    assert len(state_UBD[0].unique(dim=0)) == 4
+    made_of = on_ranks(2, lambda: trained(KINDS["network, torch dynamics"], iterations=1))
+    starts = [each["seen"][0]["experience"]["columns"]["observation_UB"][0] for each in made_of]
+    assert len(torch.cat(starts).unique(dim=0)) == 5
 
 
 def test_the_lookahead_is_shared_out():
@@ -183,9 +333,34 @@ def test_the_lookahead_is_shared_out():
     assert abs(mine - theirs) < 0.2 * total
 
 
+def test_a_gradient_step_is_one_exchange_and_the_others_do_not_grow_with_the_length_of_episodes():
+    def work(length: int) -> tuple[int, int, int]:
+        horizon = {"type": "fixed", "length": length}
+        model = PGTS("MountainCar-v0", depth=1, num_envs=4, policy=SMALL["policy"], horizon=horizon)
+        exchange, steps, step = model.ranks.exchange, list[int](), Optimiser.step
+
+        def counted(self: Optimiser, parameters: Any, gradients: Any, *rest: Any) -> torch.Tensor:
+            steps.append(sum(map(torch.numel, gradients)))
+            return step(self, parameters, gradients, *rest)
+
+        Optimiser.step = counted  # in this process, which ends here
+        assert exchange is not None
+        before = exchange.num_calls, exchange.num_bytes
+        model.iterate()
+        in_steps = sum(4 * (size + 1) for size in steps)  # float32, and the loss
+        return len(steps), exchange.num_calls - before[0] - len(steps), exchange.num_bytes - before[1] - in_steps
+
+    [(few, calls, bytes_), _], [(many, other_calls, other_bytes), _] = (
+        on_ranks(2, lambda length=length: work(length)) for length in (20, 60)
+    )
+    assert 0 < few < many
+    assert calls == other_calls
+    assert abs(bytes_ - other_bytes) < 32  # what is pickled has shorter and longer numbers
+
+
 def test_more_ranks_than_states_leave_some_without_a_lookahead():
     make = partial(PGTS, "pgts/Ladder-v0", depth=2, horizon={"type": "fixed", "length": 1})
-    answers = on_ranks(3, lambda: trained(make, num_envs=3, iterations=2))
+    answers = on_ranks(3, lambda: trained(make, iterations=2))
     assert len({checksum(each["policy"]) for each in answers}) == 1
 
 

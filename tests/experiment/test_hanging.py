@@ -12,10 +12,10 @@ import pytest
 from gymnasium.envs.classic_control import CartPoleEnv
 
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.agent.ranks import joined_ranks
 from pgts_torch.cli.main import main
 from pgts_torch.errors import LOST
 from pgts_torch.experiment import checkpoint, run
+from pgts_torch.ranks import joined_ranks
 from tests.experiment.runs import arguments, left
 from tests.forks import in_child, launched
 

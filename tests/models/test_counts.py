@@ -95,10 +95,10 @@ def test_one_call_learns_what_many_calls_do():
     experience = steps(mdp, pair_N)._replace(reward_N=torch.from_numpy(random.normal(size=500)))
     one, many = learned(mdp, experience), learned(mdp, None)
     for part in torch.arange(500).split(7):
-        many.learn(Experience(*(column[part] for column in experience)), generator=stream(0, "learn"))
+        many.learn(Experience(*(column[part] for column in experience[:-1])), generator=stream(0, "learn"))
     for name, column in one.state_dict().items():
         assert column.equal(many.state_dict()[name])
-    other = learned(mdp, Experience(*(column[1:] for column in experience)))
+    other = learned(mdp, Experience(*(column[1:] for column in experience[:-1])))
     assert not one.outcomes(torch.arange(30)).reward_NA.equal(other.outcomes(torch.arange(30)).reward_NA)
     # Each outcome counts once more than it was seen, with the mean of its rewards.
     seen = list(zip(pair_N.tolist(), experience.next_observation_N.tolist(), strict=True))
@@ -293,7 +293,7 @@ def news(model: CountsModel, visits: int) -> list[int]:
 )
 def test_steps_are_news_when_a_pair_becomes_known_or_has_been_seen_twice_as_often(options, expected):
     model = CountsModel(3, 1, gamma=0.9, options=options)
-    often = Experience(*(column.repeat(1000) for column in step(2, 0, 0.0, 2)))
+    often = Experience(*(column.repeat(1000) for column in step(2, 0, 0.0, 2)[:-1]))
     model.learn(often, generator=stream(0, "learn"))
     if options != NONE:  # one outcome more; without it everything is certain
         model.learn(step(2, 0, 0.0, 1), generator=stream(0, "learn"))
@@ -315,7 +315,7 @@ def test_a_plain_table_learns_with_the_optimistic_one_and_a_search_notices():
     with pytest.raises(PgtsError, match="new topology"):
         expectimax(plain, torch.tensor([0]), depth=0, v_leaf=lambda state_N: state_N.double(), topology=topology)
     before = model.generation
-    model.learn(Experience(*(column[:0] for column in step(0, 0, 2.0, 1))), generator=stream(0, "learn"))
+    model.learn(Experience(*(column[:0] for column in step(0, 0, 2.0, 1)[:-1])), generator=stream(0, "learn"))
     assert model.generation == before
     assert (model.exact, model.is_certain, model.highest_value) == (False, False, math.inf)
 
