@@ -117,7 +117,7 @@ class Blackjack(SnapshotAdapter):
 
 
 _FLOAT64, _HEAD = np.dtype(np.float64), b"dNone:"
-"""Most states are of this dtype, and not after an end: how their keys begin."""
+"""Most states are vectors of this dtype, and not after an end: how their keys begin, which are their data too."""
 
 
 @final
@@ -129,15 +129,18 @@ class ClassicControl(SnapshotAdapter):
 
     def get_state(self, env: Any) -> Snapshot:
         held, beyond = env.state, vars(env).get("steps_beyond_terminated")
-        state = held.copy() if type(held) is np.ndarray else np.array(held)
-        head = _HEAD if beyond is None and state.dtype is _FLOAT64 else f"{state.dtype.char}{beyond}:".encode()
-        return Snapshot(head + state.tobytes(), (state, beyond))
+        if beyond is None and type(held) is np.ndarray and held.dtype is _FLOAT64 and held.ndim == 1:
+            key = _HEAD + held.tobytes()
+            return Snapshot(key, key)
+        state = np.array(held)
+        return Snapshot(f"{state.dtype.char}{beyond}:".encode() + state.tobytes(), (state, beyond))
 
     def set_state(self, env: Any, data: Any) -> None:
-        state, beyond = data
-        env.state = state.copy()
+        # An array of its own, because the environment may write into its state.
+        is_key = type(data) is bytes
+        env.state = np.frombuffer(bytearray(data[len(_HEAD) :])) if is_key else data[0].copy()
         if "steps_beyond_terminated" in vars(env):
-            env.steps_beyond_terminated = beyond
+            env.steps_beyond_terminated = None if is_key else data[1]
 
     def same_world(self, env: Any, own: Any) -> bool:
         return type(env) is type(own) and _constants(env) == _constants(own)

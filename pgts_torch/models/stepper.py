@@ -152,11 +152,8 @@ class Stepper:
             if not (as_paid and type(reward) is float and -LARGEST_REWARD <= reward <= LARGEST_REWARD):
                 reward = self._reward(reward, rewards)
             kept = None
-            if (
-                rows is not None
-                and type(observation) is np.ndarray
-                and (observation.shape, observation.dtype) == (shape, dtype)
-            ):
+            is_row = type(observation) is np.ndarray and observation.dtype is dtype and observation.shape == shape
+            if rows is not None and is_row:
                 rows[i] = observation
                 kept = rows[i]
             elif shown:

@@ -8,11 +8,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
 from pgts_torch.errors import MissingModel
 from pgts_torch.models.actions import all_actions, sampled_actions
-from pgts_torch.models.adapters import OwnState, ToyText, adapter_for
+from pgts_torch.models.adapters import ClassicControl, OwnState, ToyText, adapter_for
 from pgts_torch.models.adapters_minigrid import NO_STATE
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.minigrid_pickles import text_of
@@ -290,3 +291,16 @@ def test_positions_and_velocities_alone_do_not_restore_ant():
             mujoco.mj_forward(env.model, env.data)
 
     assert not survives(lambda: made("Ant-v5"), Naive())
+
+
+@pytest.mark.parametrize(("dtype", "shape"), [(np.float64, (4,)), (np.float64, (2, 2)), (np.float32, (4,))])
+def test_a_snapshot_of_classic_control_outlives_writing_into_the_state(dtype, shape):
+    env, adapter = CartPoleEnv(), ClassicControl()
+    env.state = np.arange(4, dtype=dtype).reshape(shape)
+    snapshot = adapter.get_state(env)
+    for _ in range(2):
+        env.state += 1
+        assert adapter.get_state(env).name != snapshot.name
+        adapter.set_state(env, snapshot.data)
+        assert (env.state.dtype, env.state.tolist()) == (dtype, np.arange(4).reshape(shape).tolist())
+        assert (env.steps_beyond_terminated, adapter.get_state(env).name) == (None, snapshot.name)
