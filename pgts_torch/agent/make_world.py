@@ -9,10 +9,10 @@ A model that does not apply is refused with a reason; where none is left the rea
 
 import itertools
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import gymnasium
 import numpy as np
@@ -25,16 +25,16 @@ from pgts_torch.agent.observations import Observations
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError
-from pgts_torch.models.actions import base_actions
+from pgts_torch.models.actions import all_actions, base_actions
 from pgts_torch.models.adapters import known_adapter, not_restored
-from pgts_torch.models.adapters_generic import PickledAttributes
+from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside
 from pgts_torch.models.attributes import attributes, own_to_each, unlike
 from pgts_torch.models.classic import CLASSIC
 from pgts_torch.models.environments import SLOW, EnvSource, kinds_of
 from pgts_torch.models.published import publishes_table, table_of
-from pgts_torch.models.restoring import Setup, check_snapshots
+from pgts_torch.models.restoring import Setup, check_resets, check_snapshots
 from pgts_torch.models.simulator import SimulatorModel
-from pgts_torch.models.snapshots import each_of, env_name
+from pgts_torch.models.snapshots import SnapshotAdapter, each_of, env_name
 from pgts_torch.models.trial import compare
 from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_of, wrappers_of
 from pgts_torch.options.environment import Observed
@@ -86,7 +86,7 @@ def make_world(
         return other(env, float(own.outcomes.discount_NAK.max()) if isinstance(own, TabularMDP) else discount)
     request = _Request(source, env, discount, observed, action_repeat, torch.device(device))
     with SharedGenerators(0, "models"):
-        world, reasons = _first_model(request, (_table,) if plain else (_table, _dynamics, _simulator))
+        world, reasons = _first_model(request, plain=plain)
     if world is not None:
         return world
     if not plain:
@@ -139,9 +139,7 @@ class _Request:
         return frozenset() if all_equal else frozenset(own_to_each(self.fresh))
 
 
-def _first_model(
-    request: _Request, candidates: tuple[Callable[[_Request], ModelWorld | None], ...]
-) -> tuple[ModelWorld | None, list[str]]:
+def _first_model(request: _Request, *, plain: bool) -> tuple[ModelWorld | None, list[str]]:
     """Return the world of the first model that applies (None: no model does), and why those before it do not."""
     env, reasons = request.env, list[str]()
     if type(env) is TabularVectorEnv:
@@ -150,10 +148,17 @@ def _first_model(
     if type(env) is not SyncVectorEnv:
         return None, [f"{request.name} is a VectorEnv of unknown kind; a simulator needs a SyncVectorEnv ({SLOW})"]
     try:
-        _check_wrappers(request)
         _check_alike(request)
     except MissingModel as missing:
         return None, [str(missing)]
+    try:
+        _check_wrappers(request)
+    except MissingModel as missing:
+        # Neither tables nor dynamics know of what a wrapper does; a simulator may contain it.
+        reasons.append(str(missing))
+    candidates: list[Callable[[_Request], ModelWorld | None]] = [] if reasons else [_table]
+    if not plain:
+        candidates += [*([] if reasons else [_dynamics]), partial(_simulator, reasons=reasons, layered=bool(reasons))]
     for candidate in candidates:
         try:
             if (world := candidate(request)) is not None:
@@ -234,23 +239,35 @@ def _dynamics(request: _Request) -> DynamicsWorld | None:
     return DynamicsWorld(request.envs, model, observed=request.observed)
 
 
-def _simulator(request: _Request) -> SimulatedWorld:
-    """The world of a simulator that is restored from snapshots; MissingModel where it cannot be."""
+def _simulator(request: _Request, *, reasons: Sequence[str], layered: bool) -> SimulatedWorld:
+    """The world of a simulator that is restored from snapshots; MissingModel where it cannot be.
+
+    Args:
+        reasons: why there is no other model.
+        layered: whether its wrappers are part of it, because some do more than transform single answers.
+    """
     env = request.envs.envs[0]
     known = known_adapter(env)
-    adapter = known or PickledAttributes()
+    adapter: SnapshotAdapter = known or PickledAttributes()
     if adapter.restored is not None and (why := _own(request, request.own_to_each)):
         raise MissingModel(f"{request.name} cannot be restored: {why}, which is in no snapshot")
+    if layered:
+        _check_memories(request.env)
+        adapter = Layered(adapter)
     numbers, alike = itertools.count(), not request.own_to_each
-    make: Callable[[], gymnasium.Env] = lambda: request.fresh(next(numbers)).unwrapped  # noqa: E731
-    setup = Setup(make, adapter, base_actions(env), request.random, alike=alike)
+    make: Callable[[], gymnasium.Env] = lambda: inside(request.fresh(next(numbers)), adapter)  # noqa: E731
+    actions = [*all_actions(env.action_space)] if layered else base_actions(env)
+    setup = Setup(make, adapter, actions, request.random, alike=alike)
     try:
         seconds = check_snapshots(setup)
-        if known is None:
-            size = len(setup.snapshot(setup.fresh()).key)
+        if layered:
+            check_resets(setup)
+        if known is None or layered:
+            what = "has wrappers that are part of the model: their" if layered else "has no get_state: its"
+            size, other = len(setup.snapshot(setup.fresh()).key), f" ({'; '.join(reasons)})" if reasons else ""
             warnings.warn(
-                f"{request.name} has no get_state: its attributes are pickled, {size} bytes and "
-                f"{1e6 * seconds:.0f} us a call; get_state and set_state of its own could take less",
+                f"{request.name} {what} attributes are pickled, {size} bytes and {1e6 * seconds:.0f} us a call; "
+                f"get_state and set_state of its own could take less{other}",
                 stacklevel=5,
             )
     except PgtsError as error:

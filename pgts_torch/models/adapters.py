@@ -7,6 +7,7 @@ import inspect
 import pickle
 import struct
 import sys
+from collections import deque
 from typing import Any, final
 
 import gymnasium
@@ -50,6 +51,9 @@ def _content(pickled: bytes) -> tuple[Any] | None:
         return None
 
 
+_SEQUENCES = list, tuple, deque
+
+
 def same_content(one: Any, other: Any) -> bool:
     """Whether two values hold the same, however numbers are typed."""
     if isinstance(one, np.ndarray | np.generic) or isinstance(other, np.ndarray | np.generic):
@@ -59,7 +63,7 @@ def same_content(one: Any, other: Any) -> bool:
         return first.shape == second.shape and bool(((first == second) | ((first != first) & (second != second))).all())
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(same_content(one[name], other[name]) for name in one)
-    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+    if isinstance(one, _SEQUENCES) and isinstance(other, _SEQUENCES):
         return len(one) == len(other) and all(map(same_content, one, other))
     if type(one) is type(other) and type(one).__eq__ is object.__eq__ and hasattr(one, "__dict__"):
         return same_content(vars(one), vars(other))

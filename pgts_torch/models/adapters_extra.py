@@ -35,8 +35,8 @@ class Ale(SnapshotAdapter):
         if share == 0:
             return ""
         return (
-            f"actions stick with probability {share:g}, and ALE's state lacks the action that sticks; make the model "
-            "with repeat_action_probability=0"
+            f"actions stick with probability {share:g}, and ALE's state lacks the action that sticks; make it with "
+            "repeat_action_probability=0, and if they are to stick wrap it in gymnasium.wrappers.StickyAction"
         )
 
 

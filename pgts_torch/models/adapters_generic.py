@@ -1,18 +1,44 @@
-"""The adapter of environments that nobody has written one for: their attributes, pickled."""
+"""Adapters of what nobody has written one for: the attributes of an environment, and of its wrappers, pickled."""
 
+import collections
+import copyreg
 import io
 import pickle
 from collections.abc import Mapping
 from typing import Any, final
 
+import gymnasium
+import numpy as np
 from gymnasium import spaces
 
 from pgts_torch.models.adapters import same_content
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter
+from pgts_torch.models.wrappers import only_with_effect, with_effect
 
 _NO_STATE = frozenset(
     {"spec", "metadata", "render_mode", "action_space", "observation_space", "_np_random", "_np_random_seed"}
+    | {"env", "_cached_spec", "_action_space", "_observation_space", "_metadata", "_saved_kwargs"}
 )
+"""Of environments and of wrappers."""
+
+
+def _array(array: np.ndarray) -> Any:
+    if array.dtype.hasobject or array.dtype.fields:
+        return array.__reduce__()
+    return _restored_array, (array.dtype.str, array.shape, array.tobytes())
+
+
+def _restored_array(dtype: str, shape: tuple[int, ...], content: bytes) -> np.ndarray:
+    return np.frombuffer(content, dtype).reshape(shape).copy()
+
+
+_NUMBERS = np.bool_, np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint32, np.uint64, np.float32, np.float64
+_REDUCERS: Mapping[type, Any] = collections.ChainMap(
+    {np.ndarray: _array} | dict.fromkeys(_NUMBERS, lambda number: (type(number), (number.item(),))),
+    copyreg.dispatch_table,
+)
+"""How arrays and numbers of numpy are pickled. By itself numpy pickles those that were unpickled in another way than
+those that were not, and equal states would have different bytes."""
 
 
 @final
@@ -59,12 +85,14 @@ class PickledAttributes(SnapshotAdapter):
         known = self._fixed
         if not known or known["self"] is not env or known["np_random"] is not env.np_random:
             held = {name: value for name, value in vars(env).items() if isinstance(value, spaces.Space)}
-            self._fixed = held | {"self": env, "np_random": env.np_random}
+            inside = {"env": env.env, "unwrapped": env.unwrapped} if isinstance(env, gymnasium.Wrapper) else {}
+            self._fixed = held | inside | {"self": env, "np_random": env.np_random}
         return self._fixed
 
     def _pickled(self, env: Any, value: Any) -> bytes:
         file = io.BytesIO()
         pickler, names = pickle.Pickler(file, protocol=5), {id(part): name for name, part in self._parts(env).items()}
+        pickler.dispatch_table = _REDUCERS
         pickler.persistent_id = lambda part: names.get(id(part))  # type: ignore[method-assign]
         pickler.dump(value)
         return file.getvalue()
@@ -75,6 +103,62 @@ class PickledAttributes(SnapshotAdapter):
         except Exception:
             return False
         return True
+
+
+@final
+class Layered(SnapshotAdapter):
+    """An environment with wrappers that have a memory: the state of the environment inside, and the attributes of each
+    wrapper that has an effect, pickled. It takes and restores the outermost of these, not the environment inside.
+
+    Args:
+        inner: for the environment inside.
+    """
+
+    def __init__(self, inner: SnapshotAdapter) -> None:
+        self.name, self.inner = f"{inner.name}, with its wrappers", inner
+        self._each: list[PickledAttributes] = []
+
+    def get_state(self, env: Any) -> Snapshot:
+        inner, layers = self.inner.get_state(env.unwrapped), self.layers(env)
+        return Snapshot(pickle.dumps((inner.key, inner.clock, layers), 5), (inner.data, layers))
+
+    def set_state(self, env: Any, data: Any) -> None:
+        inner, layers = data
+        self.inner.set_state(env.unwrapped, inner)
+        for (adapter, wrapper), layer in zip(self._pairs(env), layers, strict=True):
+            adapter.set_state(wrapper, layer)
+
+    def same_state(self, one: Snapshot, other: Snapshot) -> bool:
+        if one.key == other.key:
+            return True
+        (inner, clock, layers), (other_inner, other_clock, others) = (pickle.loads(each.key) for each in (one, other))
+        inside = (Snapshot(inner, one.data[0], clock=clock), Snapshot(other_inner, other.data[0], clock=other_clock))
+        pairs = zip(layers, others, strict=True)
+        return self.inner.same_state(*inside) and all(
+            same_content(_unpickled(layer, None), _unpickled(another, None)) for layer, another in pairs
+        )
+
+    def seed(self, env: Any, key: int) -> None:
+        self.inner.seed(env.unwrapped, key)
+
+    def same_world(self, env: Any, own: Any) -> bool:
+        kinds = [[type(wrapper) for wrapper in with_effect(each)] for each in (env, own)]
+        return kinds[0] == kinds[1] and self.inner.same_world(env.unwrapped, own.unwrapped)
+
+    def layers(self, env: Any) -> list[bytes]:
+        """The states of the wrappers, the outermost first."""
+        return [adapter.get_state(wrapper).data for adapter, wrapper in self._pairs(env)]
+
+    def _pairs(self, env: Any) -> list[tuple[PickledAttributes, Any]]:
+        wrappers = with_effect(env)
+        while len(self._each) < len(wrappers):
+            self._each.append(PickledAttributes())
+        return list(zip(self._each, wrappers, strict=False))
+
+
+def inside(env: gymnasium.Env, adapter: SnapshotAdapter) -> Any:
+    """What of an instance an adapter takes and restores. With `Layered` its other wrappers are taken off."""
+    return only_with_effect(env) if isinstance(adapter, Layered) else env.unwrapped
 
 
 def _unpickled(content: bytes, parts: Mapping[str, Any] | None) -> Any:

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from pgts_torch.errors import MissingModel, PgtsError, failure
 from pgts_torch.models.actions import all_actions, sampled_actions
 from pgts_torch.models.adapters import known_adapter, not_restored
-from pgts_torch.models.adapters_generic import PickledAttributes
+from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside
 from pgts_torch.models.attributes import own_to_each
 from pgts_torch.models.classic import dynamics_of
 from pgts_torch.models.clocks import check_clock
@@ -26,12 +26,13 @@ from pgts_torch.models.restoring import (
     Walk,
     beside_snapshots,
     chance,
+    check_resets,
     repeated,
     restored,
     untouched,
     walks_of,
 )
-from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.snapshots import SnapshotAdapter, env_name
 from pgts_torch.models.stepper import Stepper
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.trial import compare, environment_code
@@ -141,7 +142,7 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
 
     Raises:
         MissingModel: the environment publishes no table, no adapter knows it, and its attributes are not its whole
-            state: the message says what to implement; or a wrapper may change more than single answers.
+            state: the message says what to implement.
         PgtsError: it cannot be made, or raises in random walks.
     """
     if min(continuations, length) < 1:
@@ -158,12 +159,15 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
     if known is None and mdp is not None:
         share = float(((TabularModel(mdp).frequencies() > 0).sum(-1) > 1).double().mean())
         return Report(name, "table", mdp.num_states, mdp.num_actions, share, claims, cost=None)
-    adapter = known or PickledAttributes()
+    adapter: SnapshotAdapter = known or PickledAttributes()
     is_box = isinstance(space, spaces.Box)
     outer = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if is_box else all_actions(space)
-    actions = [*map(transforms_of(first).action, outer)]
+    try:
+        actions = [*map(transforms_of(first).action, outer)]
+    except MissingModel:  # a wrapper may have a memory, which then belongs to the state
+        adapter, actions = Layered(adapter), [*outer]
     random, alike = numpy_stream(seed, "check_model"), not own_to_each(make)
-    setup = Setup(lambda: make().unwrapped, adapter, actions, random, alike=alike)
+    setup = Setup(lambda: inside(make(), adapter), adapter, actions, random, alike=alike)
     try:
         walks = walks_of(setup, continuations, length)
     except PgtsError as error:
@@ -172,6 +176,8 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
 
     def restore() -> str:
         beside_snapshots(setup)
+        if isinstance(adapter, Layered):
+            check_resets(setup)
         return restored(walks, others())
 
     checks = (

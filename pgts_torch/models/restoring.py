@@ -269,6 +269,17 @@ def untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
     return f"a search of {model.simulator_steps} steps left a real environment as it was, bit for bit"
 
 
+def check_resets(setup: Setup) -> None:
+    """MissingModel unless what an instance remembers after a reset is a function of the seed alone: what it remembered
+    of earlier episodes would neither be saved with a training nor be there in an evaluation."""
+    seed, keys = setup.number(), []
+    for env in (setup.make(), _at_the_end(setup)):
+        reset(env, seed=seed)
+        keys.append(setup.snapshot(env))
+    if not setup.adapter.same_state(*keys):
+        raise MissingModel("it remembers something from one episode to the next: leave out the wrapper that does")
+
+
 def _live(env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
     """The bits that an agent sees as it takes these actions; where an episode ends a new one starts."""
     seen = []

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.adapters_generic import Layered
 from pgts_torch.models.answers import Seen, Step, observed
 from pgts_torch.models.base import Model
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
@@ -63,7 +64,7 @@ class SnapshotModel(Model):
         Raises:
             PgtsError: it is another environment, or has another map or other constants than the model's.
         """
-        base: Any = env.unwrapped
+        base: Any = env if isinstance(self.adapter, Layered) else env.unwrapped
         if not any(base is known for known in self._compared):
             if not self.adapter.same_world(base, self.env):
                 raise PgtsError(

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from pgts_torch.errors import PgtsError, failure
 from pgts_torch.models.actions import all_actions
 from pgts_torch.models.adapters import adapter_for
+from pgts_torch.models.adapters_generic import Layered, inside
 from pgts_torch.models.answers import Seen, Step, observed
 from pgts_torch.models.chance import Chance
 from pgts_torch.models.environments import EnvSource, Given
@@ -22,12 +23,13 @@ from pgts_torch.models.steps import (
     names_discounts,
     number_of,
 )
-from pgts_torch.models.wrappers import transforms_of
+from pgts_torch.models.wrappers import Transforms, transforms_of
 
 
 @final
 class Stepper:
-    """An instance without its wrappers, whose transforms are applied to actions, rewards and observations.
+    """An instance without its wrappers, whose transforms are applied to actions, rewards and observations; with
+    `Layered`, one with those of its wrappers that have an effect.
 
     name: of the environment.   env: the instance.   space: of observations, outside of the wrappers.
     actions: as the instance takes them, in the order of their numbers.
@@ -48,9 +50,11 @@ class Stepper:
     ) -> None:
         self.made = EnvSource.of(env).make_one()
         self.name = env_name(self.made)
-        self.env: Any = self.made.unwrapped
         self.adapter = adapter or adapter_for(self.made)
-        self.transforms, self.space = transforms_of(self.made), self.made.observation_space
+        self.env: Any = inside(self.made, self.adapter)
+        # Wrappers that belong to the instance itself are no transforms of what it gives.
+        self.transforms = Transforms() if isinstance(self.adapter, Layered) else transforms_of(self.made)
+        self.space = self.made.observation_space
         self._pays, self._observe = bool(self.transforms.rewards), observe
         # Actions as the outermost wrapper takes them, and as the bare instance does.
         outer = all_actions(self.made.action_space) if actions is None else actions

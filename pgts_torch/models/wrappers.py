@@ -67,6 +67,19 @@ def wrappers_of(env: gymnasium.Env) -> list[gymnasium.Wrapper]:
     return found
 
 
+def with_effect(env: gymnasium.Env) -> list[gymnasium.Wrapper]:
+    """Those of its wrappers that may change actions, observations, rewards or ends, the outermost first."""
+    return [wrapper for wrapper in wrappers_of(env) if type(wrapper) not in _HARMLESS]
+
+
+def only_with_effect(env: gymnasium.Env) -> gymnasium.Env:
+    """The environment without those of its wrappers that have none; it is changed."""
+    outer = with_effect(env)
+    for wrapper, inside in zip(outer, [*outer[1:], env.unwrapped], strict=True):
+        wrapper.env = inside
+    return outer[0] if outer else env.unwrapped
+
+
 def transforms_of(env: gymnasium.Env) -> Transforms:
     """The transforms of the wrappers of an environment, by their classes (`check_transforms` compares them with steps).
 

@@ -29,6 +29,10 @@ class Auto(Budget):
 
     kind: Literal["auto"] = "auto"
 
+    max_calls: Count | None = None
+    """The largest number of model calls of one search. One that may need more expands fewer states of each level, or
+    samples fewer outcomes; null: as many as it takes."""
+
 
 class Expectimax(Budget):
     """Enumerates all outcomes of all actions."""

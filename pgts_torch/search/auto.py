@@ -1,5 +1,6 @@
 """The search that chooses: by what the model can do, by how often paths meet, and by the budget."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, final
@@ -29,6 +30,8 @@ class AutoSearch(Search):
     - It enumerates them and they do not fit: expectimax that expands as many states of each level as fit. The width is
       halved until they do; where they left room, the next search is twice as wide. Full width is not tried again for
       as many roots and levels as were too many the last time.
+    - There is a largest number of model calls, and the model may have more states: expectimax of the width W with which
+      (roots + W (levels - 1)) A calls are not more.
     - It only samples outcomes, or turns out to be random where it should enumerate them: sampled, with as many samples
       of each action as fit if no two paths meet. Where paths met and left room, the next search takes twice as many, up
       to 32; for more roots or levels the number is chosen again, and a search that turns out too large is done again
@@ -39,6 +42,7 @@ class AutoSearch(Search):
 
     Raises:
         NodeBudgetExceeded: from a search, where even one state a level, or one sample of each action, is too much.
+        PgtsError: from a search, where that takes more than `max_calls`.
     """
 
     defers_checks = True
@@ -57,7 +61,11 @@ class AutoSearch(Search):
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
         if self.topology is not None:
             calls_before, roots, expansions = self.topology.table.model_calls, len(root_B), leaves.expansions
+            widest = self._widest(root_B, expansions)
+            self._width = min(self._width, widest or self._width)
             try:
+                if widest is not None:
+                    return self._narrowed(leaves, root_B, calls_before)
                 if self._too_much is None or roots < self._too_much[0] or expansions < self._too_much[1]:
                     try:
                         full = search_levels(leaves, self.topology, root_B, max_nodes=self.options.max_nodes)
@@ -71,6 +79,23 @@ class AutoSearch(Search):
                     raise
                 self.topology = None
         return self._sampled(leaves, root_B, generator)
+
+    def _widest(self, root_B: Int[Tensor, "B"], expansions: int) -> int | None:
+        """The width with which a search of so many levels needs at most `max_calls` model calls; None: any width."""
+        A, max_calls = self.model.num_actions, self.options.max_calls
+        assert self.topology is not None
+        if max_calls is None or expansions == 0:
+            return None
+        states = max_calls // A
+        if self.topology.model.table is not None and self.model.num_states <= states:
+            return None
+        roots = len(root_B.unique())
+        if states < roots + expansions - 1:
+            raise PgtsError(
+                f"search.max_calls is {max_calls}; {roots} states under {A} actions, and one below them on each of "
+                f"{expansions - 1} levels, need {(roots + expansions - 1) * A}: set search.max_roots, or more calls"
+            )
+        return (states - roots) // (expansions - 1) if expansions > 1 else None
 
     def _narrowed(self, leaves: Leaves, root_B: Tensor, calls_before: int) -> Lookahead:
         """Expectimax of the largest width that fits.
@@ -101,9 +126,8 @@ class AutoSearch(Search):
         if float(narrow.pruned_BA.max()) == 0:
             self._picked = _all_paths(narrow)
         else:
-            self._picked = (
-                f"expectimax, {self._width} states a level: all paths need more than {max_nodes} nodes, "
-                "or too much memory"
+            self._picked = f"expectimax, {self._width} states a level: all paths need more than {max_nodes} nodes, " + (
+                "or too much memory" if self.options.max_calls is None else "too much memory or too many calls"
             )
         if 2 * max(self._width, narrow.nodes) <= max_nodes:
             self._width *= 2
@@ -112,14 +136,22 @@ class AutoSearch(Search):
     def _sampled(self, leaves: Leaves, root_B: Tensor, generator: torch.Generator) -> Lookahead:
         """Sparse sampling with as many samples as fit."""
         roots, A, expansions = len(root_B), self.model.num_actions, leaves.expansions
+        max_calls = math.inf if self.options.max_calls is None else self.options.max_calls
+
+        def fits(samples: int) -> bool:
+            calls = A * samples * tree_nodes(roots, A * samples, expansions - 1) if expansions else 0
+            return tree_nodes(roots, A * samples, expansions) <= self.options.max_nodes and calls <= max_calls
+
         if roots > self._most_asked[0] or expansions > self._most_asked[1]:
             self._samples, self._most_asked = 0, (roots, expansions)
-        while (
-            self._samples < MOST_SAMPLES
-            and tree_nodes(roots, A * 2 * max(self._samples, 1), expansions) <= self.options.max_nodes
-        ):
+        while self._samples < MOST_SAMPLES and fits(2 * max(self._samples, 1)):
             self._samples = 2 * max(self._samples, 1)
         self._samples = max(self._samples, 1)
+        if max_calls < math.inf and not fits(1):
+            raise PgtsError(
+                f"search.max_calls is {max_calls}; one sample of each of {A} actions, {expansions} levels below "
+                f"{roots} states, may need more: set search.max_roots, a smaller depth, more calls, or search.kind mcts"
+            )
         while True:
             try:
                 options = Sampled(
@@ -137,7 +169,8 @@ class AutoSearch(Search):
             f"sampled, {self._samples} outcomes of each action: the model only samples, and {look.nodes} nodes hold "
             f"{tree:.3g} paths"
         )
-        if self._samples < MOST_SAMPLES and look.nodes * 2**expansions <= self.options.max_nodes:
+        left = min(self.options.max_nodes / max(look.nodes, 1), max_calls / max(look.model_calls, 1))
+        if self._samples < MOST_SAMPLES and 2**expansions <= left:
             self._samples *= 2
         return look
 

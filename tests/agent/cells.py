@@ -1,5 +1,6 @@
 """Small environments that publish a table, or are restored, and what tests of their worlds share."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from inspect import signature
 from typing import Any
@@ -12,8 +13,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from pgts_torch.agent.make_world import make_world
-from pgts_torch.agent.world import ModelWorld, World
-from pgts_torch.errors import PgtsError
+from pgts_torch.agent.world import ModelWorld, SimulatedWorld, World
+from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.options.environment import Observed
 
@@ -33,6 +34,18 @@ def refusal_of(env: Any, **options: Any) -> str:
     with pytest.raises(PgtsError) as refused:
         world_of(env, **options)
     return str(refused.value)
+
+
+def told_of(env: Any) -> str:
+    """Why an environment has no table or dynamics: what its refusal says, or a warning beside the simulator that takes
+    their place."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            assert type(world_of(env)) is SimulatedWorld
+        except MissingModel as refused:
+            return str(refused)
+    return str(said[0].message)
 
 
 def vector_of(*makers: Callable[[], gymnasium.Env]) -> SyncVectorEnv:

@@ -91,5 +91,5 @@ def test_bodies_that_change_their_weight_are_in_no_snapshot():
 
 def test_emulators_whose_actions_stick_are_refused():
     kind = family("Pong")
-    with pytest.raises(PgtsError, match=r"make the model with repeat_action_probability=0"):
+    with pytest.raises(PgtsError, match=r"make it with repeat_action_probability=0"):
         world_of(lambda: kind("pong", obs_type="ram", repeat_action_probability=0.25), num_envs=1)

@@ -1,6 +1,7 @@
 """Which tables that environments publish are their models, and which are not."""
 
 import functools
+import re
 from typing import Any
 
 import gymnasium
@@ -12,9 +13,8 @@ from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
 
 from pgts_torch.agent.world import ModelWorld, SimulatedWorld, TabularWorld
-from pgts_torch.errors import MissingModel
 from pgts_torch.tabular import exact
-from tests.agent.cells import FIRST, Cells, N, Walk, refusal_of, row_of_cells, world_of
+from tests.agent.cells import FIRST, Cells, N, Walk, row_of_cells, told_of, world_of
 
 
 class Shaped(FrozenLakeEnv):
@@ -75,14 +75,13 @@ def patched() -> gymnasium.Env:
             lambda: Cells(row_of_cells(), starts=FIRST, pays=2.0),
             r"gave reward 2, an end; the table says reward 1, an end",
         ),
-        (lambda: Cells(row_of_cells(), starts=FIRST, begins=3), "it starts in state [12], which has probability 0"),
+        (lambda: Cells(row_of_cells(), starts=FIRST, begins=3), r"it starts in state [12], which has probability 0"),
         (lambda: Cells(row_of_cells(N - 1), starts=FIRST), "is no transition table: start_S has shape"),
         (lambda: Cells(row_of_cells(N - 1)), r"is no transition table: reset|it has 5 states|it shows 5"),
     ],
 )
 def test_a_table_that_was_not_written_for_what_runs_is_not_used_and_the_reason_is_told(make, why):
-    with pytest.raises(MissingModel, match=why):
-        world_of(make)
+    assert re.search(why, told_of(make))
     assert not isinstance(world_of(make, plain=True), ModelWorld)  # where no model is needed there is no exact J either
 
 
@@ -127,7 +126,7 @@ def test_a_passenger_who_changes_his_mind_is_in_no_table_and_taxis_are_restored_
 )
 def test_an_attribute_P_of_another_meaning_is_no_table(P):
     assert not isinstance(world_of(lambda: Cells(P), plain=True), ModelWorld)
-    assert "attribute P of Cells is no transition table" in refusal_of(lambda: Cells(P))
+    assert "attribute P of Cells is no transition table" in told_of(lambda: Cells(P))
 
 
 def test_an_attribute_of_another_meaning_beside_a_table_lays_no_picture_out():
@@ -143,7 +142,7 @@ def test_more_actions_than_a_table_has_are_a_reason():
             super().__init__(row_of_cells(), starts=FIRST)
             self.action_space = spaces.Discrete(3)
 
-    assert "it has 6 states and 2 actions, and its spaces are Discrete(6) and Discrete(3)" in refusal_of(Three)
+    assert "it has 6 states and 2 actions, and its spaces are Discrete(6) and Discrete(3)" in told_of(Three)
 
 
 def test_a_table_without_starts_takes_them_from_resets_and_says_so():
@@ -180,6 +179,6 @@ def test_a_table_that_changes_from_episode_to_episode_is_contradicted():
             self.initial_state_distrib = FIRST
             return answer
 
-    assert "gave reward 0, an end; the table says reward 1, an end" in refusal_of(
+    assert "gave reward 0, an end; the table says reward 1, an end" in told_of(
         lambda: Changing(row_of_cells(), starts=FIRST)
     )

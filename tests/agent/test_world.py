@@ -401,10 +401,14 @@ def test_rewards_that_a_wrapper_transforms_are_those_of_the_model():
     assert not isinstance(plain, ModelWorld)
 
 
-def test_a_model_is_refused_where_a_wrapper_repeats_actions_at_random():
+def test_where_a_wrapper_repeats_actions_at_random_the_model_only_samples():
     sticky = functools.partial(gymnasium.wrappers.StickyAction, repeat_action_probability=0.5)
-    with pytest.raises(MissingModel, match="CartPole-v1 is wrapped in StickyAction"):
-        world_of(lambda: sticky(gymnasium.make("CartPole-v1")))
+    with pytest.warns(UserWarning, match="CartPole-v1 is wrapped in StickyAction"):
+        world = world_of(lambda: sticky(gymnasium.make("CartPole-v1")))
+    state_B = world.numbers(world.read(observation := world.env.reset(seed=0)[0], world.encode(observation)))
+    first_B = world.model.sample(state_B, torch.ones_like(state_B), key_N=torch.arange(len(state_B))).next_state_N
+    for state_N, is_random in ((state_B, False), (first_B, True)):  # no action has been taken yet that could stick
+        assert world.model.is_random(state_N, torch.zeros_like(state_N)).tolist() == [is_random] * len(state_N)
 
 
 @pytest.mark.parametrize("wrapper", [gymnasium.wrappers.NormalizeObservation, gymnasium.wrappers.NormalizeReward])

@@ -308,7 +308,7 @@ def test_a_file_of_version_0_1_with_null_for_what_another_kind_of_search_has_mea
 
 def test_every_default_is_the_one_that_the_help_names() -> None:
     defaults = Config().model_dump(by_alias=True)
-    types = {key: _look_up(defaults, key) for key in _leaves(defaults) if key.endswith(".type")}
+    types = {key: _look_up(defaults, key) for key in _leaves(defaults) if key.endswith((".type", ".kind"))}
     options = {option.key: option for option in OPTIONS if option.exists(types)}
     for key, option in options.items():
         assert _look_up(defaults, key) == option.default, key

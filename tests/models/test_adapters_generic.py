@@ -138,6 +138,97 @@ def test_an_environment_whose_attributes_turn_out_not_to_be_its_state_is_found_i
         model.learn(5_000)
 
 
+class Rising(gymnasium.Wrapper):
+    """Rewards rise with the steps of an episode, and so does what is observed."""
+
+    def reset(self, **kwargs):
+        self.steps = 0
+        observation, info = super().reset(**kwargs)
+        return observation, info
+
+    def step(self, action):
+        self.steps += 1
+        observation, reward, *rest = super().step(action)
+        return observation + self.steps, reward * self.steps, *rest
+
+
+def test_wrappers_that_remember_belong_to_the_simulator():
+    """By hand: what they give in two steps from where three steps of an episode have led."""
+    make = lambda: gymnasium.wrappers.TimeLimit(Rising(gymnasium.wrappers.TimeLimit(Corridor(slip=0), 50)), 20)  # noqa: E731
+    with pytest.warns(
+        UserWarning, match="Corridor has wrappers that are part of the model: their attributes are pickled"
+    ):
+        training = PGTS(make, **SHORT | {"gamma": 0.5})
+    model, env, twin = training.world.model, training.source.like(), training.source.like()
+    for each in (env, twin):
+        each.reset(seed=4)
+        for action in (1, 0, 0):
+            observation, *_ = each.step(action)
+    outcomes = model.outcomes(model.roots([env], [observation]))
+    below = model.outcomes(outcomes.child_NAK[0, :, 0])
+    for first, second in itertools.product((0, 1), (0, 1)):
+        env = training.source.like()
+        env.reset(seed=4)
+        steps = [env.step(action) for action in (1, 0, 0, first, second)]
+        assert float(outcomes.reward_NA[0, first]) == steps[3][1]
+        assert float(below.reward_NA[first, second]) == steps[4][1]
+        seen = model.observations(outcomes.child_NAK[0, first])
+        assert np.array_equal(np.asarray(seen[0]), steps[3][0])
+    assert twin.step(0)[1] == float(outcomes.reward_NA[0, 0])  # what the search did has not touched it
+    assert check_model(make).usable
+
+
+@pytest.mark.filterwarnings(
+    "ignore:.*has wrappers that are part of the model", "ignore:.*has random steps whose outcomes"
+)
+@pytest.mark.parametrize("depth", [0, 2])
+def test_frames_that_are_stacked_and_actions_that_stick_are_trained_with_a_lookahead(depth):
+    def make():
+        return gymnasium.wrappers.FlattenObservation(
+            gymnasium.wrappers.FrameStackObservation(gymnasium.make("CartPole-v1"), 3)
+        )
+
+    model = PGTS(make, **SHORT | {"depth": depth})
+    assert model.world.observation_space.shape == (12,)
+    assert model.iterate().model_calls > 0
+    sticky = lambda: gymnasium.wrappers.StickyAction(gymnasium.make("CartPole-v1"), 0.25)  # noqa: E731
+    report = check_model(sticky)
+    assert report.usable
+    assert 0.05 < report.random_share
+    training = PGTS(sticky, **SHORT | {"depth": 1})
+    training.iterate()
+    assert str(training.search).startswith("sampled")
+
+
+@pytest.mark.filterwarnings("ignore:.*has wrappers that are part of the model")
+def test_atari_as_it_is_used_can_serve_as_a_model_with_its_stack_in_the_state():
+    for package in ("ale_py", "cv2"):
+        pytest.importorskip(package, exc_type=ImportError)
+
+    def make():
+        env = gymnasium.make("ALE/Breakout-v5", frameskip=1, repeat_action_probability=0)
+        env = gymnasium.wrappers.AtariPreprocessing(env, noop_max=3, screen_size=21)
+        return gymnasium.wrappers.StickyAction(gymnasium.wrappers.FrameStackObservation(env, 4), 0.25)
+
+    report = check_model(make, continuations=2, length=5)
+    assert report.usable
+    assert [check.passed for check in report.checks if check.name == "merge"] == [True]
+    assert report.random_share > 0
+
+
+class Hoarder(Rising):
+    """It goes on counting in the next episode."""
+
+    def reset(self, **kwargs):
+        self.steps = getattr(self, "steps", 0)
+        return self.env.reset(**kwargs)
+
+
+def test_a_wrapper_that_remembers_earlier_episodes_is_refused():
+    with pytest.raises(MissingModel, match="remembers something from one episode to the next"):
+        PGTS(lambda: Hoarder(Corridor(slip=0)), **SHORT)
+
+
 def test_without_the_model_check_nothing_is_guessed():
     with pytest.raises(
         PgtsError, match=r"model_check is off, but it alone tells.*leave it on, or give Bare the methods"

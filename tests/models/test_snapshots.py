@@ -272,7 +272,10 @@ def test_an_environment_without_an_adapter_is_told_what_to_implement():
 
 def test_an_emulator_whose_actions_stick_is_refused_with_the_remedy():
     pytest.importorskip("ale_py", exc_type=ImportError)
-    with pytest.raises(MissingModel, match=r"stick with probability 0\.25.*repeat_action_probability=0$"):
+    with pytest.raises(
+        MissingModel,
+        match=r"stick with probability 0\.25.*repeat_action_probability=0, and .* wrap it in .*StickyAction",
+    ):
         adapter_for(EnvSource.of("ALE/Breakout-v5").make_one())
 
 

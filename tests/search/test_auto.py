@@ -3,11 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium
 import pytest
 import torch
 from torch import Tensor
 
-from pgts_torch.errors import NodeBudgetExceeded
+from pgts_torch.errors import NodeBudgetExceeded, PgtsError
+from pgts_torch.models.classic import CartPole
+from pgts_torch.models.tabular import TabularModel
 from pgts_torch.options import Auto, Sampled
 from pgts_torch.search import Lookahead, auto
 from pgts_torch.search.auto import AutoSearch
@@ -159,3 +162,56 @@ def test_a_sampled_search_that_turns_out_too_large_is_done_again_with_half(sampl
     search.load_state_dict(state | {"choices": state["choices"] | {"_samples": 32}})
     search_once(search)
     assert tried == [32, 16]
+
+
+def cart_pole() -> tuple[CartPole, Tensor]:
+    model = CartPole(gymnasium.make("CartPole-v1"), gamma=0.99)
+    generator = stream(0, "cart_pole")
+    return model, model.number(0.05 * torch.randn(10, 4, dtype=model.state_dtype, generator=generator))
+
+
+@pytest.mark.parametrize("max_calls", [32, 33, 90, 200, 1000])
+def test_a_search_makes_no_more_model_calls_than_allowed_and_leaves_few_unused(max_calls):
+    model, root_B = cart_pole()
+    search = AutoSearch(model, Auto(max_calls=max_calls))
+    look = search(root_B, depth=6, v_leaf=lambda state_N: model.states(state_N)[:, 2], generator=stream(0, "search"))
+    assert min(max_calls - 2 * 6, 786) <= look.model_calls <= max_calls  # upper levels of 1000 are narrower
+    assert float(look.pruned_BA.max()) > 0
+    assert f"expectimax, {(max_calls // 2 - 10) // 6} states a level" in str(search)
+
+
+def test_with_enough_calls_nothing_is_pruned_and_a_table_that_fits_is_searched_at_full_width():
+    model, root_B = cart_pole()
+    looks = []
+    for max_calls in (None, 10**6):
+        search = AutoSearch(model, Auto(max_calls=max_calls))
+        looks.append(search(root_B, depth=3, v_leaf=torch.zeros_like, generator=stream(0, "search")))
+    assert torch.equal(looks[0].q_BA, looks[1].q_BA)
+    assert looks[0].model_calls == looks[1].model_calls == 10 * 2 * (1 + 2 + 4 + 8)
+    search = AutoSearch(TabularModel(zoo("ladder")), Auto(max_calls=10))
+    look = search(torch.tensor([0]), depth=50, v_leaf=torch.zeros_like, generator=stream(0, "search"))
+    assert "hold all paths" in str(search)
+    assert look.model_calls <= 10
+
+
+def test_too_few_calls_are_refused_with_what_a_search_needs_at_least():
+    model, root_B = cart_pole()
+    search = AutoSearch(model, Auto(max_calls=31))
+    with pytest.raises(
+        PgtsError, match=r"max_calls is 31; 10 states under 2 actions, .* each of 6 levels, need 32: set"
+    ):
+        search(root_B, depth=6, v_leaf=torch.zeros_like, generator=stream(0, "search"))
+    assert search.model_calls == 0
+
+
+@pytest.mark.parametrize(("max_calls", "first"), [(6, 1), (19, 1), (20, 2), (72, 4)])
+def test_samples_are_as_many_as_the_calls_allow(max_calls, first, samples):
+    # 2 actions, 2 levels: 2 C + 4 C^2 calls if no two paths meet, 6, 20 and 72 for C = 1, 2 and 4.
+    tried = samples(lambda C: 10)
+    search_once(AutoSearch(SamplingOnly(zoo("ladder")), Auto(max_calls=max_calls)))
+    assert tried == [first]
+
+
+def test_fewer_calls_than_one_sample_of_each_action_are_refused():
+    with pytest.raises(PgtsError, match="max_calls is 5; one sample of each of 2 actions, 2 levels below 1 states"):
+        search_once(AutoSearch(SamplingOnly(zoo("ladder")), Auto(max_calls=5)))
