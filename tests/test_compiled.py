@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from pgts_torch import compiled
+from tests.forks import PATIENCE
 
 CPU = torch.device("cpu")
 
@@ -68,14 +69,16 @@ def test_little_work_does_not_load_numba() -> None:
     pytest.importorskip("numba")
     asked = "import sys, torch; from pgts_torch.compiled import pays; cpu = torch.device('cpu'); "
     answers = "print(pays(cpu, 255), pays(cpu, 256)); import numba; print(pays(cpu, 1), pays(torch.device('cuda'), 1))"
-    done = subprocess.run([sys.executable, "-c", asked + answers], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", asked + answers], capture_output=True, text=True, check=True, timeout=PATIENCE
+    )
     assert done.stdout == "False True\nTrue False\n"
 
 
 def test_the_readmes_first_training_does_without_numba(tmp_path: Path) -> None:
     run = ["--config", "configs/ladder.yaml", "--total_steps", "2000", "--run.dir", str(tmp_path / "run")]
     code = f"import sys; from pgts_torch.cli.main import main; print(main(['train', *{run}]), 'numba' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PATIENCE)
     assert done.stdout.splitlines()[-1] == "0 False", done.stderr
 
 
