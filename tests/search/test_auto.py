@@ -198,7 +198,7 @@ def test_too_few_calls_are_refused_with_what_a_search_needs_at_least():
     model, root_B = cart_pole()
     search = AutoSearch(model, Auto(max_calls=31))
     with pytest.raises(
-        PgtsError, match=r"max_calls is 31; 10 states under 2 actions, .* each of 6 levels, need 32: set"
+        PgtsError, match=r"max_calls is 31; 10 states under 2 actions, .* each of 6 levels, need 32: visit"
     ):
         search(root_B, depth=6, v_leaf=torch.zeros_like, generator=stream(0, "search"))
     assert search.model_calls == 0
