@@ -188,6 +188,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     f"a number > 0, {SCHEDULE} or null": st.none() | SCHEDULES,
     f"a number >= 0, {SCHEDULE}": SCHEDULES | st.floats(0, allow_infinity=False),
     "rms or none or null": st.sampled_from([None, "rms", "none"]),
+    "first or last or null": st.sampled_from([None, "first", "last"]),
     "adam or sgd or null": st.sampled_from([None, "adam", "sgd"]),
     "occupancy, visits or uniform or null": st.sampled_from([None, "occupancy", "visits", "uniform"]),
     "a key of dictionary observations or null": st.none() | st.from_regex(r"[A-Za-z0-9_.:-]{1,20}", fullmatch=True),
@@ -226,7 +227,7 @@ def configurations(draw: st.DrawFn) -> Config:
     types["estimator.type"] = "lookahead" if needs_all else types["estimator.type"]
     if types["estimator.type"] == "sampled" and types["critic.type"] in ("exact", "rollout"):
         types["critic.type"] = "network"
-    if types["model.type"] in ("counts", "ensemble") and types["replay.type"] == "none":
+    if types["model.type"] in ("counts", "ensemble", "latent") and types["replay.type"] == "none":
         types["replay.type"] = "auto"  # they learn from what replay keeps
     for option in OPTIONS:
         if option.exists(types):
