@@ -148,7 +148,7 @@ class Observations:
 
 def _from_zero(array: np.ndarray, space: spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary) -> np.ndarray:
     """Numbers or bits of a space, counted from 0, as int64; PgtsError unless they are such."""
-    if array.dtype.kind not in "biu":
+    if array.dtype.kind not in ("biu" if isinstance(space, spaces.MultiBinary) else "iu"):
         raise PgtsError(f"observation is of {array.dtype}; states are integers")
     first = np.asarray(0 if isinstance(space, spaces.MultiBinary) else space.start)
     number, count = array.astype(np.int64) - first, counts(space).reshape(space.shape or ())

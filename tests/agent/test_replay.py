@@ -270,7 +270,7 @@ def test_a_model_of_the_callers_own_is_searched():
 def test_what_does_not_go_with_a_learned_model_is_refused():
     with pytest.raises(MissingModel, match=r"'ensemble'.* vectors of numbers.*'counts'"):
         PGTS("pgts/Ladder-v0", model="ensemble")
-    with pytest.raises(MissingModel, match=r"'counts'.* numbered states.*'ensemble'"):
+    with pytest.raises(MissingModel, match=r"'counts', which learns from numbers.*take 'ensemble'"):
         PGTS("CartPole-v1", model="counts")
     with pytest.raises(PgtsError, match=r"stop_at is 0\.1, which needs an upper bound"):
         PGTS("CartPole-v1", model="ensemble", stop_at=0.1)

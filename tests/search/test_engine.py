@@ -183,7 +183,7 @@ MCTS_OPTIONS = [
     {"root": "rule"},
     {"rule": "puct"},
     {"rule": "uct", "exploration": 0.3},
-    {"wave": 1},
+    {"wave": 4},
     {"prior": "policy"},
     {"backup": "mean"},
     {"merge": False},
