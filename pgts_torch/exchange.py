@@ -1,7 +1,7 @@
 """What processes that train together send each other: bytes, over sockets, combined in the order of ranks.
 
-Rank 0 receives a message of each other rank, and sends all of them the same answer. A small exchange takes a fiftieth
-of the time of gloo's, which hands each message from thread to thread: so a gradient can be summed in every step.
+Rank 0 receives a message of each other rank, and sends all of them the same answer. A small exchange takes a small
+part of the time of gloo's, which hands each message from thread to thread: so a gradient can be summed in every step.
 """
 
 import pickle

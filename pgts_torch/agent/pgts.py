@@ -140,7 +140,7 @@ class PGTS:
     def iterate(self) -> Iteration:
         """Run one iteration: visit states, estimate Q^pi, look m steps ahead, update pi.        [PGTS Alg. 1]"""
         if self.world.env.closed:
-            raise PgtsError("the environments of this training are closed; make it anew, or load a saved one")
+            raise PgtsError("the environments of this training are closed: make another one, or load a saved one")
         with self.ranks.united():
             return self._iterate()
 
