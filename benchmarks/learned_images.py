@@ -65,8 +65,8 @@ def _train_ppo(
         def __init__(self, space: gymnasium.spaces.Box) -> None:
             super().__init__(space, network.hidden[-1])
             layers: list[nn.Module] = []
-            for outputs in network.channels:
-                layers += [nn.LazyConv2d(outputs, network.kernel_size, network.stride), nn.ReLU()]
+            for outputs, kernel_size, stride in network.convolutions:
+                layers += [nn.LazyConv2d(outputs, kernel_size, stride), nn.ReLU()]
             layers.append(nn.Flatten())
             for outputs in network.hidden:
                 layers += [nn.LazyLinear(outputs), nn.ReLU()]

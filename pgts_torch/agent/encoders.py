@@ -181,8 +181,8 @@ class Encoder(nn.Module):
 def convolved(image: tuple[int, int, int], network: CNN) -> tuple[int, int] | None:
     """Return the height and width of what the convolutions leave of an image; None where it is too small for them."""
     height, width, _ = image
-    for _ in network.channels:
-        height, width = ((side - network.kernel_size) // network.stride + 1 for side in (height, width))
+    for _, kernel_size, stride in network.convolutions:
+        height, width = ((side - kernel_size) // stride + 1 for side in (height, width))
         if min(height, width) < 1:
             return None
     return height, width

@@ -107,8 +107,8 @@ def _convolutions(network: CNN, shape: tuple[int, ...], generator: torch.Generat
         return shape[0], []
     inputs, height, width = shape
     layers: list[nn.Module] = []
-    for outputs in network.channels:
-        conv = skip_init(nn.Conv2d, inputs, outputs, network.kernel_size, network.stride, dtype=torch.float32)
+    for outputs, kernel_size, stride in network.convolutions:
+        conv = skip_init(nn.Conv2d, inputs, outputs, kernel_size, stride, dtype=torch.float32)
         layers += [_orthogonal(conv, math.sqrt(2), generator), _ACTIVATIONS[network.activation]()]
         inputs = outputs
     left = convolved((height, width, inputs), network)
@@ -216,8 +216,8 @@ def _linear(inputs: int, outputs: int, gain: float, generator: torch.Generator, 
     if (count := inputs * outputs) > _MOST_WEIGHTS:
         raise PgtsError(
             f"a layer of {inputs:,} x {outputs:,} = {count:,} weights would be needed for observations of the shape "
-            f"{_shape_text(space)}; more than {_MOST_WEIGHTS:,} are never made: take a cnn with a larger stride, or "
-            "smaller or fewer images (gymnasium.wrappers.ResizeObservation), or smaller hidden layers"
+            f"{_shape_text(space)}; more than {_MOST_WEIGHTS:,} are never made: take nature_cnn, a cnn with a larger "
+            "stride, or smaller or fewer images (gymnasium.wrappers.ResizeObservation), or smaller hidden layers"
         )
     linear: nn.Linear = _orthogonal(skip_init(nn.Linear, inputs, outputs, dtype=torch.float32), gain, generator)
     return linear

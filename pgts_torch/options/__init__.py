@@ -19,7 +19,7 @@ from pgts_torch.options.critics import (
 )
 from pgts_torch.options.models import AutoModel, Counts, Ensemble, GivenModel, Latent, OwnModel
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, Random, Simplex, Softmax, Uniform
+from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, NatureCNN, Random, Simplex, Softmax, Uniform
 from pgts_torch.options.replay import AutoReplay, NoReplay, UniformReplay
 from pgts_torch.options.rollouts import (
     AutoHorizon,
@@ -58,6 +58,7 @@ __all__ = [
     "LookaheadAdvantages",
     "Mirror",
     "MonteCarlo",
+    "NatureCNN",
     "NetworkTDLambda",
     "NetworkValues",
     "NoReplay",

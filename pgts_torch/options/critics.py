@@ -6,7 +6,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
 from pgts_torch.options.fields import Clip, Count, Share, UnitInterval, conflict
 from pgts_torch.options.part import Part, null
-from pgts_torch.options.policies import CNN, MLP
+from pgts_torch.options.policies import CNN, MLP, NatureCNN
 from pgts_torch.options.rollouts import GeometricHorizon, Horizon
 from pgts_torch.options.schedules import ScheduledPositive
 
@@ -106,7 +106,7 @@ class NetworkValues(Values):
 
     type: Literal["network"] = "network"
 
-    network: OwnNetwork | SharedNetwork | MLP | CNN = Field(default=OwnNetwork(), discriminator="type")
+    network: OwnNetwork | SharedNetwork | MLP | CNN | NatureCNN = Field(default=OwnNetwork(), discriminator="type")
     """The network."""
 
     method: Annotated[MonteCarlo | NetworkTDLambda, Field(discriminator="type"), BeforeValidator(_of_networks)] = (

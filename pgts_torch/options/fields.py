@@ -121,6 +121,20 @@ def _check_samples(value: Any) -> Any:
     return value
 
 
+def _check_per_layer(value: Any) -> Any:
+    numbers = value if isinstance(value, list) and value else [value]
+    if not all(type(number) is int and 1 <= number <= 2**16 for number in numbers):
+        raise ValueError
+    return value
+
+
+PerLayer = Annotated[
+    Any,
+    BeforeValidator(_as_list),
+    AfterValidator(_check_per_layer),
+    Field(json_schema_extra={"requirement": "a whole number in [1, 65536], or a list of such, one for each layer"}),
+]
+
 Samples = Annotated[
     Any,
     BeforeValidator(_as_list),

@@ -17,7 +17,7 @@ from pgts_torch.options.fields import (
     conflict,
 )
 from pgts_torch.options.part import Part, null
-from pgts_torch.options.policies import CNN
+from pgts_torch.options.policies import CNN, NatureCNN
 
 
 class AutoModel(Part):
@@ -125,7 +125,7 @@ class Latent(Part):
 
     type: Literal["latent"] = "latent"
 
-    network: AutoNetwork | CNN = Field(default=AutoNetwork(), discriminator="type")
+    network: AutoNetwork | CNN | NatureCNN = Field(default=AutoNetwork(), discriminator="type")
     """The network that represents images."""
 
     size: Count = 64

@@ -2,9 +2,9 @@
 
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
-from pgts_torch.options.fields import Count, Natural, Positive, Share, Sizes, conflict
+from pgts_torch.options.fields import Natural, PerLayer, Positive, Share, Sizes, conflict
 from pgts_torch.options.part import Part
 
 
@@ -93,11 +93,11 @@ class CNN(Part):
     channels: Sizes = Field(default=[16, 32, 64])
     """Channels of the convolutions, one after the other."""
 
-    kernel_size: Count = 2
-    """Height and width of the kernels of all convolutions."""
+    kernel_size: PerLayer = 2
+    """Height and width of the kernels: of all convolutions, or of each."""
 
-    stride: Count = 1
-    """Stride of all convolutions."""
+    stride: PerLayer = 1
+    """Stride: of all convolutions, or of each."""
 
     hidden: Sizes = Field(default=[128])
     """Sizes of the fully connected layers."""
@@ -111,9 +111,47 @@ class CNN(Part):
     scale: Positive | None = None
     """By which images are divided; null: the largest value that they declare. MiniGrid's codes are at most 10."""
 
+    @field_validator("kernel_size", "stride")
+    @classmethod
+    def _one_for_each(cls, value: Any, info: ValidationInfo) -> Any:
+        channels = info.data.get("channels")
+        if channels is not None and isinstance(value, list) and len(value) != len(channels):
+            raise conflict(
+                f"{info.field_name} is {value}; there are {len(channels)} convolutions, of the channels {channels}: it "
+                "must have one number for each of them, or be one number for all"
+            )
+        return value
+
+    @property
+    def convolutions(self) -> list[tuple[int, int, int]]:
+        """The channels, kernel size and stride of each convolution."""
+        each = (
+            [value] * len(self.channels) if isinstance(value, int) else value
+            for value in (self.kernel_size, self.stride)
+        )
+        return list(zip(self.channels, *each, strict=True))
+
+
+class NatureCNN(CNN):
+    """The cnn that is usual for Atari (Mnih et al. 2015), over images of 36 x 36 and more."""
+
+    type: Literal["nature_cnn"] = "nature_cnn"  # type: ignore[assignment]  # another tag of the same options
+
+    channels: Sizes = Field(default=[32, 64, 64])
+    """Channels of the convolutions, one after the other."""
+
+    kernel_size: PerLayer = Field(default=[8, 4, 3])
+    """Height and width of the kernels: of all convolutions, or of each."""
+
+    stride: PerLayer = Field(default=[4, 2, 1])
+    """Stride: of all convolutions, or of each."""
+
+    hidden: Sizes = Field(default=[512])
+    """Sizes of the fully connected layers."""
+
 
 Table = Softmax | Simplex
-Network = MLP | CNN
+Network = MLP | CNN | NatureCNN
 
-TABLES, NETWORKS = ("softmax", "simplex"), ("mlp", "cnn")
+TABLES, NETWORKS = ("softmax", "simplex"), ("mlp", "cnn", "nature_cnn")
 """The types of tables and of networks; auto, which the environment decides, is in neither."""

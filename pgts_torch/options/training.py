@@ -74,10 +74,10 @@ class Training(Part):
         if policy is None or isinstance(critic, AutoCritic):
             return critic
         if not isinstance(critic, NetworkValues):
-            if policy.type == "cnn":
+            if isinstance(policy, CNN):
                 raise conflict(
-                    f"critic.type is {critic.type}, which needs numbered states; with policy.type cnn it must be "
-                    "network"
+                    f"critic.type is {critic.type}, which needs numbered states; with policy.type {policy.type} it "
+                    "must be network"
                 )
             return critic
         network = critic.network.type
@@ -85,10 +85,10 @@ class Training(Part):
             raise conflict(
                 f"critic.network.type is shared; policy.type {policy.type} is a table, which has no network to share"
             )
-        if network == "cnn" and isinstance(policy, Table):
+        if isinstance(critic.network, CNN) and isinstance(policy, Table):
             raise conflict(
-                f"critic.network.type is cnn, which takes images; policy.type is {policy.type}, a table of numbered "
-                "states"
+                f"critic.network.type is {network}, which takes images; policy.type is {policy.type}, a table of "
+                "numbered states"
             )
         return critic
 
@@ -169,8 +169,8 @@ class Training(Part):
         for name, part in parts.items():
             if isinstance(model, Latent) and isinstance(part, CNN):
                 raise conflict(
-                    f"{name}.type is cnn; with model.type latent it takes vectors that represent images: it must be "
-                    "mlp, and the cnn be model.network",
+                    f"{name}.type is {part.type}; with model.type latent it takes vectors that represent images: it "
+                    "must be mlp, and the cnn be model.network",
                     f"{name}.type",
                     "model.type",
                 )

@@ -11,7 +11,7 @@ from pgts_torch.agent import networks
 from pgts_torch.agent.encoders import Encoder, RunningNorm
 from pgts_torch.agent.networks import Network, default_network, make_trunk
 from pgts_torch.errors import PgtsError
-from pgts_torch.options import CNN, MLP
+from pgts_torch.options import CNN, MLP, NatureCNN
 from pgts_torch.seeding import stream
 
 VECTORS = spaces.Box(-np.inf, np.inf, (3,), np.float64)
@@ -53,6 +53,30 @@ def test_a_cnn_is_the_formula_of_its_weights(hidden):
     for weight, bias in zip(weights[4:-2:2], weights[5:-2:2], strict=True):
         h = (h @ weight.T + bias).relu()
     torch.testing.assert_close(net.outputs(views(4)).double(), h @ weights[-2].T + weights[-1], atol=1e-5, rtol=0)
+
+
+def test_each_convolution_may_have_a_kernel_size_and_a_stride_of_its_own():
+    net = network(CNN(channels=(2, 3), kernel_size=[3, 2], stride=[2, 1], hidden=[]), VIEWS)
+    first, first_bias, second, second_bias, weight, bias = net.parameters()
+    h = views(4).permute(0, 3, 1, 2) / 255
+    h = torch.nn.functional.conv2d(h, first, first_bias, stride=2).relu()
+    h = torch.nn.functional.conv2d(h, second, second_bias, stride=1).relu()
+    assert h.shape == (4, 3, 2, 2)
+    torch.testing.assert_close(net.outputs(views(4)), h.flatten(1) @ weight.T + bias)
+    alike = [network(CNN(channels=(2, 3), kernel_size=k), VIEWS).plain_state() for k in (2, [2, 2], [2, 3])]
+    shapes = [{name: value.shape for name, value in state.items()} for state in alike]
+    assert shapes[0] == shapes[1] != shapes[2]
+    assert all(torch.equal(value, alike[1][name]) for name, value in alike[0].items())
+
+
+def test_nature_cnn_has_the_layers_of_mnih_et_al():
+    net = network(NatureCNN(), spaces.Box(0, 255, (84, 84, 4), np.uint8))
+    shapes = [tuple(value.shape) for name, value in net.named_parameters() if name.endswith("weight")]
+    assert shapes == [(32, 4, 8, 8), (64, 32, 4, 4), (64, 64, 3, 3), (512, 7 * 7 * 64), (2, 512)]
+    assert [layer.stride[0] for layer in net.modules() if isinstance(layer, torch.nn.Conv2d)] == [4, 2, 1]
+    assert net.outputs(torch.zeros(3, 84, 84, 4, dtype=torch.uint8)).shape == (3, 2)
+    atari = spaces.Box(0, 255, (210, 160, 3), np.uint8)
+    assert sum(value.numel() for value in network(NatureCNN(), atari).parameters()) == 11_611_810
 
 
 @pytest.mark.parametrize(("description", "space"), [(MLP(), VECTORS), (MLP(hidden=(8,)), STATES), (CNN(), VIEWS)])
@@ -188,7 +212,11 @@ def test_weights_and_statistics_survive_the_round_trip_and_what_does_not_fit_cha
         (lambda: MLP(activation="gelu"), "activation is 'gelu'"),
         (lambda: CNN(channels=[16, 2.5]), "channels holds 2.5"),
         (lambda: CNN(scale=0), "scale is 0"),
+        (lambda: CNN(kernel_size=[2, 2]), r"kernel_size is \[2, 2\]; there are 3 convolutions.* one number for each"),
+        (lambda: NatureCNN(channels=[8, 8]), r"kernel_size is \[8, 4, 3\]; there are 2 convolutions"),
+        (lambda: CNN(stride=[1, 0, 1]), "stride is a list; it must be a whole number in .* one for each layer"),
         (lambda: network(CNN(), VECTORS), "use an mlp"),
+        (lambda: network(NatureCNN(), spaces.Box(0, 255, (35, 35, 3), np.uint8)), "too small"),
         (lambda: network(CNN(kernel_size=5), VIEWS), "too small"),
         (lambda: network(MLP(normalize=True), STATES), "without a scale: it must be False"),
         (lambda: network(MLP(), spaces.Text(3)), "observations are Text"),

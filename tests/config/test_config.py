@@ -193,6 +193,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "occupancy, visits or uniform or null": st.sampled_from([None, "occupancy", "visits", "uniform"]),
     "a key of dictionary observations or null": st.none() | st.from_regex(r"[A-Za-z0-9_.:-]{1,20}", fullmatch=True),
     "a list of at most 16 whole numbers in [1, 65536]": st.lists(st.integers(1, 65536), max_size=16),
+    "a whole number in [1, 65536], or a list of such, one for each layer": st.integers(1, 2**16),
     "a list of two ascending numbers or null": st.sampled_from([None, [0, 1], [-1.5, -1.5]]),
     "a mapping": st.dictionaries(st.sampled_from(["n", "traps", "word"]), PLAIN),
 }
@@ -208,6 +209,7 @@ UPDATES = {
     "simplex": ["auto", "projected", "mirror"],
     "mlp": ["auto", "gradient", "ppo", "mirror", "cmpo"],
     "cnn": ["auto", "gradient", "ppo", "mirror", "cmpo"],
+    "nature_cnn": ["auto", "gradient", "ppo", "mirror", "cmpo"],
 }
 """What can move a policy of each type."""
 
@@ -222,7 +224,7 @@ def configurations(draw: st.DrawFn) -> Config:
     types["update.type"] = draw(st.sampled_from(UPDATES[policy]))
     networks = ["own", "mlp"] if is_table else ["own", "shared"] + [policy] * (policy != "auto")
     types["critic.network.type"] = draw(st.sampled_from(networks))
-    types["critic.type"] = "network" if policy == "cnn" else types["critic.type"]
+    types["critic.type"] = "network" if policy.endswith("cnn") else types["critic.type"]
     needs_all = is_table or types["update.type"] in ("mirror", "cmpo")
     types["estimator.type"] = "lookahead" if needs_all else types["estimator.type"]
     if types["estimator.type"] == "sampled" and types["critic.type"] in ("exact", "rollout"):
@@ -252,7 +254,8 @@ def configurations(draw: st.DrawFn) -> Config:
         given["model.strength"] = None
     if types["model.type"] == "counts" and given["model.value_range"] is None:
         given["model.confidence"] = given["model.certificate"] = None
-    if types["model.type"] == "latent" and "cnn" in (types["policy.type"], types.get("critic.network.type")):
+    convolved = {"cnn", "nature_cnn"} & {types["policy.type"], types.get("critic.network.type")}
+    if types["model.type"] == "latent" and convolved:
         types = types | {"model.type": "auto"}
         given = {key: value for key, value in given.items() if not key.startswith("model.")}
     silent = {
@@ -352,12 +355,17 @@ PARTS = [
     ["--policy.type", "mlp", "--update", "{type: mirror, temperature: 0.5, max_grad_norm: never}"],
     ["--policy.type", "cnn", "--policy.scale", "10", "--update.target_kl", "0.1", "--critic.target", "q"],
     ["--policy.type", "cnn", "--critic.network", "{type: cnn, channels: [4]}", "--critic.polyak", "0.1"],
+    [
+        *("--policy", "{type: nature_cnn, kernel_size: 2, stride: 1, hidden: [8]}"),
+        *("--critic.network", "{type: nature_cnn, kernel_size: [3, 2, 2], stride: 1, hidden: [8]}"),
+    ],
     ["--policy.type", "mlp", "--search.depth", "0", "--estimator.type", "sampled", "--estimator.lambda", "0.9"],
     ["--rollout.horizon.type", "fixed", "--model.type", "given", "--replay.type", "none"],
     ["--model.type", "counts", "--rollout.horizon.first", "7"],
     ["--model.type", "own", "--model.make", "models_of_mine:model"],
     ["--model.type", "latent", "--replay.length", "3"],
     ["--model.type", "latent", "--model.network.type", "cnn"],
+    ["--model.type", "latent", "--model.network.type", "nature_cnn"],
     ["--model.members", "2", "--replay.length", "3"],
 ]
 """Command lines that together name every type there is."""
@@ -366,7 +374,7 @@ PARTS = [
 def made(arguments: list[str]) -> tuple[Policy, Critic, Update]:
     """What the library makes of a configuration."""
     config = load(None, arguments)
-    world: Any = PICTURED if config.policy.type == "cnn" else NUMBERED
+    world: Any = PICTURED if config.policy.type.endswith("cnn") else NUMBERED
     options = build.chosen(read(config.arguments()), world)
     policy = build.make_policy(options.policy, world, seed=0)
     critic = build.make_critic(options.critic, world, policy, options.estimator, seed=0)

@@ -110,8 +110,11 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
             "update: {type: adam}",
             "update.type is 'adam'; it must be auto, cmpo, gradient, mirror, ppo, projected or softmax",
         ),
-        ("policy: {type: resnet}", "policy.type is 'resnet'; it must be auto, cnn, mlp, simplex or softmax"),
-        ("policy: resnet", "policy.type is 'resnet'; it must be auto, cnn, mlp, simplex or softmax"),
+        (
+            "policy: {type: resnet}",
+            "policy.type is 'resnet'; it must be auto, cnn, mlp, nature_cnn, simplex or softmax",
+        ),
+        ("policy: resnet", "policy.type is 'resnet'; it must be auto, cnn, mlp, nature_cnn, simplex or softmax"),
         ("policy: {type: mlp, hidden: 64}", f"policy.hidden is 64; it must be {SIZES}"),
         ("policy: {type: mlp, hidden: [64, 0]}", f"policy.hidden holds 0; it must be {SIZES}"),
         (
