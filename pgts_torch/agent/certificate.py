@@ -155,6 +155,8 @@ class Certificates:
             v_N: v there, from the lookahead of depth 0.
         """
         start_S, num_episodes, ranks = self._world.start_S, experience.whole.episodes, experience.ranks
+        if start_S is None and not roots.are_all:
+            return _Starts(roots.state_N[:0], roots.weight_N[:0].double(), None, 0)
         if start_S is None:
             first_B = experience.state_TB[0]
             if experience.searched_TB is not None:

@@ -43,6 +43,10 @@ class Draws:
         """A new generator for a search; all searches of an iteration get the same random numbers."""
         return stream(self.seed, *self._common_names, "search", device=self.own.device)
 
+    def roots(self) -> torch.Generator:
+        """A new generator, on the CPU and the same in all processes, for the visits that a lookahead starts from."""
+        return stream(self.seed, *self._common_names, "roots")
+
     def update(self, number: int) -> "Draws":
         """The random generators of one of several updates of the iteration."""
         return Draws._of(self.ranks, self.seed, self.number, (*self._common_names, "update", number), self.own.device)

@@ -43,10 +43,11 @@ class LookaheadEstimator(Estimator):
     Args:
         choose: computes the lookahead, and chooses its depth.
         weight: the weights of states in the update.
+        max_roots: the most visits that the lookahead starts from; None: all.
     """
 
-    def __init__(self, choose: DepthChoice, weight: StateWeight) -> None:
-        self._look, self._choose, self._weight = choose.look, choose, weight
+    def __init__(self, choose: DepthChoice, weight: StateWeight, max_roots: int | None = None) -> None:
+        self._look, self._choose, self._weight, self._max_roots = choose.look, choose, weight, max_roots
 
     def evaluate(self, experience: Rollout, draws: Draws) -> dict[str, float]:
         critic = self._look.critic
@@ -55,7 +56,7 @@ class LookaheadEstimator(Estimator):
 
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
         self._look.restart()
-        roots, ranks = roots_of(experience, self._look.world, self._weight), experience.ranks
+        roots, ranks = roots_of(experience, self._look.world, self._weight, self._max_roots, draws), experience.ranks
         pi_NA = self._look.policy.probs(roots.observation_N)
         chosen = self._choose(experience, roots, pi_NA, draws)
         q_NA, count = chosen.look.q_BA, chosen.look.q_BA.numel()

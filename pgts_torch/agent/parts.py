@@ -117,7 +117,7 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
         search, certificates, depth_choice = _lookahead(
             world, followed, critic, options, ranks, samples_starts=dyna is None
         )
-        estimator = LookaheadEstimator(depth_choice, update.state_weight)
+        estimator = LookaheadEstimator(depth_choice, update.state_weight, options.search.max_roots)
     check_parts(arguments, world, policy, update)
     horizon, episodes = options.rollout.horizon, None
     if isinstance(horizon, StepsHorizon):
@@ -151,6 +151,11 @@ def _lookahead(
         world, search, critic, num_depths=len(depths), ranks=ranks, samples_starts=samples_starts
     )
     if stop_at is not None and not isinstance(options.model, LEARNED):
+        if options.search.max_roots is not None and world.start_S is None:
+            raise PgtsError(
+                f"stop_at is {stop_at} and max_roots is {options.search.max_roots}; start states are known from "
+                "episodes only, and a certificate needs a lookahead from all of them: leave one of the two out"
+            )
         certificates.check(f"stop_at is {stop_at}")
     if options.search.depth == "adaptive":
         certificates.check("depth is adaptive")
@@ -172,7 +177,7 @@ def _with_explorer(
         return world, None
     visiting, its_critic, its_update = copy.deepcopy((policy, critic, update))
     search, _, depth_choice = _lookahead(world, visiting, its_critic, options, ranks, samples_starts=False)
-    estimator = LookaheadEstimator(depth_choice, update.state_weight)
+    estimator = LookaheadEstimator(depth_choice, update.state_weight, options.search.max_roots)
     explorer = Explorer(world, visiting, its_critic, its_update, search, estimator)
     trained_in = copy.copy(world)
     trained_in.model = table.plain()

@@ -69,6 +69,7 @@ class PGTS:
             VectorEnv, in each process, beside which another number is an error.
         actions_per_dimension: the number of evenly spaced values, from the lowest to the highest, for each dimension of
             continuous actions; None: actions are discrete, or MultiDiscrete, whose combinations are numbered.
+        max_roots: the most visits that the lookahead of an update starts from, drawn where more states were visited.
         action_repeat, model_check: how often the model repeats each action, and whether it is checked against steps of
             the environment: see there too.
         observation_keys, image_channels: the entries of dictionary observations that are seen (default: all), and where
@@ -105,6 +106,7 @@ class PGTS:
         horizon: Description = "auto",
         num_envs: int | None = None,
         actions_per_dimension: int | None = None,
+        max_roots: int | None = None,
         action_repeat: int = 1,
         model_check: Mode = "error",
         observation_keys: Sequence[str] | None = None,

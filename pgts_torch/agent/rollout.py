@@ -52,11 +52,11 @@ class Totals(NamedTuple):
     """How much all processes have made together.
 
     visits: how many visits there are, and which of them are those of this process.
-    searched: how many visits a lookahead starts from.
+    searched: the same for the visits that a lookahead starts from.
     """
 
     visits: Share
-    searched: int
+    searched: Share
     episodes: int
 
 
@@ -107,7 +107,7 @@ class Rollout:
         """How much all processes have made together."""
         if self.totals is not None:
             return self.totals
-        return Totals(Share(ALONE, 0, self.num_steps), self._num_searched, self.num_episodes)
+        return Totals(Share(ALONE, 0, self.num_steps), Share(ALONE, 0, self._num_searched), self.num_episodes)
 
     def shared(self, ranks: Ranks) -> "Rollout":
         """The same rollout as the part of one of several processes, which must all call this.
@@ -119,8 +119,10 @@ class Rollout:
             return self
         own = self.num_steps, self._num_searched, self.num_episodes
         steps_R, searched_R, episodes_R = ranks.each("episodes", *own).astype(int).T
-        visits = Share(ranks, int(steps_R[: ranks.rank].sum()), int(steps_R.sum()))
-        return replace(self, totals=Totals(visits, int(searched_R.sum()), int(episodes_R.sum())))
+        visits, searched = (
+            Share(ranks, int(count_R[: ranks.rank].sum()), int(count_R.sum())) for count_R in (steps_R, searched_R)
+        )
+        return replace(self, totals=Totals(visits, searched, int(episodes_R.sum())))
 
     @cached_property
     def observation_V(self) -> Shaped[Tensor, "V ..."]:
@@ -212,10 +214,16 @@ class Rollout:
         if state_weight == "uniform":
             return states, torch.ones(len(states), dtype=self.weight_TB.dtype, device=states.device)
         weight_V = self.visit_weight(state_weight)[self._searched_V]
-        weight_V = weight_V * (self.share.total / self.whole.searched)  # they stand for all visits
+        weight_V = weight_V * (self.share.total / self.whole.searched.total)  # they stand for all visits
         # the sum of the weights of all visits to a state
         weight_N = torch.zeros(len(states), dtype=weight_V.dtype, device=states.device)
         return states, weight_N.index_add_(0, row_V, weight_V)
+
+    @property
+    def count_N(self) -> Int[Tensor, "N"]:
+        """How many of the visits that a lookahead starts from are to each distinct state, in the order of `visits`."""
+        states, row_V = self._distinct
+        return torch.bincount(row_V, minlength=len(states))
 
     @property
     def first_observation_N(self) -> Shaped[Tensor, "N ..."]:

@@ -156,6 +156,11 @@ class LookaheadOptions(Part):
     """Training ends once the certificate, an upper bound on the optimality gap, is at most this; null: never. It is a
     proof if the start distribution is known, the critic exact and the model the environment; else an estimate."""
 
+    max_roots: Count | None = None
+    """The most visits that the lookahead of an update starts from, where more different states were visited: they are
+    drawn evenly from all visits and weigh as much as these together, so that the gradient is right in the mean. null:
+    all."""
+
     action_repeat: Count = 1
     """How often the lookahead repeats each action, so that it looks as many times further ahead. Not in environments
     with numbered states."""

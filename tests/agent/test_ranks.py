@@ -54,6 +54,8 @@ KINDS: dict[str, Callable[..., PGTS]] = {
     "uniform weight": partial(PGTS, "pgts/Grid-v0", update={"type": "mirror", "state_weight": "uniform"}),
     "geometric horizon": partial(PGTS, "pgts/Ladder-v0", depth=2, horizon="geometric"),
     "network, torch dynamics": partial(PGTS, "CartPole-v1", depth=1, update=GRADIENT, **SMALL),
+    "table, few roots": partial(PGTS, "pgts/Grid-v0", depth=2, max_roots=9),
+    "network, few roots": partial(PGTS, "CartPole-v1", depth=1, update=GRADIENT, max_roots=20, **SMALL),
     "network, simulator": partial(PGTS, Counted, depth=1, update=GRADIENT, **SMALL),
     "network, learned model": partial(
         PGTS,
