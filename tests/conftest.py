@@ -6,10 +6,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy's threads, read when
 
 import jaxtyping
 
-import tests.typecheck  # noqa: F401  (the import hook knows it by name)
+import tests.typecheck
 
-# Before anything imports the package. Each letter of a shape is bound anew in every call.
-jaxtyping.install_import_hook("pgts_torch", "tests.typecheck.check")
+tests.typecheck.install()  # each letter of a shape is bound anew in every call
 
 from collections.abc import Iterator  # noqa: E402
 
@@ -27,6 +26,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("long"):
             item.add_marker(pytest.mark.timeout(3600))
+
+
+def pytest_runtest_setup() -> None:
+    tests.typecheck.begin_test()
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The suite itself: no process is waited for without end, and no benchmark is forgotten."""
+"""The suite itself: shapes are checked, no process is waited for without end, and no benchmark is forgotten."""
 
 import ast
 import re
@@ -6,8 +6,37 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
+from jaxtyping import Float, TypeCheckError
+from torch import Tensor
+
+from tests import typecheck
 
 ROOT = Path(__file__).parents[1]
+
+
+def double(x_N: Float[Tensor, "N"], y_N: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+    return (x_N + y_N)[: len(x_N)]
+
+
+def test_shapes_are_checked_in_the_first_calls_of_each_test_and_in_some_later_ones():
+    checked = typecheck.jaxtyped(typechecker=typecheck.check)(double)
+
+    def refused(calls: int, size: int) -> list[int]:
+        """Those of so many calls that do not take one number and so many others."""
+        found = []
+        for call in range(calls):
+            try:
+                checked(torch.ones(1), torch.ones(size))
+            except TypeCheckError:
+                found.append(call)
+        return found
+
+    assert refused(10, 3) == [*range(10)]
+    assert len(refused(160, 3)) == 10
+    typecheck.begin_test()
+    assert refused(5, 3) == [*range(5)]
+    assert refused(100, 1) == []
 
 
 def endless_waits(source: str) -> Iterator[str]:

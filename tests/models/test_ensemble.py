@@ -20,6 +20,7 @@ from pgts_torch.seeding import stream
 
 GAMMA = 0.9
 SMALL = Ensemble(members=2, hidden=[32], first_updates=800)
+BRIEF = SMALL.model_copy(update={"first_updates": 150})
 
 
 def swing(count: int, seed: int = 0, *, hidden: bool = False, length: int = 40) -> Experience:
@@ -48,8 +49,20 @@ def trained(count: int = 600, *, seed: int = 0, options: Ensemble = SMALL) -> En
     return model
 
 
-def test_what_follows_is_learned():
-    model, fresh = trained(), swing(400, seed=1)
+@pytest.fixture(scope="module")
+def model() -> EnsembleModel:
+    """One that has learned from 600 steps."""
+    return trained()
+
+
+@pytest.fixture(scope="module")
+def of_four() -> EnsembleModel:
+    """The same with four members."""
+    return trained(options=SMALL.model_copy(update={"members": 4}))
+
+
+def test_what_follows_is_learned(model):
+    fresh = swing(400, seed=1)
     reward_N, discount_N, next_ND = model.step(fresh.observation_N.float(), fresh.action_N)
     change_ND = fresh.next_observation_N - fresh.observation_N
     assert float((next_ND - fresh.next_observation_N).square().mean() / change_ND.var()) < 0.01
@@ -63,8 +76,7 @@ def test_what_follows_is_learned():
     assert float(off_ND.square().mean() / change_ND.var()) > 0.3
 
 
-def test_an_end_is_sampled_with_its_probability():
-    model = trained()
+def test_an_end_is_sampled_with_its_probability(model):
     state_N = model.number(torch.tensor([[1.4, 0.1]]).repeat(4000, 1))
     action_N = torch.ones(4000, dtype=torch.int64)
     discount = float(model.step(torch.tensor([[1.4, 0.1]]), action_N[:1])[1])
@@ -78,10 +90,9 @@ def test_an_end_is_sampled_with_its_probability():
     assert again.discount_N.equal(sampled.discount_N)
 
 
-def test_members_differ_by_about_as_much_as_they_are_wrong():
+def test_members_differ_by_about_as_much_as_they_are_wrong(of_four):
     """For values that are as steep as the estimate allows, in 20 directions."""
-    options, fresh = Ensemble(members=4, hidden=[32], first_updates=800), swing(400, seed=1)
-    model = trained(options=options)
+    model, fresh = of_four, swing(400, seed=1)
     rewards, deviation_D = model.replay.rows("reward"), model.replay.rows("state").std(0, correction=0)
     low, high = value_range((float(rewards.min()), float(rewards.max())), GAMMA)
     direction_2V = nn.functional.normalize(torch.randn(2, 20, generator=stream(0, "test")), dim=0)
@@ -101,19 +112,21 @@ def test_members_differ_by_about_as_much_as_they_are_wrong():
     assert alone.step_error(alone.number(torch.zeros(1, 2))) is None
 
 
-def test_steps_on_which_members_differ_are_not_trusted():
-    def trusted(far: float, **options: float) -> float:
+def test_steps_on_which_members_differ_are_not_trusted(of_four):
+    bold = EnsembleModel(2, 2, gamma=GAMMA, options=of_four.options.model_copy(update={"max_disagreement": 1.0}))
+    bold.load_state_dict(of_four.state_dict())
+
+    def trusted(far: float, model: EnsembleModel) -> float:
         """The share of steps that are trusted in 200 states so many deviations from the mean."""
-        model = trained(options=Ensemble(members=3, hidden=[32], first_updates=800, **options))
         state_ND = far * nn.functional.normalize(torch.randn(200, 2, generator=stream(0, "test")))
         zero_N = torch.zeros(200, dtype=torch.int64)
         found = model.sample(model.number(state_ND), zero_N, key_N=torch.arange(200)).trusted_N
         assert found is not None
         return float(found.double().mean())
 
-    assert trusted(0.5) > 0.9
-    assert trusted(8.0) < 0.1
-    assert trusted(8.0, max_disagreement=1.0) == 1
+    assert trusted(0.5, of_four) > 0.9
+    assert trusted(8.0, of_four) < 0.1
+    assert trusted(8.0, bold) == 1
 
 
 def test_new_moments_change_no_prediction():
@@ -151,8 +164,7 @@ def test_each_member_has_a_bootstrap_sample_of_the_steps_and_all_ends():
     assert bool((alone == 1).all())
 
 
-def test_a_lookahead_in_it_is_that_of_its_means():
-    model = trained()
+def test_a_lookahead_in_it_is_that_of_its_means(model):
     roots = model.number(torch.tensor([[0.1, 0.2], [0.5, -0.5]]))
     look = expectimax(model, roots, v_leaf=lambda state_N: model.states(state_N)[:, 0].double(), depth=1)
     state_ND, action_N = model.states(roots).repeat_interleave(2, 0), torch.tensor([0, 1]).repeat(2)
@@ -165,7 +177,7 @@ def test_a_lookahead_in_it_is_that_of_its_means():
 
 def test_errors_are_of_held_out_steps_and_fall_with_data():
     few, many = (
-        EnsembleModel(2, 2, gamma=GAMMA, options=Ensemble(members=2, hidden=[32], first_updates=2 * count)).learn(
+        EnsembleModel(2, 2, gamma=GAMMA, options=Ensemble(members=2, hidden=[32], first_updates=count // 2)).learn(
             swing(count), generator=stream(0, "learn")
         )
         for count in (350, 1600)
@@ -176,13 +188,13 @@ def test_errors_are_of_held_out_steps_and_fall_with_data():
 
 
 def test_observations_that_are_no_states_are_noticed():
-    model = EnsembleModel(2, 2, gamma=GAMMA, options=SMALL)
+    model = EnsembleModel(2, 2, gamma=GAMMA, options=BRIEF)
     with pytest.warns(UserWarning, match="the observation may not be the state"):
         model.learn(swing(2500, hidden=True), generator=stream(0, "learn"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model.learn(swing(100, seed=2, hidden=True), generator=stream(1, "learn"))  # said once
-        EnsembleModel(2, 2, gamma=GAMMA, options=SMALL).learn(swing(2500), generator=stream(0, "learn"))
+        EnsembleModel(2, 2, gamma=GAMMA, options=BRIEF).learn(swing(2500), generator=stream(0, "learn"))
 
 
 def test_rare_jumps_are_no_reason_to_doubt_the_observation():
@@ -192,7 +204,7 @@ def test_rare_jumps_are_no_reason_to_doubt_the_observation():
     moved = steps._replace(next_observation_N=steps.next_observation_N + 50.0 * jumps_N[:, None])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        losses = EnsembleModel(2, 2, gamma=GAMMA, options=SMALL).learn(moved, generator=stream(0, "learn"))
+        losses = EnsembleModel(2, 2, gamma=GAMMA, options=BRIEF).learn(moved, generator=stream(0, "learn"))
     assert losses["unexplained"] < 0.25  # with all of each error it would be near 1
 
 
@@ -203,7 +215,7 @@ def test_a_constant_number_and_a_constant_reward_are_learned_exactly():
         next_observation_N=torch.cat([steps.next_observation_N, torch.full((200, 1), 7.0)], 1),
         reward_N=torch.full((200,), 1e-3, dtype=torch.float64),
     )
-    model = EnsembleModel(3, 2, gamma=GAMMA, options=SMALL)
+    model = EnsembleModel(3, 2, gamma=GAMMA, options=BRIEF)
     model.learn(constant, generator=stream(0, "learn"))
     reward_N, _, next_ND = model.step(constant.observation_N.float(), constant.action_N)
     assert next_ND[:, 2].tolist() == [7.0] * 200
@@ -211,7 +223,7 @@ def test_a_constant_number_and_a_constant_reward_are_learned_exactly():
 
 
 def test_a_loaded_model_goes_on_bit_for_bit():
-    one, other = trained(300), EnsembleModel(2, 2, gamma=GAMMA, options=SMALL, seed=5)
+    one, other = trained(300, options=BRIEF), EnsembleModel(2, 2, gamma=GAMMA, options=BRIEF, seed=5)
     other.load_state_dict(one.state_dict())
     losses = [model.learn(swing(100, seed=3), generator=stream(7, "learn")) for model in (one, other)]
     assert losses[0] == losses[1]
