@@ -81,7 +81,8 @@ def make_trunk(network: MLP | CNN, observation_space: Space[Any], *, generator: 
         layers = branches[0][1] if len(branches) == 1 else [Join(beside, encoder.shapes)]
     for outputs in network.hidden:
         linear = _linear(flat, outputs, math.sqrt(2), generator, observation_space)
-        layers += [linear, _ACTIVATIONS[network.activation]()]
+        norm = [nn.LayerNorm(outputs, dtype=torch.float32)] if network.layer_norm else []
+        layers += [linear, *norm, _ACTIVATIONS[network.activation]()]
         flat = outputs
     return Trunk(encoder, nn.Sequential(*layers), flat)
 

@@ -96,7 +96,7 @@ class CMPOUpdate(TargetUpdate):
         scale = advantage_scale(batch.advantage_NA, batch.weight_N, batch.ranks).clamp(min=batch.noise)
         step_NA = batch.advantage_NA / scale / self.options.temperature
         # if all actions have the same advantage, scale is 0
-        return torch.where(scale == 0, 0.0, step_NA.clamp(-self.options.clip, self.options.clip)).float()
+        return torch.where(scale == 0, 0.0, step_NA.clamp(-self.now.clip, self.now.clip)).float()
 
 
 def advantage_scale(

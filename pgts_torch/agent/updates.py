@@ -11,6 +11,7 @@ from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy
 from pgts_torch.errors import PgtsError
 from pgts_torch.options.fields import limit
+from pgts_torch.options.schedules import value_at
 from pgts_torch.options.updates import Mirror, Projected, SoftmaxGradient, StateWeight
 from pgts_torch.search.lookahead import check_finite
 from pgts_torch.tabular.ascent import centred, floored, normalised, projected_step, softmax_direction
@@ -57,10 +58,15 @@ class Update(ABC):
 class TabularUpdate(Update):
     """One step in the rows of visited states; all other rows stay as they are.
 
-    step_size: eta > 0.
+    eta: its options' step size, a number or a schedule.
     """
 
-    step_size: float
+    eta: float | str
+
+    @property
+    def step_size(self) -> float:
+        """Its present value."""
+        return value_at(self.eta, self.num_env_steps)
 
     def __call__(self, policy: Policy, batch: Batch, *, generator: torch.Generator) -> dict[str, float]:
         """Take the step. It uses no random numbers and has no losses.
@@ -90,7 +96,7 @@ class ProjectedUpdate(TabularUpdate):
     policies = (SimplexPolicy,)
 
     def __init__(self, options: Projected = Projected()) -> None:  # noqa: B008 - frozen
-        self.options, self.step_size, self.state_weight = options, options.step_size, options.state_weight
+        self.options, self.eta, self.state_weight = options, options.step_size, options.state_weight
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         assert isinstance(policy, SimplexPolicy)
@@ -104,7 +110,7 @@ class SoftmaxUpdate(TabularUpdate):
     policies = (SoftmaxPolicy,)
 
     def __init__(self, options: SoftmaxGradient = SoftmaxGradient()) -> None:  # noqa: B008 - frozen
-        self.options, self.step_size, self.state_weight = options, options.step_size, options.state_weight
+        self.options, self.eta, self.state_weight = options, options.step_size, options.state_weight
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         assert isinstance(policy, SoftmaxPolicy)
@@ -132,7 +138,7 @@ class MirrorUpdate(TabularUpdate):
 
     def __init__(self, options: Mirror = Mirror()) -> None:  # noqa: B008 - frozen
         self.options = filled = options.filled("tables")
-        self.step_size, self.state_weight, self._floor = filled.step_size, filled.state_weight, limit(filled.floor)
+        self.eta, self.state_weight, self._floor = filled.step_size, filled.state_weight, limit(filled.floor)
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         pi_NA = policy.probs(state_N)

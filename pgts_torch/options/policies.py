@@ -81,6 +81,9 @@ class MLP(Part):
     activation: Literal["tanh", "relu"] = "tanh"
     """The activation function after each hidden layer."""
 
+    layer_norm: bool = False
+    """Normalise the outputs of each fully connected layer, before the activation (Ba et al. 2016)."""
+
     normalize: bool = False
     """Subtract the running mean of vectors and divide by their running deviation; only where there are some."""
 
@@ -104,6 +107,9 @@ class CNN(Part):
 
     activation: Literal["tanh", "relu"] = "relu"
     """The activation function after each layer."""
+
+    layer_norm: bool = False
+    """Normalise the outputs of each fully connected layer, before the activation (Ba et al. 2016)."""
 
     normalize: bool = False
     """Subtract the running mean of each channel, or entry of a vector, and divide by its running deviation."""

@@ -18,7 +18,7 @@ class AutoUpdate(Part):
 class TableUpdate(Part):
     """One step at the visited rows of a table."""
 
-    step_size: Positive = 0.1
+    step_size: ScheduledPositive = 0.1
     """eta, by which the weighted lookahead values are multiplied."""
 
     state_weight: StateWeight = "occupancy"
@@ -102,7 +102,7 @@ class CMPO(Epochs):
     temperature: Positive = 0.1
     """By which advantages, in units of their mean size, are divided; smaller temperatures make longer steps."""
 
-    clip: Positive = 3.0
+    clip: ScheduledPositive = 3.0
     """The largest change of log pi(a|s) in one iteration, before normalisation."""
 
 
@@ -115,7 +115,7 @@ class Mirror(Part):
     state_weight: StateWeight | None = null(tables="uniform", networks="visits")
     """The weight of a visited state: its discounted occupancy, its fraction of all visits, or 1."""
 
-    step_size: Positive | None = null(tables=1.0)
+    step_size: ScheduledPositive | None = null(tables=1.0)
     """eta, by which the weighted advantages are multiplied. Only for tables, as the next two."""
 
     normalize: Literal["rms", "none"] | None = null(tables="rms")

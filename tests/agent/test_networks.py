@@ -55,6 +55,27 @@ def test_a_cnn_is_the_formula_of_its_weights(hidden):
     torch.testing.assert_close(net.outputs(views(4)).double(), h @ weights[-2].T + weights[-1], atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize(("description", "space"), [(MLP(hidden=(4, 6)), VECTORS), (CNN(hidden=(4, 6)), VIEWS)])
+def test_layer_norm_normalises_the_outputs_of_each_dense_layer_before_the_activation(description, space):
+    net = network(description.model_copy(update={"layer_norm": True}), space)
+    plain = network(description, space)
+    x_N = views(4) if space is VIEWS else torch.randn(4, 3, generator=stream(0, "x"))
+    weights = [layer for layer in net.trunk.layers if isinstance(layer, torch.nn.Linear)]
+    assert all(
+        map(
+            torch.equal,
+            *([each.weight for each in one.trunk.layers if isinstance(each, torch.nn.Linear)] for one in (net, plain)),
+        )
+    )
+    h_ND = plain.trunk.layers[: -2 * 2](plain.encode(x_N)) if space is VIEWS else x_N
+    for linear in weights:
+        raw_ND = linear(h_ND)
+        raw_ND = (raw_ND - raw_ND.mean(1, keepdim=True)) / (raw_ND.var(1, correction=0, keepdim=True) + 1e-5).sqrt()
+        h_ND = raw_ND.tanh() if space is VECTORS else raw_ND.relu()
+    torch.testing.assert_close(net.outputs(x_N), net.head(h_ND))
+    assert not torch.allclose(net.outputs(x_N), plain.outputs(x_N), atol=1e-3)
+
+
 def test_each_convolution_may_have_a_kernel_size_and_a_stride_of_its_own():
     net = network(CNN(channels=(2, 3), kernel_size=[3, 2], stride=[2, 1], hidden=[]), VIEWS)
     first, first_bias, second, second_bias, weight, bias = net.parameters()

@@ -374,7 +374,9 @@ def test_a_policy_gradient_is_that_of_autograd(entropy_coef):
         assert not torch.allclose(moved, start, atol=1e-4)
 
 
-@pytest.mark.parametrize("options", [MLP(hidden=()), MLP(), MLP(hidden=(7, 5), activation="relu"), CNN()])
+@pytest.mark.parametrize(
+    "options", [MLP(hidden=()), MLP(), MLP(hidden=(7, 5), activation="relu"), CNN(), MLP(layer_norm=True)]
+)
 def test_gradients_that_are_written_out_have_the_bits_of_autograd(options):
     shape = (7, 7, 3) if isinstance(options, CNN) else (4,)
     policy = NetworkPolicy(spaces.Box(-9, 9, shape), 3, options)

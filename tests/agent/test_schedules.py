@@ -9,7 +9,7 @@ import torch
 from pgts_torch import PGTS
 from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
-from pgts_torch.options import CMPO, PPO, Gradient, Mirror, NetworkValues
+from pgts_torch.options import CMPO, PPO, Gradient, Mirror, NetworkValues, Projected, SoftmaxGradient
 from pgts_torch.options.schedules import at, value_at
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -81,6 +81,37 @@ def test_a_clip_range_that_changes_is_the_one_that_is_used():
         model.policy.load_state_dict(policy)
     clipped = [each.iterate().losses["clip_fraction"] for each in models]
     assert clipped[1] > clipped[0]
+
+
+@pytest.mark.parametrize(
+    ("policy", "kind"), [("softmax", Mirror), ("simplex", Mirror), ("softmax", SoftmaxGradient), ("simplex", Projected)]
+)
+def test_the_step_size_of_tables_is_that_of_the_schedule(policy, kind):
+    make = lambda eta: PGTS("pgts/Ladder-v0", depth=1, policy=policy, update=kind(step_size=eta), num_envs=2)  # noqa: E731
+    scheduled, constant, small = (make(eta) for eta in ("linear(1, 0.1, 1)", 1.0, 0.1))
+    for one in (scheduled, constant):
+        one.iterate()
+    first = scheduled.policy.state_dict()
+    assert same_bits(first, constant.policy.state_dict())
+    small.iterate()
+    assert not same_bits(first, small.policy.state_dict())
+    small.load_state_dict(constant.state_dict())
+    for one in (scheduled, small):
+        one.iterate()
+    assert scheduled.update.step_size == 0.1
+    assert same_bits(scheduled.policy.state_dict(), small.policy.state_dict())
+    assert not same_bits(scheduled.policy.state_dict(), first)
+
+
+def test_the_clip_of_cmpo_is_that_of_the_schedule():
+    given = {"depth": 1, "num_envs": 2, "horizon": {"type": "fixed", "length": 20}}
+    model = PGTS("CartPole-v1", **given, update=CMPO(clip="linear(0.5, 0, 1)"))
+    before = model.policy.state_dict()
+    model.iterate()
+    moved = model.policy.state_dict()
+    assert not same_bits(before, moved)
+    model.iterate()  # at 0 the target is the policy itself
+    assert same_bits(moved, model.policy.state_dict())
 
 
 def test_a_training_goes_on_with_its_schedule_and_with_more_steps_in_all(tmp_path):

@@ -34,6 +34,7 @@ def mistakes(tmp_path: Path) -> Callable[..., list[str]]:
 
 SIZES = "a list of at most 16 whole numbers in [1, 65536]"
 KINDS = "auto, expectimax, mcts or sampled"
+SCHEDULE = "or linear(FROM, TO, STEPS) or cosine(FROM, TO, STEPS) by environment steps"
 
 
 @pytest.mark.fault("empty file", "not UTF-8", "aliases", "python tags", "nesting 3,000 deep", "integer of 5,000 digits")
@@ -105,7 +106,7 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ("env: {kwargs: {n: [1, .nan]}}", "env.kwargs holds nan; numbers must be finite"),
         ("env: {kwargs: {1: 2}}", "env.kwargs has the key '1', which cannot be the name of an argument"),
         ("env: {kwargs: {gamma: 0.9}}", "env.kwargs must not have the key gamma: env.gamma sets it"),
-        ("update: {step_size: 0}", "update.step_size is 0; it must be a number > 0 or null"),
+        ("update: {step_size: 0}", f"update.step_size is 0; it must be a number > 0, {SCHEDULE} or null"),
         (
             "update: {type: adam}",
             "update.type is 'adam'; it must be auto, cmpo, gradient, mirror, ppo, projected or softmax",
@@ -276,7 +277,7 @@ def test_all_mistakes_are_reported_at_once_in_the_order_of_lines_then_flags(
         "update: {type: projected, step_size: 0}\nnam: x\nsearch: {depth: -1}\nseed: 1\nseed: 2\ncritic: {type: x}\n"
     )
     assert mistakes(content, "--sed", "3", "--threads", "0", "stray") == [
-        "c.yaml:1: update.step_size is 0; it must be a number > 0",
+        f"c.yaml:1: update.step_size is 0; it must be a number > 0, {SCHEDULE}",
         "c.yaml:2: nam is unknown; did you mean name?",
         "c.yaml:3: search.depth is -1; it must be a whole number >= 0 or adaptive",
         "c.yaml:5: the key seed is given twice",
