@@ -63,7 +63,7 @@ def main() -> int:
     torch.set_num_threads(1)
     before = {} if against is None else dict(map(_split, against.read_text().splitlines()))
     differs = False
-    for name, path, arguments in _settings():
+    for name, path, arguments in settings():
         digest = _digest(path, arguments)
         is_same = against is None or before.get(name) == digest
         differs |= not is_same
@@ -71,7 +71,7 @@ def main() -> int:
     return int(differs)
 
 
-def _settings() -> Iterator[tuple[str, Path | None, list[str]]]:
+def settings() -> Iterator[tuple[str, Path | None, list[str]]]:
     for path in sorted((ROOT / "configs").glob("*.yaml")):
         yield path.stem, path, SHORT
     for name, arguments in VARIANTS.items():

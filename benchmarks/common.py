@@ -114,11 +114,12 @@ def median_ratio(above: list[float], below: list[float]) -> float:
     return statistics.median(a / b for a, b in zip(above, below, strict=True))
 
 
-def use_one_core() -> None:
-    """One thread of one core for torch and, if it is imported later, for XLA."""
+def use_one_core(device: str = "cpu") -> None:
+    """One thread of one core for torch and, if it is imported later, for XLA, which runs on the same kind of device."""
     torch.set_num_threads(1)
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    os.environ["JAX_PLATFORMS"] = "cpu"
+    os.environ["JAX_PLATFORMS"] = device.partition(":")[0]
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # torch needs memory too
     if sys.platform == "linux":
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
@@ -127,7 +128,7 @@ def parser(doc: str) -> ArgumentParser:
     """The options of all search benchmarks."""
     options = ArgumentParser(description=doc, formatter_class=RawDescriptionHelpFormatter)
     options.add_argument("--json", type=Path, help="where to write the figures")
-    options.add_argument("--device", default="cpu", help="where our searches run; mctx always runs on the CPU")
+    options.add_argument("--device", default="cpu", help="where searches run: cpu or cuda")
     options.add_argument("--quick", action="store_true", help="fewer sizes and repeats, under a minute")
     return options
 

@@ -10,9 +10,10 @@
 4. Depth 32 and depth 64 on known states: how the time grows, and how many calls the model gets.
 5. Depth 1 to 64 from one root: nodes, model calls and time with merging, and without it as far as that fits.
 6. DeepSea(50): deeper and deeper from the start until another action looks best than at depth 0.
-7. One sweep over 10^6 nodes: which share of the memory bandwidth it reaches.
+7. One sweep over 10^6 nodes, on a GPU also over 10^7: which share of the memory bandwidth it reaches.
 
-One thread on one core for both sides. Each time is the median of several repeats in which all forms take turns, and a
+One thread on one core for both sides, and with --device cuda one GPU; there a tree search of fixed shape is also held
+by a CUDA graph. Each time is the median of several repeats in which all forms take turns, and a
 ratio is the median of theirs. Without mctx (the extra `bench`) the peer's lines are missing.
 """
 
@@ -40,7 +41,9 @@ from peers import POLICIES, mctx_searcher
 
 from pgts_torch.bellman import Outcomes, sweep
 from pgts_torch.models import TabularModel
+from pgts_torch.options import MCTS
 from pgts_torch.search import Topology, mcts
+from pgts_torch.search.fixed_trees import FixedTrees
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, deep_sea, exact, grid
 
@@ -118,6 +121,8 @@ def _mcts_forms(mdp: TabularMDP, root_B: torch.Tensor, v_S: torch.Tensor, device
         for keep in (True, False) if way == "tree" else (True,):
             form = f"mcts, {way}, {'known' if keep else 'fresh'}"
             forms[form] = _mcts(mdp, root_B, v_S, device, keep=keep, **options)
+    if device.startswith("cuda"):
+        forms["mcts, a CUDA graph"] = _captured(mdp, root_B.to(device), v_S.to(device))
     for policy in POLICIES:
         peer = mctx_searcher(mdp, v_S, root_B, policy=policy, simulations=SIMULATIONS, max_depth=DEPTH + 1)
         if peer:
@@ -139,6 +144,28 @@ def _mcts(
     topology, root_B, v_S = Topology(model) if keep else None, root_B.to(device), v_S.to(device)
     options |= {"topology": topology, "generator": generator, "v_leaf": lambda state_N: v_S[state_N]}
     return lambda: mcts(model, root_B, depth=DEPTH, simulations=SIMULATIONS, **options).q_BA
+
+
+def _captured(mdp: TabularMDP, root_B: torch.Tensor, v_S: torch.Tensor) -> Callable[[], torch.Tensor]:
+    """The search one simulation after another, without noise, as a CUDA graph."""
+    model = TabularModel(mdp, device=root_B.device)
+    prior_SA = torch.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions).to(v_S)
+    outcomes, options = (
+        model.outcomes(torch.arange(mdp.num_states, device=root_B.device)),
+        MCTS(simulations=SIMULATIONS),
+    )
+    trees = FixedTrees(outcomes, v_S, prior_SA, DEPTH + 1, options, num_roots=len(root_B), num_nodes=SIMULATIONS)
+    preference_BA = prior_SA[root_B].log()
+    trees.search(root_B, preference_BA)  # what is made once is not captured
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        q_BA, _ = trees.search(root_B, preference_BA)
+
+    def search() -> torch.Tensor:
+        graph.replay()
+        return q_BA
+
+    return search
 
 
 def print_mcts_throughput(table: dict[str, Any]) -> None:
@@ -199,12 +226,14 @@ def bandwidth(repeats: int, device: str, num_nodes: int) -> list[dict[str, Any]]
 
 
 def print_bandwidth(rows: list[dict[str, Any]]) -> None:
-    print(f"\nOne sweep over {rows[0]['nodes']:.0e} nodes, 4 actions, 5 outcomes, beside a copy")
-    print(f"{'children':<14}{'dtype':<10}{'sweep ms':>10}{'MB':>8}{'GB/s':>8}{'copy GB/s':>12}{'share':>8}")
+    print("\nOne sweep, 4 actions, 5 outcomes, beside a copy")
+    print(f"{'nodes':<8}{'children':<14}{'dtype':<10}{'sweep ms':>10}{'MB':>8}{'GB/s':>8}{'copy GB/s':>12}{'share':>8}")
     for row in rows:
         rates = [row["bytes"] / row[f"{form}_milliseconds"] / 1e6 for form in ("sweep", "copy")]
         time = f"{row['sweep_milliseconds']:>10.2f}{row['bytes'] / 1e6:>8.0f}"
-        print(f"{row['children']:<14}{row['dtype']:<10}{time}{rates[0]:>8.1f}{rates[1]:>12.1f}{row['share']:>8.0%}")
+        print(
+            f"{row['nodes']:<8.0e}{row['children']:<14}{row['dtype']:<10}{time}{rates[0]:>8.1f}{rates[1]:>12.1f}{row['share']:>8.0%}"
+        )
     print("MB: what a sweep must move at least. share: time of a copy that moves as much to this.")
 
 
@@ -215,7 +244,7 @@ def main() -> None:
     repeats = args.repeats if args.repeats is not None else 3 if args.quick else 15
     if repeats < 1:
         options.error(f"argument --repeats: {repeats} is not at least 1")
-    use_one_core()
+    use_one_core(args.device)
     few, device, n = max(3, repeats // 3), args.device, 20 if args.quick else 50
     report: dict[str, Any] = about(args) | {"repeats": repeats}
     report["beside_mctx"] = beside_mctx(repeats, device)
@@ -230,7 +259,8 @@ def main() -> None:
     merging.print_cost_against_depth(report["cost_against_depth"])
     report["decision_in_deep_sea"] = merging.decision_in_deep_sea(n, device)
     merging.print_decision_in_deep_sea(n, report["decision_in_deep_sea"])
-    report["bandwidth"] = bandwidth(few, device, 10**5 if args.quick else 10**6)
+    sizes = (10**5,) if args.quick else (10**6, 10**7) if device.startswith("cuda") else (10**6,)
+    report["bandwidth"] = [row for num_nodes in sizes for row in bandwidth(few, device, num_nodes)]
     print_bandwidth(report["bandwidth"])
     write(report, args.json)
 

@@ -125,7 +125,7 @@ class Outcomes:
 
     def expected(self, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
         """sum_k p_k gamma_k v(s'_k)."""
-        return torch.mv(self.weight, v_C).view(self.reward_NA.shape)
+        return _product(self.weight, self.num_outcomes, v_C).view(self.reward_NA.shape)
 
     def rows(self, row_N: Int[Tensor, "N"]) -> Self:
         """The outcomes of some of the states, in the given order."""
@@ -190,7 +190,8 @@ def swept_backup(outcomes: Outcomes, v_C: Float[Tensor, "C"], sweeps: int) -> Fl
         return torch.from_numpy(q_NA)
     with torch.no_grad():
         v_C = sweep(outcomes, v_C, sweeps) if sweeps else v_C
-        return torch.addmv(outcomes.reward_NA.reshape(-1), outcomes.weight, v_C).view(outcomes.reward_NA.shape)
+        q = _product(outcomes.weight, outcomes.num_outcomes, v_C, outcomes.reward_NA.reshape(-1))
+        return q.view(outcomes.reward_NA.shape)
 
 
 def sweep(
@@ -200,8 +201,7 @@ def sweep(
 
         v(s) <- max_a q(s, a),   or  q(s, action(s)) where actions are given,   q = `backup` of v
 
-    The sweeps share two buffers: that takes half the time of separate backups where states are few and the calls cost
-    most, and no fresh memory where they are many.
+    Compiled sweeps share two buffers.
     """
     _check_values(outcomes, v_S)
     with torch.no_grad():
@@ -215,13 +215,32 @@ def sweep(
         if times == 0:
             return v_S.clone()
         reward = reward_NA.reshape(-1)
-        q = torch.addmv(reward, weight, v_S)
-        q_NA = q.view(reward_NA.shape)
-        v_S = q_NA.amax(-1)
-        for _ in range(times - 1):
-            torch.addmv(reward, weight, v_S, out=q)
-            torch.amax(q_NA, -1, out=v_S)
+        for _ in range(times):
+            v_S = _product(weight, outcomes.num_outcomes, v_S, reward).view(reward_NA.shape).amax(-1)
         return v_S
+
+
+def _product(weight: Tensor, K: int, v_C: Float[Tensor, "C"], reward: Float[Tensor, "M"] | None = None) -> Tensor:
+    """The rows of `weight` times v, plus the rewards."""
+    values, child = weight.values(), weight.col_indices()
+    if not sums_in_order(v_C.device, len(values)):
+        return torch.mv(weight, v_C) if reward is None else torch.addmv(reward, weight, v_C)
+    term_MK = (values * v_C.index_select(0, child)).view(-1, K)
+    # The order of `bellman_kernels.back_up`; a cumulative sum adds one after another.
+    fours = K // 4 * 4
+    parts = [term_MK[:, first:fours:2].cumsum(1)[:, -1] for first in range(2 if fours else 0)]
+    parts += [term_MK[:, k] for k in range(fours, K)]
+    total = sum(parts[1:], parts[0])
+    return total if reward is None else total + reward
+
+
+def sums_in_order(device: torch.device, size: int) -> bool:
+    """Whether a product adds in the order of compiled loops where nothing is compiled: on the CPU, unless it is large.
+
+    The order in which torch's sparse product adds, and whether it rounds in between, is that of the processor's maker.
+    It depends on the number of rows too, so that a search split into batches would be another one.
+    """
+    return device.type == "cpu" and size < _LARGE
 
 
 def _rows(values: Tensor, child: Tensor, K: int, num_children: int) -> Tensor:
@@ -229,6 +248,9 @@ def _rows(values: Tensor, child: Tensor, K: int, num_children: int) -> Tensor:
     index = child.dtype
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        warnings.filterwarnings(
+            "ignore", message="Sparse invariant checks are implicitly disabled"
+        )  # before torch 2.12
         return torch.sparse_csr_tensor(
             torch.arange(len(child) // K + 1, dtype=index, device=child.device) * K,
             child,
