@@ -162,6 +162,8 @@ def _captured(mdp: TabularMDP, root_B: torch.Tensor, v_S: torch.Tensor) -> Calla
         q_BA, _ = trees.search(root_B, preference_BA)
 
     def search() -> torch.Tensor:
+        assert trees is not None  # the graph works in its memory, and in that of the preferences
+        assert preference_BA is not None
         graph.replay()
         return q_BA
 

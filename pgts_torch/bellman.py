@@ -223,7 +223,8 @@ def sweep(
 def _product(weight: Tensor, K: int, v_C: Float[Tensor, "C"], reward: Float[Tensor, "M"] | None = None) -> Tensor:
     """The rows of `weight` times v, plus the rewards."""
     values, child = weight.values(), weight.col_indices()
-    if not sums_in_order(v_C.device, len(values)):
+    # cuSPARSE takes no rows that have more entries than columns: repeated children are entries of their own.
+    if K <= len(v_C) and not sums_in_order(v_C.device, len(values)):
         return torch.mv(weight, v_C) if reward is None else torch.addmv(reward, weight, v_C)
     term_MK = (values * v_C.index_select(0, child)).view(-1, K)
     # The order of `bellman_kernels.back_up`; a cumulative sum adds one after another.

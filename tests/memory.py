@@ -4,6 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from torch.profiler import ProfilerActivity
+
+CPU = ProfilerActivity.CPU
 
 
 def peak_bytes(call: Callable[[], Any]) -> int:
@@ -11,7 +14,7 @@ def peak_bytes(call: Callable[[], Any]) -> int:
 
     Every allocation on the CPU is an event of the profiler; what numpy or Python allocate is not.
     """
-    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
+    with torch.profiler.profile(activities=[CPU], profile_memory=True, acc_events=True) as profile:
         kept = call()
     held = peak = 0
     events = (event for event in profile.profiler.kineto_results.events() if event.name() == "[memory]")
