@@ -29,6 +29,6 @@ def visit(
     if episodes is None:
         made = rollout(world, policy, horizon, seed=draws.seed, names=draws.names, generator=draws.own)
     else:
-        length = horizon.length if draws.number else horizon.first
+        length = horizon.length if draws.number or horizon.first is None else horizon.first
         made = episodes.collect(policy, length, names=draws.names, generator=draws.own)
     return made.shared(ranks)

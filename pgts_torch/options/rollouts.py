@@ -39,15 +39,15 @@ class GeometricHorizon(Part):
 
 class StepsHorizon(Part):
     """Every iteration takes the same number of steps in each environment. An episode that is not over goes on in the
-    next iteration. Needs replay."""
+    next iteration. Needs replay, or sampled advantages whose weights are not the occupancy."""
 
     type: Literal["steps"] = "steps"
 
     length: Count = 200
     """Steps of an iteration in each environment."""
 
-    first: Count = 500
-    """Steps of the first iteration in each environment."""
+    first: Count | None = null(uniform=500)
+    """Steps of the first iteration in each environment, by replay.type; without replay null is as many as in others."""
 
     max_length: Count | None = None
     """The largest number of steps of an episode; null: the time limit of the environment, if it has one."""

@@ -65,6 +65,8 @@ class Training(Part):
         if isinstance(rollout.horizon, AutoHorizon):
             horizon = FixedHorizon() if isinstance(replay, NoReplay) else StepsHorizon()
             rollout = rollout.model_copy(update={"horizon": horizon})
+        if isinstance(rollout.horizon, StepsHorizon):
+            rollout = rollout.model_copy(update={"horizon": rollout.horizon.filled(replay.type)})
         return self.model_copy(update={"replay": replay, "rollout": rollout.filled(rollout.horizon.type)})
 
     @field_validator("critic")
@@ -206,12 +208,20 @@ class Training(Part):
                 "replay.type",
             )
         is_none = isinstance(replay, NoReplay) or (isinstance(replay, AutoReplay) and not isinstance(model, LEARNED))
-        if rollout is not None and isinstance(rollout.horizon, StepsHorizon) and is_none:
+        if rollout is None or not isinstance(rollout.horizon, StepsHorizon) or not is_none:
+            return replay
+        if isinstance(info.data.get("estimator"), LookaheadAdvantages):
             raise conflict(
                 "rollout.horizon.type is steps, so that rollouts do not begin where episodes begin; that needs "
-                "replay.type uniform",
+                "replay.type uniform, or estimator.type sampled",
                 "rollout.horizon.type",
                 "replay.type",
+                "estimator.type",
+            )
+        if getattr(info.data.get("update"), "state_weight", None) == "occupancy":
+            raise conflict(
+                "update.state_weight is occupancy, and rollout.horizon.type is steps, so that rollouts do not begin "
+                "where episodes begin: it must be visits or uniform"
             )
         return replay
 
@@ -253,11 +263,12 @@ def _with_types(data: dict[str, Any]) -> dict[str, Any]:
         data = data | {"model": model | {"type": "own", "make": name}}  # a name of the caller's own, MODULE:NAME
     data = _with_type(_with_type(data, "model", [Ensemble, Counts, Latent, OwnModel]), "replay", [UniformReplay])
     replayed = _type(data, "replay") == "uniform" or _type(data, "model") in ("ensemble", "counts", "latent")
-    horizons: list[type[Part]] = [FixedHorizon, GeometricHorizon]
+    sampled = _type(data, "estimator") == "sampled"
+    horizons: list[type[Part]] = [FixedHorizon, GeometricHorizon, *[StepsHorizon] * sampled]
     if isinstance(rollout := data.get("rollout"), dict):
         data = data | {"rollout": _with_type(rollout, "horizon", [StepsHorizon] * replayed + horizons)}
     data = _with_type(data, "policy", [Softmax, MLP, CNN])
-    policy, sampled = _type(data, "policy"), _type(data, "estimator") == "sampled"
+    policy = _type(data, "policy")
     tables, networks = policy not in NETWORKS, policy not in TABLES
     for_tables: list[type[Part]] = [Projected if policy == "simplex" else Mirror]
     for_networks: list[type[Part]] = [PPO] if sampled else [CMPO, PPO]

@@ -70,6 +70,15 @@ KINDS: dict[str, Callable[..., PGTS]] = {
         PGTS, "CliffWalking-v1", depth=8, model="counts", horizon={"type": "steps", "length": 20}, replay=FEW
     ),
     "network, no model": partial(PGTS, "CartPole-v1", depth=0, estimator="sampled", update=GRADIENT, **SMALL),
+    "episodes that go on": partial(
+        PGTS,
+        "CartPole-v1",
+        depth=0,
+        estimator="sampled",
+        update={"type": "ppo", "minibatch_size": 16, "num_epochs": 2},
+        policy=SMALL["policy"],
+        horizon={"type": "steps", "length": 12},
+    ),
 }
 
 

@@ -274,7 +274,7 @@ def test_what_does_not_go_with_a_learned_model_is_refused():
         PGTS("CartPole-v1", model="counts")
     with pytest.raises(PgtsError, match=r"stop_at is 0\.1, which needs an upper bound"):
         PGTS("CartPole-v1", model="ensemble", stop_at=0.1)
-    with pytest.raises(PgtsError, match=r"replay\.type uniform"):
+    with pytest.raises(PgtsError, match=r"replay\.type uniform, or estimator\.type sampled"):
         PGTS("CartPole-v1", horizon="steps")
     with pytest.raises(PgtsError, match=r"estimator\.type sampled there is no lookahead"):
         PGTS("CartPole-v1", model="ensemble", estimator="sampled", depth=0)

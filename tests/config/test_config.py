@@ -268,11 +268,13 @@ def configurations(draw: st.DrawFn) -> Config:
     is_learned = types["model.type"] in ("counts", "ensemble", "latent")
     if is_learned and given.get("model.certificate") is None:
         given["search.stop_at"] = None
-    if types["rollout.horizon.type"] == "steps" and (types["replay.type"], is_learned) != ("auto", True):
+    goes_on, is_sampled = types["rollout.horizon.type"] == "steps", types["estimator.type"] == "sampled"
+    if goes_on and not is_sampled and (types["replay.type"], is_learned) != ("auto", True):
         given = {key: value for key, value in given.items() if not key.startswith("replay.")}
         given["replay.type"] = "uniform"
-    if types["estimator.type"] == "sampled":
-        given = {key: value for key, value in given.items() if not key.startswith(("model.", "replay.", "rollout."))}
+    if is_sampled:
+        given = {key: value for key, value in given.items() if not key.startswith(("model.", "replay."))}
+        given |= {"update.state_weight": "visits"} if goes_on and "update.state_weight" in given else {}
         given |= {"critic.target": "v"} if types["critic.type"] != "auto" else {}
         given = {key: value for key, value in given.items() if not key.startswith("search.")} | {"search.depth": 0}
     return Config.model_validate(_nested(given))
@@ -361,6 +363,7 @@ PARTS = [
     ],
     ["--policy.type", "mlp", "--search.depth", "0", "--estimator.type", "sampled", "--estimator.lambda", "0.9"],
     ["--rollout.horizon.type", "fixed", "--model.type", "given", "--replay.type", "none"],
+    ["--rollout.horizon", "{length: 5, max_length: 9}", "--search.depth=0", "--estimator=sampled", "--policy=mlp"],
     ["--model.type", "counts", "--rollout.horizon.first", "7"],
     ["--model.type", "own", "--model.make", "models_of_mine:model"],
     ["--model.type", "latent", "--replay.length", "3"],
