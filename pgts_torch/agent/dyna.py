@@ -33,6 +33,8 @@ class Dyna:
         average that steps toward it by `polyak` after each update; with polyak 1, and for a table, the trained policy.
     replay: the visited states, in the column "state".
 
+    num_due: how many updates of this iteration are not over.
+
     Args:
         world: the environments and their model.
         trained: the policy that is trained.
@@ -59,7 +61,7 @@ class Dyna:
         self.replay = ReplayBuffer(options.capacity) if own is None else own
         if own is None:
             self.replay.add(state=world.export(torch.zeros(0, dtype=torch.int64, device=world.device)))
-        self.num_updates = self._steps = 0
+        self.num_updates = self._steps = self.num_due = 0
 
     @property
     def model_calls(self) -> int:
@@ -103,6 +105,7 @@ class Dyna:
         every = ranks.part(self.replay.rows("state").unique()) if self.options.starts == "all" else None
         kept_R = None if is_table else ranks.each("kept states", len(self.replay))[:, 0].tolist()
         for number in range(max(due, 1)):
+            self.num_due = max(due, 1) - number
             own = draws.update(number)
             self._world.reset_numbers()
             start_B = self._world.adopt(self._sampled(own, kept_R) if every is None else every)

@@ -22,6 +22,7 @@ from pgts_torch.agent.iteration import Iteration, PolicyBatch
 from pgts_torch.agent.model_check import Mode
 from pgts_torch.agent.parts import make_parts
 from pgts_torch.agent.policies import Policy, exact_probs
+from pgts_torch.agent.price import Pricing
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
@@ -133,6 +134,11 @@ class PGTS:
         self.episodes, self.dyna, self.posterior = parts.episodes, parts.dyna, parts.posterior
         self.gamma, self.horizon = self.world.gamma, self.options.rollout.horizon
         self.num_iterations = self.num_env_steps = self.num_model_calls = 0
+        depth = self.options.search.depth
+        levels = depth + (self.critic.target == "v") if isinstance(depth, int) else None
+        self.pricing = Pricing(
+            self.options, self.search, self.dyna, levels=levels, calls=lambda: parts.model_calls, ranks=self.ranks
+        )
         self._arguments = arguments | {"env": self.source.description, "device": str(self.device)}
         self._own_actions = self.source.own_actions(self.world.env)
         self._generator = stream(seed, "predict", device=self.device)
@@ -149,6 +155,7 @@ class PGTS:
     def _iterate(self) -> Iteration:
         draws = Draws.of(self.ranks, self.seed, self.num_iterations, self.device)
         calls_before = self._parts.model_calls
+        self.pricing.begin()
         self.update.num_env_steps = self.critic.num_env_steps = self.num_env_steps
 
         # Visit states by episodes of pi_k, or of an `Explorer` where the model has optimism: the states where d(s), an
@@ -171,6 +178,7 @@ class PGTS:
         self.num_env_steps += experience.share.total
         model_calls = self.ranks.total(self._parts.model_calls - calls_before, self.policy.state_dict)
         self.num_model_calls += model_calls
+        self.pricing.end(model_calls)
         return Iteration(
             **vars(batch),
             experience=experience,
@@ -182,6 +190,8 @@ class PGTS:
 
     def _improve(self, rollout: Rollout, draws: Draws) -> tuple[PolicyBatch, dict[str, float]]:
         """Estimate Q^pi from a rollout, look m steps ahead, update pi. Return the batch, and the losses by name."""
+        self.pricing.update()
+
         # Line 2: estimate Q^{pi_k}.
         losses = self.estimator.evaluate(rollout, draws)
 
@@ -238,7 +248,8 @@ class PGTS:
         Args:
             callback: one or more, each called with (self, iteration) after each iteration; if one returns False,
                 training ends in all processes.
-            progress: show a progress bar.
+            progress: show a progress bar, and say what an iteration costs. From a second on that is always said, before
+                it is spent where the lookahead takes long; from 30 seconds on with what makes it cheaper.
 
         Raises:
             PgtsError: a callback that cannot be called; or the environment failed, naming step and seeds.
@@ -251,6 +262,8 @@ class PGTS:
             while self.num_env_steps < total_steps:
                 iteration = self.iterate()
                 bar.update(iteration.num_steps)
+                if progress:
+                    self.pricing.say()
                 goes_on = False not in [call(self, iteration) for call in callbacks]
                 if not all(self.ranks.gather("whether to go on", lambda: goes_on)) or iteration.is_enough:  # noqa: B023
                     break

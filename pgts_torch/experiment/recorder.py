@@ -81,6 +81,7 @@ class Recorder:
         elif iteration.posterior is not None:
             progress.certificate = iteration.posterior
         self._last = iteration
+        algorithm.pricing.say()
         self.movement.follow(algorithm, iteration)
         if k % self.config.log.every == 0:
             tags = diagnostics.metrics(algorithm, iteration)

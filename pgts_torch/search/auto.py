@@ -174,6 +174,14 @@ class AutoSearch(Search):
             self._samples *= 2
         return look
 
+    @property
+    def num_samples(self) -> int:
+        return max(self._samples, 1)
+
+    def most_states(self, roots: int, levels: int) -> float:
+        max_calls = self.options.max_calls
+        return self._within(math.inf if max_calls is None else max_calls // self.calls_of_state)
+
     def check_choices(self, choices: Mapping[str, Any]) -> None:
         super().check_choices(choices)
         counts = (choices["_width"], choices["_samples"], *choices["_most_asked"], *(choices["_too_much"] or ()))

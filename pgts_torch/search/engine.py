@@ -1,5 +1,7 @@
 """Searches as objects: one kind of lookahead in one model, with what it remembers from one search to the next."""
 
+import math
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,6 +19,8 @@ from pgts_torch.search.empirical import FixedSamples
 from pgts_torch.search.expectimax import search_levels
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_finite
 from pgts_torch.search.mcts import search_tree
+from pgts_torch.search.memory import tree_nodes
+from pgts_torch.search.price import Meter
 from pgts_torch.search.sampled import plan_levels, search_samples
 from pgts_torch.search.topology import Topology
 from pgts_torch.seeding import sample_keys
@@ -30,18 +34,22 @@ class Search(ABC):
     """(T^m Q)(s, .) at the roots of one model.
 
     model_calls: for how many (state, action) it has queried the model so far.
+    options: its options, with its limits.
     topology: what it remembers of a model that enumerates outcomes; None: it remembers no outcomes.
     choices: the names of the attributes by which earlier searches decide how later ones are made.
     uses_prior: whether it starts from the probabilities of the current policy.
     defers_checks: whether it goes on without harm from values that are not finite.
     leaf_error: the error of the critic from which the doubt of the lookahead is computed; None: it is not.
+    meter: measures what it costs; None: nothing does.
     """
 
     topology: Topology | None = None
     choices: tuple[str, ...] = ()
     uses_prior: bool = False
     defers_checks: bool = False
+    options: Any
     leaf_error: float | None = None
+    meter: Meter | None = None
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -73,6 +81,9 @@ class Search(ABC):
             raise PgtsError("the prior of the search is that of the policy: give prior")
         own_prior, waiting = prior if self.uses_prior else None, readings if self.defers_checks else None
         leaves = Leaves(self.model, depth, q_leaf, v_leaf, own_prior, self.leaf_error, waiting)
+        if self.meter is not None:
+            leaves.meter, is_tree = self.meter, isinstance(self, MCTSSearch)
+            self.meter.search(len(root_B), leaves.expansions, self.most_states, self._fits, is_tree=is_tree)
         look = self.look_ahead(leaves, root_B, generator)
         check_finite("lookahead", "the lookahead", look.q_BA, root_B, readings)
         self.model_calls += look.model_calls
@@ -81,6 +92,33 @@ class Search(ABC):
     @abstractmethod
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
         """The search itself: `__call__` checks its values and counts its model calls."""
+
+    @property
+    def calls_of_state(self) -> int:
+        """How many model calls expand a state."""
+        return self.model.num_actions * (1 if self.topology is not None else self.num_samples)
+
+    @property
+    def num_samples(self) -> int:
+        """How many outcomes of an action it samples, where it does."""
+        return 1
+
+    @abstractmethod
+    def most_states(self, roots: int, levels: int) -> float:
+        """The most states that it expands below so many roots, on so many levels."""
+
+    def _fits(self, size: float, total: float) -> bool:
+        """Whether a level of so many states, after so many on those above it, is within the limits."""
+        states = int(min(size + total, sys.maxsize))
+        if states > self.options.max_nodes or self.topology is None:
+            return states <= self.options.max_nodes
+        new = max(0, states - self.topology.table.count)
+        return self.topology.bytes(new, looked_up=int(size), kept=states) <= self.options.max_bytes
+
+    def _within(self, states: float) -> float:
+        """At most `max_nodes`, and all states where the model has a table of them."""
+        is_table = isinstance(self.model, EnumeratingModel) and self.model.table is not None
+        return min(states, self.options.max_nodes, self.model.num_states if is_table else math.inf)
 
     def reset(self) -> None:
         """Drop what was learned of the model's states: their ids have been given to other states."""
@@ -153,6 +191,10 @@ class ExpectimaxSearch(Search):
         max_nodes, max_width = self.options.max_nodes, self.options.max_width
         return search_levels(leaves, self.topology, root_B, max_nodes=max_nodes, max_width=max_width)
 
+    def most_states(self, roots: int, levels: int) -> float:
+        width = self.options.max_width
+        return self._within(math.inf if width is None else roots + width * (levels - 1))
+
     def __str__(self) -> str:
         width = self.options.max_width
         return "expectimax" if width is None else f"expectimax, {width} states a level"
@@ -174,6 +216,14 @@ class SampledSearch(Search):
 
     def look_ahead(self, leaves: Leaves, root_B: Int[Tensor, "B"], generator: torch.Generator) -> Lookahead:
         return search_samples(leaves, self._model, root_B, self.options, generator, replicates=REPLICATES)
+
+    @property
+    def num_samples(self) -> int:
+        samples = self.options.samples
+        return samples if isinstance(samples, int) else samples[0] or 1
+
+    def most_states(self, roots: int, levels: int) -> float:
+        return self.options.max_nodes
 
     def __str__(self) -> str:
         return f"sampled, {self.options.samples} outcomes of each action, shared by {self.options.share}"
@@ -205,6 +255,15 @@ class MCTSSearch(Search):
             calls_each = self._samples
         look = search_tree(leaves, topology, root_B, self.options, generator)
         return replace(look, model_calls=look.model_calls * calls_each)
+
+    @property
+    def num_samples(self) -> int:
+        return self._samples
+
+    def most_states(self, roots: int, levels: int) -> float:
+        outcomes = self._samples if self.topology is None else getattr(self.model, "num_outcomes", None) or 1
+        in_tree = tree_nodes(1, self.model.num_actions * outcomes, levels - 1)
+        return self._within(roots * min(self.options.simulations, in_tree))
 
     def __str__(self) -> str:
         rule = self.options.rule

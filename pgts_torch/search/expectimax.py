@@ -69,6 +69,7 @@ def search_levels(
     leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], *, max_nodes: int, max_width: int | None = None
 ) -> Lookahead:
     """`expectimax`, with leaves and topology at hand: expand the levels, call the critic at the bottom, back up."""
+    topology.table.meter = leaves.meter
     if max_width is not None:
         return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
     calls_before, expansions = topology.table.model_calls, leaves.expansions

@@ -15,6 +15,7 @@ from torch import Tensor
 from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.models.base import Model
 from pgts_torch.readings import Readings
+from pgts_torch.search.price import Meter
 
 Leaf = Callable[[Tensor], Tensor]
 """A critic or a policy as a search calls it: states [N] to values of Q^pi [N, A] or of v^pi [N], or to pi [N, A]."""
@@ -138,6 +139,7 @@ class Leaves:
 
     calls: how often the critic was called.
     readings: where the check of values waits that they are finite; None: it is made at once.
+    meter: measures what the search costs; None: nothing does.
     expansions: how many levels are expanded: with Q at the bottom m, with v one more, for Q = r + gamma P v.
 
     Args:
@@ -168,6 +170,7 @@ class Leaves:
         self.expansions = check_count("depth", depth, least=0) + (v_leaf is not None)
         self._model, self._q_leaf, self._v_leaf, self._prior = model, q_leaf, v_leaf, prior
         self.leaf_error, self.readings = leaf_error, readings
+        self.meter: Meter | None = None
 
     def v(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
         """v, or max_a Q(s, a); PgtsError, with the state, if the critic's values are of a wrong shape or not finite."""

@@ -135,6 +135,7 @@ def search_tree(
     check_roots(root_B, topology.model.num_states)
     if leaves.expansions == 0:
         return unexpanded(leaves, root_B)
+    topology.table.meter = leaves.meter
     # A root alone needs no sorting, which takes as long as many of its simulations.
     state_B, row_B = (root_B, None) if root_B.shape[0] == 1 else root_B.unique(return_inverse=True)
     calls_before = topology.table.model_calls

@@ -12,6 +12,7 @@ from pgts_torch.bellman import Outcomes
 from pgts_torch.compiled import pays
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model
+from pgts_torch.search.price import Meter
 from pgts_torch.search.table import Table, with_room
 
 _TOLERANCE = 1e-4
@@ -28,6 +29,7 @@ class OutcomeTable(Table):
     row_S: the row R of a state; -1 where the model was not queried, -2 where it was, and its own table was read. It may
         be longer than there are states.
     num_queried: for how many states the model was queried.   model_calls: for how many (state, action).
+    meter: measures what queries cost; None: nothing does.
 
     Args:
         model: enumerates outcomes.
@@ -43,6 +45,7 @@ class OutcomeTable(Table):
         self.child_RAK = self._column("AK", dtype=torch.int64)
         self.row_S = torch.empty(0, dtype=torch.int64, device=model.device)
         self._seen: tuple[tuple[Tensor, ...], list[np.ndarray]] = (), []
+        self.meter: Meter | None = None
 
     @property
     def arrays(self) -> list[np.ndarray]:
@@ -77,21 +80,34 @@ class OutcomeTable(Table):
         """
         # The states are distinct, so that none is queried, or gets a row, twice.
         missing = self.missing(state_N)
-        if len(missing):
-            answer = self.model.outcomes(missing)
-            self._count(missing)
-            row_N = self._written(answer) if self._can_write(len(missing), answer) else None
-            if row_N is None:
-                check_outcomes(self.model, missing, answer)
-                row_N = self._append(
-                    reward_RA=answer.reward_NA,
-                    prob_RAK=answer.prob_NAK,
-                    discount_RAK=answer.discount_NAK,
-                    child_RAK=answer.child_NAK,
-                )
-            # The model may have met new states, which get room before their ids are used.
-            self.row_S = with_room(self.row_S, self.model.num_states)
-            self.row_S[missing] = row_N
+        if len(missing) and self.meter is not None:
+            # Numbers that a learned model answers may depend on how many states it is asked for.
+            known, divides = self.num_queried, self.model.exact
+            self.meter.query(missing, self._ask, self._children, known=known, divides=divides)
+        elif len(missing):
+            self._ask(missing)
+
+    def _ask(self, missing: Int[Tensor, "missing"]) -> None:
+        answer = self.model.outcomes(missing)
+        self._count(missing)
+        row_N = self._written(answer) if self._can_write(len(missing), answer) else None
+        if row_N is None:
+            check_outcomes(self.model, missing, answer)
+            row_N = self._append(
+                reward_RA=answer.reward_NA,
+                prob_RAK=answer.prob_NAK,
+                discount_RAK=answer.discount_NAK,
+                child_RAK=answer.child_NAK,
+            )
+        # The model may have met new states, which get room before their ids are used.
+        self.row_S = with_room(self.row_S, self.model.num_states)
+        self.row_S[missing] = row_N
+
+    def _children(self, state_N: Int[Tensor, "N"]) -> tuple[Int[Tensor, "C"], Int[Tensor, "D"]]:
+        """The distinct states that follow these queried ones; and those of them that were not queried."""
+        outcomes = self._rows(self.row_S[state_N])
+        children = outcomes.child_NAK[has_weight(outcomes)].unique()
+        return children, children[self.row_S[children] < 0]
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
         """A copy of the outcomes of these distinct states, after `query`."""

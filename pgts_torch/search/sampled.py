@@ -101,6 +101,7 @@ def search_samples(
         return search_levels(leaves, topology, root_B, max_nodes=options.max_nodes)
     empirical = Empirical(model, root_B, samples=plan, share=options.share, key=key)
     topology = Topology(empirical, max_bytes=options.max_bytes)
+    topology.table.meter = leaves.meter
     # The empirical model's states are nodes: expand them, value the lowest, back up as in `expectimax`.
     steps, bottom_N, nodes_per_level = _expanded(empirical, topology, leaves.expansions, options)
     v_N = _leaf_values(leaves, empirical, steps, bottom_N)

@@ -1,0 +1,173 @@
+"""What an iteration costs, foreseen from its first states."""
+
+import functools
+import re
+from typing import Any
+
+import pytest
+import torch
+from gymnasium import spaces
+
+from pgts_torch import PGTS
+from pgts_torch.agent import price
+from pgts_torch.search.price import Meter
+from tests.models.corridors import Corridor
+
+pytestmark = pytest.mark.usefixtures("unchecked_shapes")
+
+FACTOR = 3.0
+"""Within this factor the calls of an iteration are foreseen."""
+
+FEW = {"num_envs": 3, "horizon": {"type": "fixed", "length": 40}}
+NETWORK = FEW | {"policy": {"type": "mlp", "hidden": [8]}}
+CARTPOLE = NETWORK | {"env": "CartPole-v1"}
+
+
+class Counted(Corridor):
+    """Its actions are counted from 0."""
+
+    def __init__(self) -> None:
+        super().__init__(slip=0)
+        self.action_space = spaces.Discrete(2)
+
+    def step(self, action: int):
+        return super().step(action + 5)
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "paths that never meet": CARTPOLE | {"depth": 5},
+    "paths that never meet, few levels": CARTPOLE | {"depth": 1, "num_envs": 8},
+    "paths that meet, in a simulator": NETWORK | {"env": Counted, "depth": 6, "num_envs": 8},
+    "a tree search": CARTPOLE | {"depth": 6, "search": {"type": "mcts", "simulations": 20}},
+    "sampled outcomes": CARTPOLE | {"depth": 2, "search": {"type": "sampled", "samples": 2}},
+    "few calls": CARTPOLE | {"depth": 6, "search": {"type": "auto", "max_calls": 1200}},
+    "few states of a level": CARTPOLE | {"depth": 6, "search": {"type": "expectimax", "max_width": 30}},
+    "few nodes": CARTPOLE | {"depth": 6, "search": {"type": "auto", "max_nodes": 2000}},
+    "few roots": CARTPOLE | {"depth": 5, "max_roots": 20},
+    "an adaptive depth": CARTPOLE | {"depth": "adaptive", "max_depth": 3, "reward_range": (0, 1)},
+}
+
+
+def ticking(
+    model: PGTS, monkeypatch: pytest.MonkeyPatch, *, patience: float, tick: float = 1e-3
+) -> tuple[list[int], list[int]]:
+    """Have the clock of the price moved on by model calls: `tick` seconds for each state. How many states had been
+    queried each time that the price was said; and in all, in a list of one number."""
+    queried, said = [0], list[int]()
+    known = model.world.model
+    outcomes, sample = known.outcomes, getattr(known, "sample", None)
+
+    def counted(state_N: torch.Tensor) -> Any:
+        queried[0] += len(state_N)
+        return outcomes(state_N)
+
+    def sampled(state_N: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
+        queried[0] += len(state_N)
+        return sample(state_N, *args, **kwargs)
+
+    monkeypatch.setattr(known, "outcomes", counted)
+    monkeypatch.setattr(known, "sample", sampled, raising=False)
+    monkeypatch.setattr(price, "Meter", functools.partial(Meter, patience=patience, clock=lambda: tick * queried[0]))
+    say = model.pricing.say
+    monkeypatch.setattr(model.pricing, "say", lambda: said.append(queried[0]) or say())
+    return said, queried
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_calls_of_an_iteration_are_foreseen_before_they_are_made(case, monkeypatch, capsys):
+    model = PGTS(**CASES[case])
+    first = PGTS(**CASES[case]).iterate().look  # how many there are is known by now
+    assert first is not None
+    said, queried = ticking(model, monkeypatch, patience=2e-4 * first.model_calls)
+    iteration = model.iterate()
+    told = model.pricing.price
+    assert told is not None
+    assert len(said) == 1
+    assert said[0] < 0.75 * queried[0]
+    assert iteration.model_calls / FACTOR < told.calls
+    assert told.is_bound == (case == "a tree search")
+    assert told.calls < FACTOR * iteration.model_calls
+    assert re.match(
+        r"note: an iteration takes (about|up to) [\d,]+ model calls and [\d.,]+ s\n$", capsys.readouterr().err
+    )
+
+
+def test_a_price_that_follows_the_roots_alone_would_be_wrong():
+    model = PGTS(**CASES["paths that never meet"])
+    iteration = model.iterate()
+    assert iteration.model_calls > 3 * FACTOR * len(iteration.state_N) * 2
+
+
+def test_the_updates_of_an_iteration_with_replay_are_foreseen_from_the_first_ones(monkeypatch):
+    replay = {"type": "uniform", "updates_per_step": 0.2, "starts": 8, "length": 4, "search_every": 1}
+    model = PGTS("CartPole-v1", depth=1, policy=NETWORK["policy"], replay=replay)
+    said, _ = ticking(model, monkeypatch, patience=1.0)
+    iteration = model.iterate()
+    assert len(said) == 1
+    assert said[0] < 1200
+    told = model.pricing.price
+    assert told is not None
+    assert iteration.model_calls / FACTOR < told.calls < FACTOR * iteration.model_calls
+    assert told.calls > 3 * 2 * 1200
+
+
+ADVISED = {
+    "auto": CARTPOLE | {"depth": 5},
+    "expectimax": CARTPOLE | {"depth": 5, "search": "expectimax"},
+    "sampled": CARTPOLE | {"depth": 2, "search": {"type": "sampled", "samples": 3}},
+    "mcts": CARTPOLE | {"depth": 5, "search": {"type": "mcts", "simulations": 20}},
+    "repeated actions": CARTPOLE | {"depth": 4, "action_repeat": 2},
+}
+
+
+@pytest.mark.parametrize("case", ADVISED)
+def test_what_is_said_to_make_a_long_iteration_cheaper_does(case, monkeypatch, capsys):
+    model = PGTS(**ADVISED[case])
+    ticking(model, monkeypatch, patience=1.0, tick=0.2)
+    calls = model.iterate().model_calls
+    assert "; cheaper: " in capsys.readouterr().err
+    told = model.pricing.price
+    assert told is not None
+    assert told.seconds > price.LONG
+    tried = 0
+    for advice in told.advice:
+        found = re.match(r"search\.(\w+) ([\w,]+)", advice)
+        if found is None:
+            assert advice in ("a shorter rollout.horizon.length", "search.max_width")
+            continue
+        name, value = found[1], found[2].replace(",", "")
+        given: Any = int(value) if value.isdecimal() else value
+        other = {name: given}
+        if name not in ("depth", "max_roots", "action_repeat"):
+            kind = {"type": "auto"} | ({} if "search" not in ADVISED[case] else _described(ADVISED[case]["search"]))
+            other = {"search": {"type": given} if name == "kind" else kind | {name: given}}
+        cheaper = PGTS(**ADVISED[case] | other).iterate()
+        if name == "action_repeat":  # a call repeats an action less often
+            assert cheaper.model_calls <= 1.5 * calls
+        else:
+            assert cheaper.model_calls < 0.7 * calls
+        tried += 1
+    assert tried >= 2
+
+
+def _described(search: Any) -> dict[str, Any]:
+    return {"type": search} if isinstance(search, str) else search
+
+
+def test_a_cheap_iteration_is_priced_by_the_second_one_and_said_to_who_wants_to_see_progress(capsys):
+    model = PGTS("pgts/Ladder-v0")
+    model.iterate()
+    assert model.pricing.price is None
+    second = model.iterate()
+    assert model.pricing.price is not None
+    assert model.pricing.price.calls == second.model_calls
+    assert "note" not in capsys.readouterr().err
+    model.learn(model.num_env_steps + 1, progress=True)
+    model.learn(model.num_env_steps + 1, progress=True)
+    assert capsys.readouterr().err.count("note: an iteration takes about ") == 1
+
+
+def test_without_a_lookahead_there_is_no_price():
+    model = PGTS("CartPole-v1", depth=0, estimator="sampled", policy="mlp", num_envs=2)
+    model.learn(model.num_env_steps + 1200)
+    assert model.pricing.price is None
