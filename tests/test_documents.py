@@ -1,0 +1,90 @@
+"""What README.md and the pages of docs/start say: their Python runs as printed, their commands are known, links lead
+somewhere."""
+
+import contextlib
+import doctest
+import io
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from pgts_torch.cli.commands import COMMANDS
+
+ROOT = Path(__file__).parents[1]
+PAGES = {
+    str(path.relative_to(ROOT)): path for path in (ROOT / "README.md", *sorted((ROOT / "docs/start").glob("*.md")))
+}
+
+
+class Block(NamedTuple):
+    """A fenced block: its language, what it holds, and whether it takes longer than a test may."""
+
+    language: str
+    text: str
+    is_long: bool
+
+
+def blocks(page: str) -> list[Block]:
+    found = re.findall(r"^(<!-- long -->\n)?```(\w*)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    return [Block(language, text, bool(long)) for long, language, text in found]
+
+
+def printed(page: list[Block], *, long: bool) -> Iterator[tuple[str, str]]:
+    """What the Python of a page prints, and what the page says, block by block; one namespace for all."""
+    names: dict[str, object] = {}
+    for block, after in zip(page, [*page[1:], Block("", "", False)], strict=True):
+        if block.language == "python" and (long or not block.is_long):
+            out = io.StringIO()
+            with contextlib.redirect_stdout(out):
+                exec(block.text, names)
+            yield out.getvalue(), after.text if after.language == "text" else ""
+
+
+def says(wanted: str, got: str) -> bool:
+    """Whether they are the same, where ... stands for anything."""
+    return doctest.OutputChecker().check_output(wanted, got, doctest.ELLIPSIS)
+
+
+def run(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *, long: bool) -> None:
+    monkeypatch.chdir(folder)
+    for got, wanted in printed(blocks(PAGES[page].read_text(encoding="utf-8")), long=long):
+        assert says(wanted, got), f"{page} says {wanted!r}, and printed is {got!r}"
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("page", PAGES)
+def test_the_python_of_a_page_runs_and_prints_what_it_says(page, tmp_path, monkeypatch):
+    run(page, tmp_path, monkeypatch, long=False)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("page", [page for page, path in PAGES.items() if "<!-- long -->" in path.read_text()])
+def test_what_takes_longer_runs_too(page, tmp_path, monkeypatch):
+    run(page, tmp_path, monkeypatch, long=True)
+
+
+def test_another_number_than_the_printed_one_is_noticed():
+    page = blocks("```python\nprint(1.25, [2])\n```\n\n```text\n1.26 [...]\n```\n")
+    ((got, wanted),) = printed(page, long=False)
+    assert not says(wanted, got)
+    assert says(wanted.replace("1.26", "1.25"), got)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_and_links_of_a_page_exist(page, capsys):
+    text = PAGES[page].read_text(encoding="utf-8")
+    for block in blocks(text):
+        for line in block.text.splitlines() if block.language == "sh" else ():
+            program, command, *arguments = shlex.split(line)
+            if program == "pgts":
+                with contextlib.suppress(SystemExit):
+                    COMMANDS[command](["--help"])
+                known = capsys.readouterr().out
+                assert all(word in known for word in arguments if word.startswith("--"))
+    for link in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
+        assert (PAGES[page].parent / link).exists(), link
