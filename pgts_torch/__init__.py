@@ -64,7 +64,7 @@ def _register_environments() -> None:
                 vector_entry_point=f"pgts_torch.envs.entry_points:{entry_point}_vector",
                 max_episode_steps=max_episode_steps,
             )
-    for name in ("Catch", "minigrid"):
+    for name in ("Catch", "minigrid", "atari"):
         if (id := f"images/{name.title()}-v0") not in gymnasium.registry:
             gymnasium.register(id, entry_point=f"pgts_torch.envs.images:{name}")
 

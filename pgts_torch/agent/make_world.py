@@ -249,7 +249,10 @@ def _simulator(request: _Request, *, reasons: Sequence[str], layered: bool) -> S
     env = request.envs.envs[0]
     known = known_adapter(env)
     adapter: SnapshotAdapter = known or PickledAttributes()
-    if adapter.restored is not None and (why := _own(request, request.own_to_each)):
+    # What wrappers hold is in the snapshot where they are part of the simulator.
+    kept = {type(wrapper).__name__ for wrapper in wrappers_of(env)} if layered else set()
+    outside = {name for name in request.own_to_each if name.partition(".")[0] not in kept}
+    if adapter.restored is not None and (why := _own(request, outside)):
         raise MissingModel(f"{request.name} cannot be restored: {why}, which is in no snapshot")
     if layered:
         _check_memories(request.env)

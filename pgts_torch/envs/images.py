@@ -1,4 +1,4 @@
-"""Small environments that are seen as images."""
+"""Environments that are seen as images."""
 
 from typing import Any, final
 
@@ -71,3 +71,30 @@ def minigrid(room: str) -> gymnasium.Env:
         raise PgtsError(f"{room} needs MiniGrid: pip install pgts_torch[envs]") from error
     whole: gymnasium.Env = ImgObsWrapper(FullyObsWrapper(gymnasium.make(room)))
     return whole
+
+
+def atari(game: str, size: int = 84, stack: int = 4, sticky: float = 0.25) -> gymnasium.Env:
+    """A game of Atari (extra `atari`) as it is usually learned: four frames a step, of which the brighter of the last
+    two is seen in grey and scaled down; a stack of the latest observations, channels first; and actions that stick.
+
+    They stick by Gymnasium's wrapper, so that it is drawn by the search whether they do. ALE's own stickiness would be
+    foreseen.
+
+    Args:
+        game: its id, for instance ALE/Breakout-v5.
+        size: pixels on a side.
+        stack: how many observations are seen at once.
+        sticky: the probability with which an action is the one before; 0: it never is.
+
+    Raises:
+        PgtsError: ALE or OpenCV, with which images are scaled, is not installed.
+    """
+    try:
+        import ale_py  # noqa: F401 - registers its environments
+        import cv2  # noqa: F401 - AtariPreprocessing needs it
+    except ImportError as error:
+        raise PgtsError(f"{game} needs ALE and OpenCV: pip install 'pgts_torch[atari]'") from error
+    env: gymnasium.Env = gymnasium.make(game, frameskip=1, repeat_action_probability=0.0)
+    env = gymnasium.wrappers.AtariPreprocessing(env, screen_size=size)
+    env = gymnasium.wrappers.FrameStackObservation(env, stack)
+    return gymnasium.wrappers.StickyAction(env, sticky) if sticky else env

@@ -9,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 from pgts_torch.envs.images import Catch
 from pgts_torch.errors import PgtsError
+from pgts_torch.models.wrappers import wrappers_of
 
 
 def test_catch_is_an_environment_as_gymnasium_defines_them():
@@ -47,3 +48,17 @@ def test_all_of_a_minigrid_room_is_seen():
     assert image.shape == (8, 8, 3)
     assert (image[..., 0] == 10).sum() == 1  # the agent
     assert (image[..., 0] == 8).sum() == 1  # the goal, which the agent's own view need not show
+
+
+def test_a_game_of_atari_is_seen_as_a_stack_of_small_grey_frames_and_its_actions_stick():
+    for package in ("ale_py", "cv2"):
+        pytest.importorskip(package, exc_type=ImportError)
+    env = gymnasium.make("images/Atari-v0", game="ALE/Breakout-v5", size=42, stack=3)
+    image = env.reset(seed=0)[0]
+    assert image.shape == env.observation_space.shape == (3, 42, 42)
+    assert image.max() > 0
+    wrappers = [type(each).__name__ for each in wrappers_of(env)]
+    assert "StickyAction" in wrappers
+    assert env.unwrapped.ale.getFloat("repeat_action_probability") == 0.0
+    plain = gymnasium.make("images/Atari-v0", game="ALE/Breakout-v5", sticky=0)
+    assert "StickyAction" not in [type(each).__name__ for each in wrappers_of(plain)]

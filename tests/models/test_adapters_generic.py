@@ -216,6 +216,32 @@ def test_atari_as_it_is_used_can_serve_as_a_model_with_its_stack_in_the_state():
     assert report.random_share > 0
 
 
+class Buffered(gymnasium.Wrapper):
+    """Its rewards are those of the step before, and its buffer holds anything before the first episode, as that of
+    AtariPreprocessing does."""
+
+    numbers = itertools.count()
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.buffer = float(next(self.numbers))
+
+    def reset(self, **kwargs):
+        self.last = self.buffer = 0.0
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        observation, self.buffer, *rest = self.env.step(action)
+        paid, self.last = self.last, self.buffer
+        return observation, paid, *rest
+
+
+@pytest.mark.filterwarnings("ignore:.*has wrappers that are part of the model")
+def test_what_a_wrapper_of_each_instance_has_of_its_own_is_restored_with_the_others():
+    model = PGTS(lambda: Buffered(gymnasium.make("CartPole-v1")), **SHORT | {"depth": 1})
+    assert model.iterate().model_calls > 0
+
+
 class Hoarder(Rising):
     """It goes on counting in the next episode."""
 
