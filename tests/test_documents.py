@@ -3,6 +3,7 @@ somewhere."""
 
 import contextlib
 import doctest
+import importlib
 import io
 import re
 import shlex
@@ -16,7 +17,8 @@ from pgts_torch.cli.commands import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 PAGES = {
-    str(path.relative_to(ROOT)): path for path in (ROOT / "README.md", *sorted((ROOT / "docs/start").glob("*.md")))
+    str(path.relative_to(ROOT)): path
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs/start").glob("*.md")))
 }
 
 
@@ -88,3 +90,23 @@ def test_commands_and_links_of_a_page_exist(page, capsys):
                 assert all(word in known for word in arguments if word.startswith("--"))
     for link in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
         assert (PAGES[page].parent / link).exists(), link
+
+
+@pytest.mark.parametrize("package", ["models", "search", "tabular", "envs"])
+def test_every_public_name_is_in_the_reference(package):
+    pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs/reference").glob("*.md"))
+    named = set(re.findall(r"^\.\. auto\w+:: .*?(\w+)$", pages, re.MULTILINE))
+    zoo = {
+        "combination_lock",
+        "corridor",
+        "deep_sea",
+        "grid",
+        "ladder",
+        "mirage",
+        "random_mdp",
+        "river_swim",
+        "tightrope",
+    }
+    whole = zoo if "zoo" in named else set()
+    assert set(importlib.import_module(f"pgts_torch.{package}").__all__) <= named | whole
+    assert {"PGTS", "EvalCallback", "evaluate"} <= named
