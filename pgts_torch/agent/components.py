@@ -11,8 +11,11 @@ from collections.abc import Iterator
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from gymnasium.spaces import Space
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
 
 from pgts_torch.errors import PgtsError
 
@@ -32,6 +35,10 @@ _FREE: dict[str, type[np.generic]] = {
     "float128": np.float64,
 }
 """The dtypes in place of those that torch lacks, or computes with only in part."""
+
+
+class ActionMask(spaces.MultiBinary):
+    """The legal actions: the last component of a row, where there are masks. Networks do not see it as an input."""
 
 
 def found_in(space: Space[Any], path: Path = ()) -> Iterator[tuple[Path, Space[Any]]]:
@@ -56,6 +63,29 @@ def components(seen: Space[Any]) -> list[Component]:
             raise PgtsError(f"observations are {seen}; a network takes numbers, bits, vectors and images")
         found.append(part)
     return found
+
+
+def inputs(seen: Space[Any]) -> list[Component]:
+    """Return the components of a row that a network sees: all but the legal actions."""
+    return [part for part in components(seen) if not isinstance(part, ActionMask)]
+
+
+def with_mask(seen: Space[Any], num_actions: int) -> Space[Any]:
+    """Return the space of rows that end with the legal actions."""
+    return spaces.Tuple([*components(seen), ActionMask(num_actions)])
+
+
+def legal_in(seen: Space[Any], row_N: Shaped[Tensor, "N ..."]) -> Bool[Tensor, "N A"] | None:
+    """Return the legal actions in rows of observations; None where all are."""
+    last = seen.spaces[-1] if isinstance(seen, spaces.Tuple) else None
+    return row_N[..., -size(last) :] != 0 if isinstance(last, ActionMask) else None
+
+
+def legal_only(
+    value_NA: Float[Tensor, "N A"], legal_NA: Bool[Tensor, "N A"] | None, other: float = -math.inf
+) -> Float[Tensor, "N A"]:
+    """Return logits or values with another one in place of those of actions that are not legal."""
+    return value_NA if legal_NA is None else torch.where(legal_NA, value_NA, other)
 
 
 def row_shape(seen: Space[Any]) -> tuple[int, ...]:

@@ -6,10 +6,10 @@ from typing import Any, final
 import torch
 from gymnasium import spaces
 from gymnasium.spaces import Space
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from pgts_torch.agent.components import Component, components, counts, image_shape, row_shape
+from pgts_torch.agent.components import Component, components, counts, image_shape, inputs, legal_in, row_shape
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.options.policies import CNN, MLP
 from pgts_torch.ranks import ALONE, Ranks
@@ -132,13 +132,13 @@ class Encoder(nn.Module):
 
     def __init__(self, space: Space[Any], network: MLP | CNN) -> None:
         super().__init__()
-        parts = components(space)
+        parts = inputs(space)
         if network.normalize and not any(isinstance(part, spaces.Box) for part in parts):
             raise PgtsError(f"normalize is True; observations are {space}, without a scale: it must be False")
         self.space, self.row_shape = space, row_shape(space)
         self.parts = nn.ModuleList(_encoder(part, network) for part in parts)
         self.shapes: list[tuple[int, ...]] = [part.shape for part in self.parts]  # type: ignore[misc]
-        self._sizes = [math.prod(part.shape or ()) for part in parts]
+        self._sizes = [math.prod(part.shape or ()) for part in components(space)]
         if isinstance(network, CNN) and all(len(shape) == 1 for shape in self.shapes):
             images = any(map(image_shape, parts))
             raise PgtsError(
@@ -152,18 +152,22 @@ class Encoder(nn.Module):
         return sum(map(math.prod, self.shapes))
 
     def forward(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
-        encoded = [part(x_N) for part, x_N in zip(self.parts, self._split(observation_N), strict=True)]
+        encoded = [part(x_N) for part, x_N in zip(self.parts, self._split(observation_N), strict=False)]
         return encoded[0] if len(encoded) == 1 else torch.cat([x_N.flatten(1) for x_N in encoded], 1)
 
     def _split(self, observation_N: Tensor) -> tuple[Tensor, ...]:
-        """The entries of each component."""
+        """The entries of each component, the legal actions too."""
         if observation_N.shape[1:] != self.row_shape:
             raise PgtsError(f"an observation has shape {tuple(observation_N.shape[1:])}; it must be {self.row_shape}")
-        return (observation_N,) if len(self.parts) == 1 else observation_N.split(self._sizes, 1)
+        return (observation_N,) if len(self._sizes) == 1 else observation_N.split(self._sizes, 1)
+
+    def legal(self, observation_N: Tensor) -> Bool[Tensor, "N A"] | None:
+        """The legal actions in these observations; None where all are."""
+        return legal_in(self.space, observation_N)
 
     def absorb(self, observation_N: Tensor, ranks: Ranks = ALONE) -> None:
         """Add these observations, in all ranks, to the running statistics, where there are any."""
-        for part, x_N in zip(self.parts, self._split(observation_N), strict=True):
+        for part, x_N in zip(self.parts, self._split(observation_N), strict=False):
             if isinstance(part, Values):
                 part.absorb(x_N, ranks)
 

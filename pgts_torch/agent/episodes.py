@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, final
+from typing import Any, Literal, final
 
 import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from pgts_torch.errors import PgtsError, failure
+from pgts_torch.models.masks import KEY, ActionMasks, Masked
 from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.steps import (
     check_discounts,
@@ -28,16 +29,22 @@ class Episodes:
     An environment whose episode is over is not stepped any more where environments can be stepped one by one (a plain
     `SyncVectorEnv`); else it is reset, and its further steps are ignored.
 
-    observation: the latest observation of each environment.
-
     Args:
         env: environments in `AutoresetMode.DISABLED`.
         gamma: discount of a step that does not end the episode. An environment with `metadata["discounts"] = True` may
             name another one in `info["discount"]`.
         seeds: one for the reset of each environment.
+        masks: how action masks are read; "off": they are not, if there are any; None: there are none.
     """
 
-    def __init__(self, env: VectorEnv, *, gamma: float, seeds: list[int]) -> None:
+    def __init__(
+        self,
+        env: VectorEnv,
+        *,
+        gamma: float,
+        seeds: list[int],
+        masks: ActionMasks | Literal["off"] | None = None,
+    ) -> None:
         self._env, self._gamma, self._seeds = env, gamma, seeds
         self._one_by_one = isinstance(env, SyncVectorEnv) and type(env).step is SyncVectorEnv.step
         self._names_discounts = [names_discounts(one) for one in each_of(env)]
@@ -45,13 +52,23 @@ class Episodes:
         self._reward_B = np.zeros(env.num_envs)
         self._stepping: int | None = None  # the index of the environment whose step is running
         self._each: list[Any] = []  # the latest observation of each environment, where these are stepped one by one
-        self.observation: Any = None
+        self._observation: Any = None
+        self._masks = masks if isinstance(masks, ActionMasks) else None
+        self._unmasked = masks is None
+        self._legal_BA = np.zeros((0, 0), dtype=bool)  # rows without a legal action: the episode is over
+
+    @property
+    def observation(self) -> Any:
+        """The latest observation of each environment; `Masked` where there are action masks."""
+        return self._observation if self._masks is None else Masked(self._observation, self._legal_BA)
 
     def reset(self) -> None:
         """Begin the episodes."""
-        self.observation = self._env.reset(seed=self._seeds)[0]  # type: ignore[arg-type]  # or one seed for all
+        self._observation, info = self._env.reset(seed=self._seeds)  # type: ignore[arg-type]  # or one seed for all
         if self._one_by_one:
-            self._each = list(iterate(self._env.observation_space, self.observation))
+            self._each = list(iterate(self._env.observation_space, self._observation))
+        if self._masks is not None:
+            self._legal_BA = self._read_masks(info, np.ones(self._env.num_envs, dtype=bool))
 
     def restart(self, over_B: np.ndarray, seeds: list[int]) -> None:
         """Begin new episodes in some environments.
@@ -62,14 +79,34 @@ class Episodes:
         """
         self._seeds, self._over_B = seeds, self._over_B & ~over_B
         if not self._one_by_one:
-            self.observation = self._env.reset(seed=seeds, options={"reset_mask": over_B})[0]  # type: ignore[arg-type]
+            self._reset_some(over_B, seeds)
             return
         assert isinstance(self._env, SyncVectorEnv)
+        self._legal_BA = self._legal_BA.copy()
         for b in over_B.nonzero()[0]:
             self._stepping = int(b)
-            self._each[b], _ = self._env.envs[b].reset(seed=seeds[b])
+            self._each[b], info = self._env.envs[b].reset(seed=seeds[b])
+            if self._masks is not None:
+                self._legal_BA[b] = self._masks.of(self._env.envs[b], info)
         self._stepping = None
         self._join()
+
+    def _reset_some(self, over_B: np.ndarray, seeds: list[int] | None) -> None:
+        """Reset the environments of `over_B`, with a seed each."""
+        self._observation, info = self._env.reset(seed=seeds, options={"reset_mask": over_B})  # type: ignore[arg-type]
+        if self._masks is not None:
+            self._legal_BA = np.where(over_B[:, None], self._read_masks(info, over_B), self._legal_BA)
+
+    def _read_masks(self, info: dict[str, Any], needed_B: np.ndarray) -> np.ndarray:
+        """The legal actions of all environments, by what they have just returned together."""
+        assert self._masks is not None
+
+        def reads(b: int) -> None:
+            self._stepping = b
+
+        legal_BA = self._masks.of_all(self._env, info, needed_B, reads)
+        self._stepping = None
+        return legal_BA
 
     def step(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Take one step. Return rewards, discounts and truncations; they have no meaning outside `alive_B`.
@@ -88,9 +125,15 @@ class Episodes:
 
     def _step_all(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if self._over_B.any():
-            self._env.reset(options={"reset_mask": self._over_B})
-        self.observation, rewards, terminated_B, truncated_B, info = self._env.step(action_B)
+            self._reset_some(self._over_B, None)
+        if self._masks is not None:  # of episodes that are over any legal action will do
+            action_B = np.where(alive_B, action_B, self._legal_BA.argmax(-1))
+        self._observation, rewards, terminated_B, truncated_B, info = self._env.step(action_B)
         self._over_B = terminated_B | truncated_B
+        if self._masks is not None:
+            self._legal_BA = self._read_masks(info, ~self._over_B) & ~terminated_B[:, None]
+        elif self._unmasked and KEY in info:
+            self._refuse_masks()
         # info["_discount"] is True where an environment has named a discount in this step.
         named_B = info.get("_discount", "discount" in info) if all(self._names_discounts) else False
         discount_B = np.where(terminated_B, 0.0, np.where(named_B, info.get("discount", 0.0), self._gamma))
@@ -102,10 +145,14 @@ class Episodes:
         envs = self._env.envs
         reward_B, discount_B = np.zeros((2, len(envs)))
         self._reward_B = reward_B
-        truncated_B = np.zeros(len(envs), dtype=bool)
+        truncated_B, masks, self._legal_BA = np.zeros(len(envs), dtype=bool), self._masks, self._legal_BA.copy()
         for b in alive_B.nonzero()[0]:
             self._stepping = int(b)
             self._each[b], reward, terminated, truncated_B[b], info = envs[b].step(action_B[b])
+            if masks is not None:
+                self._legal_BA[b] = masks.after(envs[b], info, terminated, truncated_B[b])
+            elif self._unmasked and KEY in info:
+                self._refuse_masks()
             reward_B[b] = number_of("reward", reward)
             discount_B[b] = 0.0 if terminated else discount_of(info, self._gamma, named=self._names_discounts[b])
         self._stepping = None
@@ -116,7 +163,13 @@ class Episodes:
         """Make one observation of those of all environments."""
         space = self._env.single_observation_space
         rows: Any = create_empty_array(space, n=len(self._each))
-        self.observation = concatenate(space, self._each, rows)
+        self._observation = concatenate(space, self._each, rows)
+
+    def _refuse_masks(self) -> None:
+        raise PgtsError(
+            f"info has {KEY!r} after a step and had none after a reset, so that nothing is known of the first actions: "
+            "give a mask after each reset, too, or set action_masks to 'off'"
+        )
 
     @contextmanager
     def named(self, when: str) -> Iterator[None]:

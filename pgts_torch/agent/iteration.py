@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from pgts_torch.agent.policies import Policy
@@ -23,6 +23,8 @@ class Batch:
         normalised steps divide at least; 0 where nothing was sampled or no standard errors are computed.
     policy: the policy pi that the batch is of, from which updates of networks start; None: the one that is updated.
     ranks: the processes that have the other rows: an update is that from the rows of all.
+    legal_NA: the legal actions of each row, by which updates of networks leave the others out; None: all are legal.
+        They find it in the observations.
     """
 
     observation_N: Shaped[Tensor, "N ..."]
@@ -31,6 +33,7 @@ class Batch:
     noise: float = 0.0
     policy: Policy | None = None
     ranks: Ranks = ALONE
+    legal_NA: Bool[Tensor, "N A"] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

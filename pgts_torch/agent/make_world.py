@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Literal
 
 import gymnasium
 import numpy as np
@@ -31,12 +32,14 @@ from pgts_torch.models.adapters_generic import Layered, PickledAttributes, insid
 from pgts_torch.models.attributes import attributes, own_to_each, unlike
 from pgts_torch.models.classic import CLASSIC
 from pgts_torch.models.environments import SLOW, EnvSource, kinds_of
+from pgts_torch.models.masks import ActionMasks, has_method, masks_of
 from pgts_torch.models.published import publishes_table, table_of
 from pgts_torch.models.restoring import Setup, check_resets, check_snapshots
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import SnapshotAdapter, each_of, env_name
-from pgts_torch.models.trial import compare
-from pgts_torch.models.wrappers import Transforms, check_transforms, transforms_of, wrappers_of
+from pgts_torch.models.trial import compare, environment_code
+from pgts_torch.models.wrapper_trial import check_transforms
+from pgts_torch.models.wrappers import Transforms, transforms_of, wrappers_of
 from pgts_torch.options.environment import Observed
 from pgts_torch.seeding import SharedGenerators, numpy_stream
 from pgts_torch.tabular.mdp import TabularMDP, check_gamma
@@ -59,7 +62,7 @@ def make_world(
     plain: bool,
     action_repeat: int = 1,
     device: torch.device | str,
-    other: Callable[[VectorEnv, float], ModelWorld] | None = None,
+    other: Callable[[VectorEnv, float, ActionMasks | Literal["off"] | None], ModelWorld] | None = None,
 ) -> World:
     """Make the world of an environment, with the first model of table, dynamics and simulator that applies to it.
 
@@ -69,7 +72,8 @@ def make_world(
         observed: what is seen of observations.
         plain: whether no model is needed: then only a table is looked for, and without one the world has no model.
         action_repeat: how often an action is taken in one outcome of the model (`TensorModel`).
-        other: makes the world of environments and their discount, with a model that is learned or the caller's own.
+        other: makes the world of environments, their discount and how their action masks are read (`World.masks`), with
+            a model that is learned or the caller's own.
 
     Raises:
         PgtsError: the environment does not exist, or no agent can act in it; or actions are to be repeated in a table,
@@ -80,11 +84,13 @@ def make_world(
     env = source.make(num_envs, one_by_one=one_by_one) if source.given is None else source.given
     discount = DEFAULT_GAMMA if gamma is None else gamma
     check_gamma(discount)
+    request = _Request(source, env, discount, observed, action_repeat, torch.device(device))
     if other is not None:
         _check_memories(env)
         own = getattr(each_of(env)[0].unwrapped, "mdp", None)
-        return other(env, float(own.outcomes.discount_NAK.max()) if isinstance(own, TabularMDP) else discount)
-    request = _Request(source, env, discount, observed, action_repeat, torch.device(device))
+        return other(
+            env, float(own.outcomes.discount_NAK.max()) if isinstance(own, TabularMDP) else discount, request.masks
+        )
     with SharedGenerators(0, "models"):
         world, reasons = _first_model(request, plain=plain)
     if world is not None:
@@ -93,7 +99,7 @@ def make_world(
         raise MissingModel("; ".join(reversed(reasons)) + _WAYS_OUT)
     _check_memories(env)
     _check_single(action_repeat, "without a model")
-    return World(env, gamma=discount, observed=observed, device=device)
+    return World(env, gamma=discount, observed=observed, masks=request.masks, device=device)
 
 
 @dataclass(frozen=True)
@@ -130,6 +136,26 @@ class _Request:
     def new(self) -> gymnasium.Env:
         """A new environment whose attributes are read; it is never stepped."""
         return self.fresh()
+
+    @cached_property
+    def masks(self) -> ActionMasks | Literal["off"] | None:
+        """How the action masks of the environments are read, where they are not those of a table."""
+        mode = self.observed.action_masks
+        if mode == "off":
+            return "off"
+        # what an environment raises in reset is reported, with its seed, in training
+        with (
+            SharedGenerators(0, "masks"),
+            suppress(Failed),
+            environment_code(),
+        ):
+            masks = masks_of(self.env, self.fresh if self.source.makers else None)
+            if masks is None and mode == "on":
+                raise PgtsError(
+                    f"action_masks is 'on'; {self.name} has neither a method action_masks() nor info['action_mask']"
+                )
+            return masks
+        return None
 
     @cached_property
     def own_to_each(self) -> frozenset[str]:
@@ -205,6 +231,8 @@ def _table(request: _Request) -> TabularWorld | None:
     discrete = isinstance(request.env.single_observation_space, spaces.Discrete)
     if request.observed.observation_keys is not None or not discrete or not publishes_table(request.envs.envs[0]):
         return None
+    if request.observed.action_masks == "on" or (request.observed.action_masks == "auto" and has_method(request.env)):
+        raise MissingModel(f"the table of {request.name} is not used: it says nothing of its action masks")
     if own := request.own_to_each & {"P", "mdp", "initial_state_distrib"}:
         raise MissingModel(
             f"each instance of {request.name} has its own {min(own)}, and one table must fit all: make them alike"
@@ -217,7 +245,7 @@ def _table(request: _Request) -> TabularWorld | None:
             "to 1,000 resets",
             stacklevel=4,
         )
-    return TabularWorld(request.env, mdp, starts_known=starts_known, device=request.device)
+    return TabularWorld(request.env, mdp, starts_known=starts_known, masks="off", device=request.device)
 
 
 def _dynamics(request: _Request) -> DynamicsWorld | None:
@@ -226,8 +254,9 @@ def _dynamics(request: _Request) -> DynamicsWorld | None:
     kind = next((kind for kind in CLASSIC if type(env.unwrapped) is kind.env_class), None)
     if kind is None:
         return None
+    is_masked = isinstance(request.masks, ActionMasks)
     unused = f"the dynamics in torch of {kind.env_class.__name__} are not used"
-    if why := kind.obstacle(env) or _own(request, kind.constants):
+    if why := kind.obstacle(env) or _own(request, kind.constants) or ("they have no action masks" * is_masked):
         raise MissingModel(f"{unused}: {why}")
     env = request.fresh()
     tried = kind(env, gamma=request.gamma)
@@ -260,7 +289,10 @@ def _simulator(request: _Request, *, reasons: Sequence[str], layered: bool) -> S
     numbers, alike = itertools.count(), not request.own_to_each
     make: Callable[[], gymnasium.Env] = lambda: inside(request.fresh(next(numbers)), adapter)  # noqa: E731
     actions = [*all_actions(env.action_space)] if layered else base_actions(env)
-    setup = Setup(make, adapter, actions, request.random, alike=alike)
+    masks = inner = request.masks if isinstance(request.masks, ActionMasks) else None
+    if inner is not None:
+        inner = ActionMasks.of_env(make(), actions, by_method=inner.by_method)
+    setup = Setup(make, adapter, actions, request.random, alike=alike, masks=inner)
     try:
         seconds = check_snapshots(setup)
         if layered:
@@ -286,9 +318,10 @@ def _simulator(request: _Request, *, reasons: Sequence[str], layered: bool) -> S
         action_repeat=request.action_repeat,
         adapter=adapter,
         observe=None if seen.as_given else seen.rows,
+        masks=masks,
         device=request.device,
     )
-    return SimulatedWorld(request.envs, model, observed=request.observed, device=request.device)
+    return SimulatedWorld(request.envs, model, observed=request.observed, masks=request.masks, device=request.device)
 
 
 def _own(request: _Request, names: Iterable[str]) -> str:

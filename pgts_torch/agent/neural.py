@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.advantages import critic_targets
+from pgts_torch.agent.components import legal_only
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.networks import Network, Trunk, default_network, make_trunk
@@ -32,10 +33,11 @@ _SLOWEST_RATE = 0.1
 
 @final
 class NetworkPolicy(Policy):
-    """pi(a|o) ~ exp(logit_a(o)) in float32; nearly uniform at first, because the head has gain 0.01.
+    """pi(a|o) ~ exp(logit_a(o)) in float32, over the legal actions; nearly uniform at first, because the head has gain
+    0.01.
 
     Args:
-        observation_space: Discrete(n), vectors or channels-last images.
+        observation_space: of the rows, which may end with the legal actions.
         num_actions: A.
         options: of the trunk.
         seed: the initial weights are from the stream (seed, "policy"), the same on every device.
@@ -60,8 +62,9 @@ class NetworkPolicy(Policy):
         self.num_actions = num_actions
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
-        """softmax of the logits."""
-        return self.network.outputs(observation_N).softmax(-1)
+        """softmax of the logits of the legal actions."""
+        legal_NA = self.network.trunk.encoder.legal(observation_N)
+        return legal_only(self.network.outputs(observation_N), legal_NA).softmax(-1)
 
     def state_dict(self) -> dict[str, Any]:
         return self.network.plain_state()
@@ -224,7 +227,8 @@ class NetworkCritic(Critic):
     def q(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         if self.target != "q":
             raise PgtsError("this critic learns v; it has no Q. Make it with target='q', or search with v_leaf")
-        return self._values(self.network, observation_N)
+        legal_NA = self.network.trunk.encoder.legal(observation_N)
+        return legal_only(self._values(self.network, observation_N), legal_NA)
 
     def state_dict(self) -> dict[str, Any]:
         state = {

@@ -14,9 +14,10 @@ from dataclasses import replace
 from typing import Any, final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pgts_torch.agent.components import legal_only
 from pgts_torch.agent.gradients import Forward, through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
@@ -31,6 +32,9 @@ from pgts_torch.options.updates import PPO, Gradient
 from pgts_torch.ranks import Ranks, Share
 from pgts_torch.readings import Readings
 from pgts_torch.search.lookahead import check_finite
+
+_LOG_OF_ZERO = -1e4
+"""In place of log pi(a|s) = -inf of an action that is not legal: its exp is 0, and 0 times it is no NaN."""
 
 
 class NetworkUpdate(Update):
@@ -71,6 +75,8 @@ class NetworkUpdate(Update):
         self._optimiser.learning_rate = self.now.learning_rate
         ranks = batch.ranks
         with self._optimiser.attempt(network.tensors) as readings:
+            if (legal_NA := encoder.legal(batch.observation_N)) is not None:
+                batch = replace(batch, advantage_NA=legal_only(batch.advantage_NA, legal_NA, 0.0), legal_NA=legal_NA)
             _check_numbers(batch, readings)
             if fresh := encoder.fresh:
                 encoder.absorb(batch.observation_N, ranks)
@@ -148,7 +154,7 @@ class GradientUpdate(NetworkUpdate):
     ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
         """Losses: policy, minus the objective without entropy, before the step; grad_norm, before clipping."""
         made, coef = Forward(network, input_N), self.now.entropy_coef
-        log_NA, slope_NA = made.output_ND.log_softmax(-1), batch.advantage_NA.float()
+        log_NA, slope_NA = log_softmax(made.output_ND, batch.legal_NA), batch.advantage_NA.float()
         pi_NA = log_NA.exp()
         policy_loss = loss = -(batch.weight_N @ (pi_NA * slope_NA).sum(-1))
         if coef:
@@ -158,7 +164,7 @@ class GradientUpdate(NetworkUpdate):
         stepped = self.step(made, through_log_softmax(log_NA, down_NA), batch.ranks, loss, policy_loss)
         assert stepped is not None
         readings.add(policy=stepped[1][1], grad_norm=stepped[0])
-        return log_NA, log_probs(network, input_N)
+        return log_NA, log_probs(network, input_N, batch.legal_NA)
 
 
 @final
@@ -190,7 +196,7 @@ class PPOUpdate(NetworkUpdate):
         if self.options.normalize_advantage:
             advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N, share)
         columns, num_steps = (input_N, old_NA, advantage_NA, weight_N), 0
-        made = passes(network, columns, share, self.options.num_epochs, self.options.minibatch_size, generator)
+        made = passes(network, columns, batch.legal_NA, share, self.options, generator)
         for forward, log_NA, count, (_, before_NA, part_NA, part_N) in made:
             gain_NA, down_NA = self.objective(log_NA, before_NA, part_NA, part_N, count)
             losses = [-mean(part_N, gain_NA.sum(-1), count)]
@@ -201,7 +207,7 @@ class PPOUpdate(NetworkUpdate):
                 break
             readings.add(policy=stepped[1][0], grad_norm=stepped[0])
             num_steps += 1
-        new_NA = log_probs(network, input_N)
+        new_NA = log_probs(network, input_N, batch.legal_NA)
         outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.now.clip_range
         readings.add(
             clip_fraction=batch.ranks.sum("clipped", mean(weight_N, (old_NA.exp() * outside_NA).sum(-1), share.total)),
@@ -254,29 +260,43 @@ def divergence(log_p_NA: Float[Tensor, "N A"], log_q_NA: Float[Tensor, "N A"]) -
 
 def log_probs_before(network: Network, input_N: Float[Tensor, "N ..."], batch: Batch) -> Float[Tensor, "N A"]:
     """log pi of the policy that the batch is of, from which the update starts."""
-    return log_probs(batch.policy.network if isinstance(batch.policy, NetworkPolicy) else network, input_N)
+    before = batch.policy.network if isinstance(batch.policy, NetworkPolicy) else network
+    return log_probs(before, input_N, batch.legal_NA)
 
 
 @torch.no_grad()
-def log_probs(network: Network, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N A"]:
+def log_probs(
+    network: Network, input_N: Float[Tensor, "N ..."], legal_NA: Bool[Tensor, "N A"] | None
+) -> Float[Tensor, "N A"]:
     """log pi, without gradient."""
-    return network(input_N).log_softmax(-1)
+    return log_softmax(network(input_N), legal_NA)
+
+
+def log_softmax(logit_NA: Float[Tensor, "N A"], legal_NA: Bool[Tensor, "N A"] | None) -> Float[Tensor, "N A"]:
+    """log pi over the legal actions; that of the others is finite, and its exp is 0."""
+    return legal_only(legal_only(logit_NA, legal_NA).log_softmax(-1), legal_NA, _LOG_OF_ZERO)
 
 
 def passes(
     network: Network,
     columns: Sequence[Tensor],
+    legal_NA: Bool[Tensor, "N A"] | None,
     share: Share,
-    num_epochs: int,
-    minibatch_size: int,
+    options: Any,
     generator: torch.Generator,
 ) -> Iterator[tuple[Forward, Float[Tensor, "N A"], int, tuple[Tensor, ...]]]:
     """Yield minibatches of the columns, the first of which are inputs: their pass through the current network and log
-    pi, without gradient; how many rows the minibatch has in all processes; and those of this one."""
-    for _ in range(num_epochs):
-        for count, part in minibatches(columns, minibatch_size, share, generator=generator):
+    pi, without gradient; how many rows the minibatch has in all processes; and those of this one.
+
+    Args:
+        options: of an update, which say how many there are.
+    """
+    rows = columns if legal_NA is None else [*columns, legal_NA]
+    for _ in range(options.num_epochs):
+        for count, part in minibatches(rows, options.minibatch_size, share, generator=generator):
             made = Forward(network, part[0])
-            yield made, made.output_ND.log_softmax(-1), count, part
+            log_NA = log_softmax(made.output_ND, None if legal_NA is None else part[-1])
+            yield made, log_NA, count, part[: len(columns)]
 
 
 def mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"], count: int) -> Float[Tensor, ""]:

@@ -19,8 +19,11 @@ from pgts_torch.agent.components import (
     num_combinations,
     plainly,
     row_dtype,
+    row_shape,
+    with_mask,
 )
 from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.models.masks import Masked
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.environment import Observed
 
@@ -59,21 +62,30 @@ class _Part:
 class Observations:
     """Makes tensors of the observations of an environment, a row of each (`components`).
 
-    space: of rows. Numbers are counted from 0, and the channels of images come last.
-    as_given: whether rows are the observations themselves, in their dtype.
+    space: of rows. Numbers are counted from 0, the channels of images come last, and after all come the legal actions.
+    as_given: whether rows, without legal actions, are the observations themselves, in their dtype.
 
     Args:
         env: the environments.
         options: what is seen of dictionaries, and where images have their channels.
         numbered: whether the combinations of several numbers are numbered in their turn: then rows are Discrete.
+        masked: how many actions there are, where observations are `Masked`; None: they are not.
 
     Raises:
         PgtsError: a key that the observations do not have, images that may have their channels first or last, or a
             kind of observation that no network takes.
     """
 
-    def __init__(self, env: VectorEnv, options: Observed, device: torch.device, *, numbered: bool = False) -> None:
-        self.options, self.device, self.numbered = options, device, numbered
+    def __init__(
+        self,
+        env: VectorEnv,
+        options: Observed,
+        device: torch.device,
+        *,
+        numbered: bool = False,
+        masked: int | None = None,
+    ) -> None:
+        self.options, self.device, self.numbered, self.masked = options, device, numbered, masked
         self._what = f"the observations of {env_name(env)}"
         space, channels = env.single_observation_space, options.image_channels
         self._parts = [
@@ -83,8 +95,12 @@ class Observations:
         seen: list[Component] = [part.seen for part in self._parts]
         self._row: Space[Any] = seen[0] if len(seen) == 1 else spaces.Tuple(seen)
         self._dtype = row_dtype(self._row)
-        self.space = spaces.Discrete(num_combinations(self._row) or 0) if numbered else self._row
+        self.space: Space[Any] = spaces.Discrete(num_combinations(self._row) or 0) if numbered else self._row
         self.as_given = isinstance(space, spaces.Box | spaces.Discrete) and self.space == space
+        self._inner_axes = len(row_shape(self.space))
+        if masked is not None:
+            self.space = with_mask(self.space, masked)
+            self._masked_dtype = row_dtype(self.space)
         if channels is not None and not any(len(part.shape or ()) == 3 for part in seen):
             raise PgtsError(f"image_channels is {channels!r}; {self._what} are {space}, without an image of three axes")
 
@@ -120,10 +136,22 @@ class Observations:
 
     def encode(self, observation: Any) -> Tensor:
         """As `World.encode`."""
-        return torch.from_numpy(self.rows(observation)).to(self.device)
+        if isinstance(observation, Masked):
+            rows = self.with_legal(self.rows(observation.observation), observation.legal_A)
+        else:
+            rows = self.rows(observation)
+        return torch.from_numpy(rows).to(self.device)
+
+    def with_legal(self, rows: np.ndarray, legal_NA: np.ndarray) -> np.ndarray:
+        """Return rows of `encode` from those without legal actions; where none is, all count as legal."""
+        flat = rows.reshape(*rows.shape[: rows.ndim - self._inner_axes], -1)
+        legal_NA = legal_NA | ~legal_NA.any(-1, keepdims=True)
+        if legal_NA.shape[:-1] != flat.shape[:-1]:
+            raise PgtsError(f"action masks have the shape {legal_NA.shape}; observations have {rows.shape}")
+        return np.concatenate([flat, legal_NA], -1, dtype=self._masked_dtype, casting="unsafe")
 
     def rows(self, observation: Any) -> np.ndarray:
-        """Return the rows of `encode` as an array of its own."""
+        """Return the rows of observations, without their legal actions, as an array of its own."""
         found = [part.read(observation) for part in self._parts]
         if len(found) == 1 and not self.numbered:
             return np.array(found[0], self._dtype)

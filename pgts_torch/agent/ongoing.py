@@ -68,8 +68,12 @@ class OngoingEpisodes:
         B = self._world.env.num_envs
         self._actions_B: list[list[int]] = [[] for _ in range(B)]
         self._return_B = [0.0] * B
-        self._episodes = Episodes(self._world.env, gamma=self._world.gamma, seeds=self._seeds())
+        self._episodes = self._new_episodes()
         self._has_begun = False
+
+    def _new_episodes(self) -> Episodes:
+        world = self._world
+        return Episodes(world.env, gamma=world.gamma, seeds=self._seeds(), masks=world.masks)
 
     def _seeds(self) -> list[int]:
         """The seed of the present episode of each environment."""
@@ -224,7 +228,7 @@ class OngoingEpisodes:
         self._actions_B, self._has_begun = recorded, state["observed"] is not None
         if not self._has_begun:
             return
-        self._episodes = Episodes(self._world.env, gamma=self._world.gamma, seeds=self._seeds())
+        self._episodes = self._new_episodes()
         longest, return_B = max(map(len, recorded)), [0.0] * B
         with shared_generators(self._world, self._seed, ("restored",)), self._episodes.named("when it was repeated"):
             self._episodes.reset()

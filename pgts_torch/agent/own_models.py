@@ -3,7 +3,7 @@
 Their states are what is observed: numbers or vectors; those of images are vectors that represent them.
 """
 
-from typing import Any, final
+from typing import Any, Literal, final
 
 import torch
 from gymnasium import spaces
@@ -19,6 +19,7 @@ from pgts_torch.errors import MissingModel, PgtsError, failure
 from pgts_torch.models.base import Model
 from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.ensemble import EnsembleModel
+from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.tensor import TensorModel
@@ -40,10 +41,8 @@ class VectorWorld(VectorStates):
         observed: what is seen of observations.
     """
 
-    def __init__(
-        self, env: VectorEnv, model: TensorModel, *, gamma: float, observed: Observed, device: torch.device
-    ) -> None:
-        super().__init__(env, gamma=gamma, observed=observed, device=device)
+    def __init__(self, env: VectorEnv, model: TensorModel, *, gamma: float, **options: Any) -> None:
+        super().__init__(env, gamma=gamma, **options)
         self.model: TensorModel = model
         if isinstance(model, LatentModel):
             self.perceive, self.perceived_space = model.represent, model.space
@@ -66,6 +65,7 @@ def learned_world(
     action_repeat: int,
     capacity: int,
     seed: int,
+    masks: ActionMasks | Literal["off"] | None,
     device: torch.device,
 ) -> ModelWorld:
     """Return the environments with a model that has learned nothing yet.
@@ -77,7 +77,8 @@ def learned_world(
     Raises:
         MissingModel: it does not learn from such observations.
     """
-    world = World(env, gamma=gamma, observed=observed, device=device)
+    shared: dict[str, Any] = {"gamma": gamma, "observed": observed, "masks": masks, "device": device}
+    world = World(env, **shared)
     space = world.observation_space
     if (kind := _learned_by(space)) is not type(options):
         needed = {Counts: "numbers", Ensemble: "vectors of numbers", Latent: "images"}[type(options)]
@@ -92,7 +93,7 @@ def learned_world(
         num_states = num_combinations(space)
         assert num_states is not None
         table = CountsModel(num_states, world.num_actions, gamma=gamma, options=options, device=device)
-        return TabularWorld(env, None, model=table, gamma=gamma, observed=observed, numbered=True, device=device)
+        return TabularWorld(env, None, model=table, numbered=True, **shared)
     given: dict[str, Any] = {
         "gamma": gamma,
         "options": options,
@@ -106,7 +107,7 @@ def learned_world(
         model: TensorModel = LatentModel(space, world.num_actions, **given)
     else:
         model = EnsembleModel(space.shape[0], world.num_actions, **given)
-    return VectorWorld(env, model, gamma=gamma, observed=observed, device=device)
+    return VectorWorld(env, model, **shared)
 
 
 def _learned_by(space: Space[Any]) -> type[Counts | Ensemble | Latent] | None:
@@ -136,13 +137,22 @@ def own_model(options: OwnModel) -> Model:
     return made
 
 
-def world_of(env: VectorEnv, model: Model, *, gamma: float, observed: Observed, device: torch.device) -> ModelWorld:
+def world_of(
+    env: VectorEnv,
+    model: Model,
+    *,
+    gamma: float,
+    observed: Observed,
+    masks: ActionMasks | Literal["off"] | None,
+    device: torch.device,
+) -> ModelWorld:
     """Return the environments with a model of the caller's own, whose states are observations.
 
     Raises:
         PgtsError: the model does not fit the environments.
     """
-    world = World(env, gamma=gamma, observed=observed, device=device)
+    shared: dict[str, Any] = {"gamma": gamma, "observed": observed, "masks": masks, "device": device}
+    world = World(env, **shared)
     space, name = world.observation_space, type(model).__name__
     if model.num_actions != world.num_actions:
         raise PgtsError(f"{name} has {model.num_actions} actions; {env_name(env)} has {world.num_actions}")
@@ -152,14 +162,14 @@ def world_of(env: VectorEnv, model: Model, *, gamma: float, observed: Observed, 
         if model.num_states != space.n:
             raise PgtsError(f"{name} has {model.num_states} states; {env_name(env)} has {space.n}")
         mdp = model.mdp if isinstance(model, TabularModel) else None
-        return TabularWorld(env, mdp, model=model, gamma=gamma, observed=observed, device=device)
+        return TabularWorld(env, mdp, model=model, **shared)
     if isinstance(space, spaces.Box) and isinstance(model, TensorModel):
         if space.shape != (model.state_size,):
             raise PgtsError(
                 f"states of {name} have {model.state_size} numbers; observations of {env_name(env)} have the shape "
                 f"{space.shape}: both must be the same vectors"
             )
-        return VectorWorld(env, model, gamma=gamma, observed=observed, device=device)
+        return VectorWorld(env, model, **shared)
     raise PgtsError(
         f"{name} does not fit {env_name(env)}, whose observations are {space}: numbered observations need a model over "
         "their numbers, vectors a TensorModel over such vectors"

@@ -1,6 +1,7 @@
 """Make the parts of a training from the arguments of `PGTS`."""
 
 import copy
+import sys
 from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,11 +26,13 @@ from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.agent.posterior_certificate import PosteriorCertificate
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import ModelWorld, World
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import LearningModel, Model
 from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.environments import EnvSource
+from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.rewards import RewardRange
+from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.arguments import read
 from pgts_torch.options.models import LEARNED, OwnModel
 from pgts_torch.options.replay import UniformReplay
@@ -215,17 +218,30 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
             device=device,
             other=other,
         )
+    masks = world.masks
+    if isinstance(masks, ActionMasks) and not masks.by_method and options.env.action_masks == "auto" and ranks.leads:
+        said = f"actions of {source.name} are masked by {masks.what}; action_masks 'off' ignores it"
+        print(f"note: {said}", file=sys.stderr)
     if arguments["reward_range"] is not None:
         world.promise(RewardRange.of(arguments["reward_range"]))
     return source, world
 
 
-def _with_model(model: Model, shared: Mapping[str, Any], env: VectorEnv, gamma: float) -> ModelWorld:
-    return world_of(env, model, gamma=gamma, **shared)
+def _with_model(model: Model, shared: Mapping[str, Any], env: VectorEnv, gamma: float, masks: Any) -> ModelWorld:
+    return world_of(env, model, gamma=gamma, masks=masks, **shared)
 
 
-def _with_learned(options: Training, shared: Mapping[str, Any], seed: int, env: VectorEnv, gamma: float) -> ModelWorld:
+def _with_learned(
+    options: Training, shared: Mapping[str, Any], seed: int, env: VectorEnv, gamma: float, masks: Any
+) -> ModelWorld:
     assert isinstance(options.model, LEARNED)
     capacity = options.replay.capacity if isinstance(options.replay, UniformReplay) else UniformReplay().capacity
     repeat = options.search.action_repeat
-    return learned_world(env, options.model, gamma=gamma, action_repeat=repeat, capacity=capacity, seed=seed, **shared)
+    if isinstance(masks, ActionMasks):
+        raise MissingModel(
+            f"model is {options.model.type!r}, which does not learn which actions are legal, and {env_name(env)} has "
+            f"{masks.what}: take its simulator (model 'auto'), or depth 0 and the estimator 'sampled'"
+        )
+    return learned_world(
+        env, options.model, gamma=gamma, action_repeat=repeat, capacity=capacity, seed=seed, masks=masks, **shared
+    )

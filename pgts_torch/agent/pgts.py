@@ -30,6 +30,7 @@ from pgts_torch.agent.world import SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.environments import Given, close_environments
+from pgts_torch.models.masks import ActionMasks, Masked
 from pgts_torch.ranks import present_ranks
 from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.seeding import drawn_seed, stream
@@ -75,6 +76,8 @@ class PGTS:
             the environment: see there too.
         observation_keys, image_channels: the entries of dictionary observations that are seen (default: all), and where
             images have their channels ("first", "last"; default: as their shape tells).
+        action_masks: whether actions that are not legal, by `action_masks()` of the environment or
+            `info["action_mask"]`, are never taken: "auto", "on" or "off" (`options.environment.Observed`).
         reward_range: the lowest and the highest reward of a single step; a reward outside of it is an error. `stop_at`
             and an adaptive depth need it where the model has no largest reward (simulators).
         gamma: discount. Default: the environment's own (pgts/*), else 0.99. A VectorEnv of pgts/* has its own.
@@ -112,6 +115,7 @@ class PGTS:
         model_check: Mode = "error",
         observation_keys: Sequence[str] | None = None,
         image_channels: Literal["first", "last"] | None = None,
+        action_masks: Literal["auto", "on", "off"] = "auto",
         reward_range: Sequence[float] | None = None,
         gamma: float | None = None,
         seed: int | None = 0,
@@ -270,16 +274,26 @@ class PGTS:
         return self
 
     def predict(
-        self, observation: ArrayLike, *, deterministic: bool = True, generator: torch.Generator | None = None
+        self,
+        observation: ArrayLike,
+        *,
+        deterministic: bool = True,
+        action_mask: ArrayLike | None = None,
+        generator: torch.Generator | None = None,
     ) -> np.ndarray | np.generic:
         """Return actions for observations, in the form of the environment; without search.
 
         Args:
             observation: an observation of the environment, or an array of them.
+            action_mask: which actions are legal there, as the environment says it: a vector, or a row for each of an
+                array of observations. It is needed where the environment has action masks.
             deterministic: take the most probable action; else sample from pi.
             generator: for sampling; default: one with this model's seed, which continues from call to call.
+
+        Raises:
+            PgtsError: an observation or a mask is none of the environment, or the mask is missing, or of no use.
         """
-        observation_N = self.world.encode(observation)
+        observation_N = self.world.encode(self._masked(observation, action_mask))
         shape = observation_N.shape[: observation_N.ndim - len(row_shape(self.world.observation_space))]
         observation_N = self.world.perceive(observation_N.reshape(-1, *observation_N.shape[len(shape) :]))
         if deterministic:
@@ -288,6 +302,24 @@ class PGTS:
             action_N = self.policy.sample(observation_N, generator=generator or self._generator)
         action = action_N.cpu().numpy().reshape(shape)
         return action[()] if self._own_actions is None else self._own_actions[action]
+
+    def _masked(self, observation: Any, action_mask: Any) -> Any:
+        """An observation with its legal actions."""
+        masks = self.world.masks
+        if not isinstance(masks, ActionMasks):
+            if action_mask is not None:
+                raise PgtsError(
+                    f"action_mask is given; {self.source.name} was trained without action masks, with all actions legal"
+                )
+            return observation
+        if action_mask is None:
+            raise PgtsError(
+                f"{self.source.name} has action masks: give the one of this observation, as {masks.what} has it, in "
+                "predict(observation, action_mask=...)"
+            )
+        one = isinstance(action_mask, tuple) or np.ndim(action_mask) <= 1
+        legal_A = masks.read(action_mask) if one else np.array([masks.read(row) for row in np.asarray(action_mask)])
+        return Masked(observation, legal_A)
 
     def save(self, path: str | Path) -> None:
         """Write arguments and state into one file with a checksum, without an environment that was given as an object.

@@ -306,7 +306,7 @@ def shared_generators(world: World, seed: int, names: tuple[str | int, ...]) -> 
 
 def _episodes(world: World, policy: Policy, horizon: Horizon, seeds: list[int], generator: torch.Generator) -> Rollout:
     num_envs, model_world = world.env.num_envs, world if isinstance(world, ModelWorld) else None
-    episodes = Episodes(world.env, gamma=world.gamma, seeds=seeds)
+    episodes = Episodes(world.env, gamma=world.gamma, seeds=seeds, masks=world.masks)
     observations: list[Tensor] = []
     reads: list[Tensor] = []
 

@@ -4,13 +4,21 @@ from abc import abstractmethod
 from typing import Any, final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pgts_torch.agent.gradients import through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
-from pgts_torch.agent.neural_updates import NetworkUpdate, divergence, log_probs, log_probs_before, mean, passes
+from pgts_torch.agent.neural_updates import (
+    NetworkUpdate,
+    divergence,
+    log_probs,
+    log_probs_before,
+    log_softmax,
+    mean,
+    passes,
+)
 from pgts_torch.options.updates import CMPO, Mirror
 from pgts_torch.ranks import ALONE, Ranks
 from pgts_torch.readings import Readings
@@ -42,11 +50,11 @@ class TargetUpdate(NetworkUpdate):
         if batch.ranks.totals("rows that move", exponent_NA.any()) == [0]:
             readings.add(policy=0.0, grad_norm=0.0)
             return old_NA, old_NA
-        target_NA = (old_NA + exponent_NA).log_softmax(-1)
+        target_NA = log_softmax(old_NA + exponent_NA, batch.legal_NA)
         share = batch.ranks.share("rows", len(input_N))
         weight_N = batch.weight_N / share.mean("weights", batch.weight_N)
         columns = input_N, target_NA, weight_N
-        made = passes(network, columns, share, self.options.num_epochs, self.options.minibatch_size, generator)
+        made = passes(network, columns, batch.legal_NA, share, self.options, generator)
         for forward, log_NA, count, (_, part_NA, part_N) in made:
             # Of KL(target || pi) in log pi it is -target, and so in the logits pi - target.
             down_NA = -(part_N * (1 / count))[:, None] * part_NA.exp()
@@ -54,7 +62,7 @@ class TargetUpdate(NetworkUpdate):
             stepped = self.step(forward, through_log_softmax(log_NA, down_NA), batch.ranks, loss)
             assert stepped is not None
             readings.add(grad_norm=stepped[0])
-        new_NA = log_probs(network, input_N)
+        new_NA = log_probs(network, input_N, batch.legal_NA)
         after = mean(weight_N, divergence(target_NA, new_NA), share.total)
         readings.add(policy=batch.ranks.sum("the loss of the policy", after))
         return old_NA, new_NA
@@ -93,17 +101,25 @@ class CMPOUpdate(TargetUpdate):
         super().__init__(options)
 
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
-        scale = advantage_scale(batch.advantage_NA, batch.weight_N, batch.ranks).clamp(min=batch.noise)
+        scale = advantage_scale(batch.advantage_NA, batch.weight_N, batch.ranks, batch.legal_NA).clamp(min=batch.noise)
         step_NA = batch.advantage_NA / scale / self.options.temperature
         # if all actions have the same advantage, scale is 0
         return torch.where(scale == 0, 0.0, step_NA.clamp(-self.now.clip, self.now.clip)).float()
 
 
 def advantage_scale(
-    advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"], ranks: Ranks = ALONE
+    advantage_NA: Float[Tensor, "N A"],
+    weight_N: Float[Tensor, "N"],
+    ranks: Ranks = ALONE,
+    legal_NA: Bool[Tensor, "N A"] | None = None,
 ) -> Float[Tensor, ""]:
-    """mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|, over the rows of all ranks: the mean size of advantages, in
-    reward units."""
-    size_N = (advantage_NA - advantage_NA.mean(-1, keepdim=True)).abs().mean(-1).double()
+    """mean_s w(s) mean_a |adv(s, a) - mean_b adv(s, b)|, over the rows of all ranks and the legal actions: the mean
+    size of advantages, in reward units."""
+    if legal_NA is None:
+        size_N = (advantage_NA - advantage_NA.mean(-1, keepdim=True)).abs().mean(-1).double()
+    else:
+        share_NA = legal_NA / legal_NA.sum(-1, keepdim=True)
+        mean_N1 = (share_NA * advantage_NA).sum(-1, keepdim=True)
+        size_N = (share_NA * (advantage_NA - mean_N1).abs()).sum(-1).double()
     total = ranks.sum("weights of advantages", weight_N.double().sum())
     return ranks.sum("the size of advantages", (weight_N.double() / total) @ size_N)

@@ -6,7 +6,7 @@ Searches take states, which are integers; policies and critics take observations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, final
+from typing import Any, Literal, final
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from pgts_torch.agent.observations import Observations
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.dynamics import DynamicsModel
+from pgts_torch.models.masks import ActionMasks, Masked
 from pgts_torch.models.provenance import draws_its_own
 from pgts_torch.models.replay import Column
 from pgts_torch.models.rewards import RewardRange
@@ -47,6 +48,8 @@ class World:
     mdp: the exact MDP, where it is known.
     start_S: the start distribution mu over all states; None where it is known from episodes only.
     reward_range: the bounds that rewards of single steps are checked against; None: they are not checked.
+    masks: how action masks are read, so that observations are `Masked`; "off": they are not, if there are any; None:
+        there are none.
 
     Args:
         env: the environments, with discrete actions.
@@ -71,11 +74,13 @@ class World:
         gamma: float,
         observed: Observed = Observed(),  # noqa: B008 - frozen
         numbered: bool = False,
+        masks: ActionMasks | Literal["off"] | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.env, self.gamma, self.device = env, gamma, torch.device(device)
+        self.env, self.gamma, self.masks, self.device = env, gamma, masks, torch.device(device)
         self.num_actions = int(env.single_action_space.n)  # type: ignore[attr-defined]  # checked before
-        self.observations = Observations(env, observed, self.device, numbered=numbered)
+        masked = self.num_actions if isinstance(masks, ActionMasks) else None
+        self.observations = Observations(env, observed, self.device, numbered=numbered, masked=masked)
         self.observation_space = self.perceived_space = self.observations.space
         self.perceive = _as_it_is
 
@@ -86,8 +91,8 @@ class World:
 
     def of(self, env: VectorEnv) -> "World":
         """A world without a model for other environments of the same kind; warnings are not repeated in it."""
-        seen = self.observations
-        world = World(env, gamma=self.gamma, observed=seen.options, numbered=seen.numbered, device=self.device)
+        seen, shared = self.observations, {"masks": self.masks, "device": self.device}
+        world = World(env, gamma=self.gamma, observed=seen.options, numbered=seen.numbered, **shared)  # type: ignore[arg-type]
         world.warned, world.perceive, world.perceived_space = True, self.perceive, self.perceived_space
         return world
 
@@ -169,7 +174,7 @@ class TabularWorld(ModelWorld):
         gamma: discount; default: that of the table.
         starts_known: whether the start distribution of the table is that of the environment; False: it was
             estimated from resets.
-        env, observed, numbered, device: as in `World`.
+        env, observed, numbered, masks, device: as in `World`.
     """
 
     keeps_numbers = True
@@ -222,7 +227,7 @@ class SimulatedWorld(ModelWorld):
 
     Args:
         model: a simulator of the same environment.
-        env, observed, numbered, device: as in `World`.
+        env, observed, numbered, masks, device: as in `World`.
     """
 
     def __init__(self, env: SyncVectorEnv, model: SimulatorModel, **options: Any) -> None:
@@ -232,7 +237,11 @@ class SimulatedWorld(ModelWorld):
 
     def read(self, observation: Any, encoded_B: Tensor) -> Int[Tensor, "B"]:
         """Take a snapshot of each environment and return their numbers."""
-        return self.model.roots(self._envs, iterate(self.env.observation_space, observation)).to(self.device)
+        legal_BA = None
+        if isinstance(observation, Masked):
+            observation, legal_BA = observation
+        each = iterate(self.env.observation_space, observation)
+        return self.model.roots(self._envs, each, legal_BA).to(self.device)
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
         return read_N
@@ -241,9 +250,11 @@ class SimulatedWorld(ModelWorld):
         """The observations that the simulator made in these states: of which it keeps rows, where these are something
         else than what the environment gives."""
         kept_N = self.model.observations(state_N)
-        return (
-            self.observations.encode(kept_N) if self.observations.as_given else torch.from_numpy(kept_N).to(self.device)
-        )
+        if self.observations.as_given:
+            kept_N = self.observations.rows(kept_N)
+        if isinstance(self.masks, ActionMasks):
+            kept_N = self.observations.with_legal(kept_N, self.model.legal(state_N))
+        return torch.from_numpy(kept_N).to(self.device)
 
     def export(self, state_N: Int[Tensor, "N"]) -> list[Any]:
         """The snapshot and observation of each state; those of equal states are one object, which is pickled once."""

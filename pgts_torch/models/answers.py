@@ -33,11 +33,13 @@ class Seen:
     """A state, and what `observe` made of its observation: None while that is not known.
 
     like: the same state at another count of steps, which has the same observation.
+    legal: a byte for each action, 1 where it is legal; None: it is not known, or there are no action masks.
     """
 
     snapshot: Snapshot
     observation: Any = None
     like: "Seen | None" = None
+    legal: bytes | None = None
 
 
 @dataclass(slots=True)

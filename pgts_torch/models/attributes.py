@@ -22,6 +22,7 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch.errors import Failed
+from pgts_torch.models.actions import all_actions
 from pgts_torch.models.trial import environment_code, random_walk, reset
 
 _NONE = frozenset[str]()
@@ -54,7 +55,7 @@ _LOOKED_AFTER, _LONGEST, _SECONDS = 5, 200, 0.2
 steps; and for about these seconds."""
 
 _ACTIONS = 20
-"""How many are sampled for the walk in which `unlike` looks for differences."""
+"""How many that are no numbers are sampled for the walk in which `unlike` looks for differences."""
 
 _LEAST_RESETS, _MOST_RESETS = 10, 100
 """How often an environment is reset before a difference is taken for a lasting one: of two goals, each the outcome of
@@ -131,8 +132,11 @@ def unlike(
     if not any(left):
         return None
     walked = make()
-    walked.action_space.seed(int(generator.integers(2**31)))
-    actions = [walked.action_space.sample() for _ in range(_ACTIONS)]
+    space = walked.action_space
+    space.seed(int(generator.integers(2**31)))
+    # All of them where they are numbers, for it may be that few are legal.
+    is_discrete = isinstance(space, spaces.Discrete)
+    actions = [*all_actions(space)] if is_discrete else [space.sample() for _ in range(_ACTIONS)]
     of_state = changing(walked, actions, generator, times=2)
     if walked.render_mode is not None:  # attributes that rendering sets are no difference
         with contextlib.suppress(Failed), environment_code():

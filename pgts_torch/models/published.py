@@ -111,7 +111,9 @@ def compare_table(
             raise ModelMismatch(f"it starts in state {seen}, which has probability 0 there")
         return int(seen)
 
-    return compare(TabularModel(mdp), env, generator, state_of, gamma=gamma, seconds=seconds)
+    # Where a table says what every action does, masks of the environment are advice.
+    any_action = bool(mdp.outcomes.reward_NA.isfinite().all())
+    return compare(TabularModel(mdp), env, generator, state_of, gamma=gamma, seconds=seconds, any_action=any_action)
 
 
 def _from_rows(env: gymnasium.Env, gamma: float, transforms: Transforms, generator: np.random.Generator) -> TabularMDP:

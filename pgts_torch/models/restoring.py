@@ -4,6 +4,7 @@ import itertools
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -13,10 +14,11 @@ import torch
 from pgts_torch.errors import MissingModel
 from pgts_torch.models.adapters import methods_for
 from pgts_torch.models.attributes import changing, own_generator
+from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, generator_state
 from pgts_torch.models.steps import as_declared, bits, number_of
-from pgts_torch.models.trial import Taken, environment_code, reset, step
+from pgts_torch.models.trial import Taken, Trial, environment_code
 from pgts_torch.seeding import SharedGenerators, sample_keys, stream
 
 ACTIONS_TRIED = 8
@@ -40,6 +42,7 @@ class Setup:
     make: makes an instance without wrappers.   actions: of the environment inside them.
     longest: the most steps before a walk is recorded, or before a state of another instance is restored.
     alike: whether new instances are alike; else each state is restored in an instance of its own.
+    masks: how action masks say which actions are legal, of which alone are taken; None: all are.
     """
 
     make: Callable[[], Any]
@@ -48,9 +51,20 @@ class Setup:
     random: np.random.Generator
     longest: int = 50
     alike: bool = True
+    masks: ActionMasks | None = None
+
+    @cached_property
+    def trial(self) -> Trial:
+        return Trial(self.actions, self.masks)
+
+    def reset(self, env: Any, *, seed: int | None = None) -> Taken:
+        return self.trial.reset(env, seed=seed)
+
+    def step(self, env: Any, action: Any) -> Taken:
+        return self.trial.step(env, action)
 
     def model(self) -> SimulatorModel:
-        return SimulatorModel(self.make, gamma=1.0, actions=self.actions, adapter=self.adapter)
+        return SimulatorModel(self.make, gamma=1.0, actions=self.actions, adapter=self.adapter, masks=self.masks)
 
     def number(self) -> int:
         return int(self.random.integers(2**31))
@@ -61,7 +75,7 @@ class Setup:
     def fresh(self) -> Any:
         """A new instance, without wrappers, at the start of some episode."""
         env = self.make()
-        reset(env, seed=self.number())
+        self.reset(env, seed=self.number())
         return env
 
     def snapshot(self, env: Any) -> Snapshot:
@@ -74,6 +88,7 @@ class Setup:
         return name if self.snapshot(env).name == name else None
 
     def restore(self, env: Any, snapshot: Snapshot) -> None:
+        self.trial.forget(env)
         with environment_code():
             self.adapter.set_state(env, snapshot.data)
 
@@ -106,7 +121,9 @@ def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> float:
     turns = replace(setup, make=take_turns)
     beside_snapshots(turns)
     longest = int(np.clip(seconds / (_STEPS_IN_ALL * (each := _seconds_of_a_step(turns))), 2, _LONG_LENGTH))
-    turns = replace(turns, longest=longest, actions=setup.actions[: max(2, min(longest, ACTIONS_TRIED))])
+    # With masks all actions are needed, for it may be that none of the first ones is legal.
+    tried = len(setup.actions) if setup.masks else max(2, min(longest, ACTIONS_TRIED))
+    turns = replace(turns, longest=longest, actions=setup.actions[:tried])
     many = _SHORT_WALKS if setup.alike else _WALKS_APART
     for count, length in ((many, min(longest, _SHORT_LENGTH)), (1, longest)):
         walks = walks_of(turns, count, length)
@@ -124,7 +141,7 @@ def _seconds_of_a_step(setup: Setup) -> float:
     for _ in range(_TIMED_STEPS):
         begin = time.perf_counter()
         state = setup.snapshot(env)
-        step(env, setup.action())
+        setup.step(env, setup.action())
         times.append(time.perf_counter() - begin)
         setup.restore(env, state)
     return min(times)
@@ -136,10 +153,10 @@ def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
     for _ in range(count):
         # Without seeds: some emulators load their program again for each seed.
         for _ in range(int(setup.random.integers(setup.longest))):
-            if step(env, setup.action()).ends:
-                reset(env)
+            if setup.step(env, setup.action()).ends:
+                setup.reset(env)
         walks.append(_recorded(setup, env, setup.number(), tuple(setup.action() for _ in range(length))))
-        reset(env)
+        setup.reset(env)
     return walks
 
 
@@ -147,14 +164,15 @@ def _recorded(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Wal
     """These actions from the present state, up to an end."""
     start = setup.snapshot(env)
     setup.seed(env, key)
-    seen, states = list[bytes](), list[Hashable]()
+    seen, states, made = list[bytes](), list[Hashable](), list[Any]()
     for action in actions:
-        taken = step(env, action)
+        taken = setup.step(env, action)
+        made.append(taken.action)
         seen.append(_bits_of(env, taken))
         states.append(setup.snapshot(env).name)
         if taken.ends:
             break
-    return Walk(start, key, actions, tuple(seen), tuple(states))
+    return Walk(start, key, tuple(made), tuple(seen), tuple(states))
 
 
 def _again(setup: Setup, env: Any, walk: Walk) -> Walk:
@@ -175,7 +193,7 @@ def _at_the_end(setup: Setup) -> Any:
     """A new instance at the end of an episode, or late in one."""
     env = setup.fresh()
     for _ in range(setup.longest):
-        if step(env, setup.action()).ends:
+        if setup.step(env, setup.action()).ends:
             break
     return env
 
@@ -192,7 +210,7 @@ def beside_snapshots(setup: Setup) -> None:
     env, known = setup.make(), setup.adapter.restored
     if known is None or type(env).__module__.split(".")[0] in ("gymnasium", "ale_py"):
         return
-    reset(env, seed=setup.number())
+    setup.reset(env, seed=setup.number())
     if names := changing(env, setup.actions, setup.random, but=known):
         raise MissingModel(
             f"{min(names)} changes in its steps or resets and is in no snapshot of {setup.adapter.name}: "
@@ -240,15 +258,18 @@ def untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
     """Whether two equal real environments stay equal when a search starts from one of them."""
     real, twin = setup.make(), setup.make()
     seed, actions = setup.number(), [setup.action() for _ in range(2 * length)]
-    begun = [[_bits_of(env, reset(env, seed=seed))] for env in (real, twin)]
+    begun = [[_bits_of(env, setup.reset(env, seed=seed))] for env in (real, twin)]
     for env, seen in zip((real, twin), begun, strict=True):
-        seen += _live(env, actions[:length])
+        seen += _live(setup, env, actions[:length])
     before = _state_of(setup, real)
     model, after = setup.model(), {before}
-    frontier_N = torch.tensor([model.number(setup.snapshot(real))])
+    frontier_N = torch.tensor([model.number(setup.snapshot(real), legal_A=setup.trial.legal(real))])
     for level in range(_LEVELS):
-        state_N = frontier_N[:width].repeat_interleave(len(setup.actions))
-        action_N = torch.arange(len(setup.actions)).repeat(len(frontier_N[:width]))
+        legal_NA = torch.tensor(model.legal(frontier_N[:width]))
+        if setup.masks:
+            legal_NA &= legal_NA.cumsum(-1) <= ACTIONS_TRIED
+        n_N, action_N = legal_NA.nonzero(as_tuple=True)
+        state_N = frontier_N[n_N]
         key_N = sample_keys(len(state_N), generator=stream(seed, "untouched", level))
         sampled = model.sample(state_N, action_N, key_N=key_N)
         frontier_N = sampled.next_state_N[sampled.discount_N > 0].unique()
@@ -262,7 +283,7 @@ def untouched(setup: Setup, length: int, *, width: int = _WIDTH) -> str:
             "after reset with the same seed two instances go on differently: reset must hand its seed to "
             "super().reset, and draw from self.np_random only"
         )
-    if _live(real, actions[length:]) != _live(twin, actions[length:]):
+    if _live(setup, real, actions[length:]) != _live(setup, twin, actions[length:]):
         raise MissingModel(
             "a real environment goes on differently after a search: it shares something with the model's"
         )
@@ -274,20 +295,20 @@ def check_resets(setup: Setup) -> None:
     of earlier episodes would neither be saved with a training nor be there in an evaluation."""
     seed, keys = setup.number(), []
     for env in (setup.make(), _at_the_end(setup)):
-        reset(env, seed=seed)
+        setup.reset(env, seed=seed)
         keys.append(setup.snapshot(env))
     if not setup.adapter.same_state(*keys):
         raise MissingModel("it remembers something from one episode to the next: leave out the wrapper that does")
 
 
-def _live(env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
+def _live(setup: Setup, env: gymnasium.Env, actions: Sequence[Any]) -> list[bytes]:
     """The bits that an agent sees as it takes these actions; where an episode ends a new one starts."""
     seen = []
     for action in actions:
-        taken = step(env, action)
+        taken = setup.step(env, action)
         seen.append(_bits_of(env, taken))
         if taken.ends:
-            seen.append(_bits_of(env, reset(env)))
+            seen.append(_bits_of(env, setup.reset(env)))
     return seen
 
 

@@ -19,6 +19,7 @@ from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.clocks import trusted_clock
 from pgts_torch.models.environments import Given
 from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, ExactModel, Happened, step_text
+from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.provenance import draws_its_own
 from pgts_torch.models.snapshot_model import SnapshotModel
 from pgts_torch.models.snapshots import SnapshotAdapter
@@ -52,13 +53,15 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         action_repeat: how often an action is taken in one outcome, as in `TensorModel`.
         adapter: takes and restores snapshots. Default: the one for the environment's family.
         observe: what to remember of an observation, for `observations`; an array, or None for nothing. Default: all.
+        masks: how the environment says which actions are legal. The others are never taken: their reward is -inf. Which
+            are legal is known of states that steps have led to, and of roots that it was given for.
         highest_value: an upper bound of v*, where one is known.
         device, dtype: of the answers.
 
     Raises:
         MissingModel: no adapter knows the environment, or a wrapper may change more than single answers.
         PgtsError: it cannot be made, gamma is no discount, its actions cannot be enumerated, or action_repeat is below
-            1, or above 1 beside a highest value.
+            1, or above 1 beside a highest value or action masks.
     """
 
     kind, is_cheap, num_outcomes = "simulator", False, 1
@@ -72,6 +75,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         action_repeat: int = 1,
         adapter: SnapshotAdapter | None = None,
         observe: Callable[[Any], Any] | None = None,
+        masks: ActionMasks | None = None,
         highest_value: float = math.inf,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float64,
@@ -81,7 +85,15 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         check_count("action_repeat", action_repeat)
         if action_repeat > 1 and highest_value < math.inf:
             raise PgtsError(f"highest_value is {highest_value}; under repeated actions no bound of v* stays one")
-        self._stepper = stepper = Stepper(env, gamma=gamma, actions=actions, adapter=adapter, observe=observe)
+        if action_repeat > 1 and masks is not None:
+            raise PgtsError(
+                f"action_repeat is {action_repeat}, and {masks.what} may forbid the second of two equal actions: take "
+                "1, or set action_masks to 'off'"
+            )
+        self._stepper = stepper = Stepper(
+            env, gamma=gamma, actions=actions, adapter=adapter, observe=observe, masks=masks
+        )
+        self._masks = masks
         super().__init__(stepper.name, stepper.space, observe, device)
         self.action_repeat, self.adapter, self.actions = action_repeat, stepper.adapter, stepper.actions
         self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value
@@ -281,7 +293,13 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         if seen.snapshot.cut:
             # It leads to itself under its first action alone, see the class.
             return {action: Step(-math.inf if action else 0.0, 1.0, seen, False) for action in range(self.num_actions)}
-        return self._answers.known(seen.snapshot, repeat, self.reward_range)
+        known = self._answers.known(seen.snapshot, repeat, self.reward_range)
+        if self._masks is None or seen.legal == b"\1" * self.num_actions:
+            return known
+        if seen.legal is None:
+            raise PgtsError(f"{self.name}: which actions are legal in {self.state_text(state)} is not known")
+        illegal = Step(-math.inf, 1.0, seen, False)
+        return {action: illegal for action, legal in enumerate(seen.legal) if not legal} | dict(known)
 
     def _late(self, state: int) -> Any:
         if not self._stepper.observes_late:

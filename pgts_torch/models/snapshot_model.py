@@ -12,7 +12,7 @@ from gymnasium import spaces
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import ModelMismatch, PgtsError
 from pgts_torch.models.adapters_generic import Layered
 from pgts_torch.models.answers import Seen, Step, observed
 from pgts_torch.models.base import Model
@@ -54,12 +54,13 @@ class SnapshotModel(Model):
         self._number.clear()
         self._compared.clear()
 
-    def root(self, env: gymnasium.Env, observation: Any = None) -> int:
+    def root(self, env: gymnasium.Env, observation: Any = None, legal_A: np.ndarray | None = None) -> int:
         """The number of the state that another instance of this environment is in. Nothing of that instance changes.
 
         Args:
             env: wrapped or not; it has been reset.
             observation: its observation there, through its wrappers; needed only by critics that read observations.
+            legal_A: the legal actions there, if there are action masks.
 
         Raises:
             PgtsError: it is another environment, or has another map or other constants than the model's.
@@ -72,16 +73,23 @@ class SnapshotModel(Model):
                     "map or constants differ; make both with the same arguments"
                 )
             self._compared.append(base)
-        return self.number(self.adapter.get_state(base), observation)
+        return self.number(self.adapter.get_state(base), observation, legal_A)
 
-    def roots(self, envs: Iterable[gymnasium.Env], observations: Iterable[Any] | None = None) -> Int[Tensor, "B"]:
+    def roots(
+        self,
+        envs: Iterable[gymnasium.Env],
+        observations: Iterable[Any] | None = None,
+        legal_BA: Iterable[np.ndarray] | None = None,
+    ) -> Int[Tensor, "B"]:
         """`root` of each of several instances."""
-        pairs = zip(envs, itertools.repeat(None) if observations is None else observations, strict=False)
-        return torch.tensor([self.root(*pair) for pair in pairs], dtype=torch.int64, device=self.device)
+        unknown = itertools.repeat(None)
+        each = zip(envs, observations or unknown, unknown if legal_BA is None else legal_BA, strict=False)
+        return torch.tensor([self.root(*one) for one in each], dtype=torch.int64, device=self.device)
 
-    def number(self, snapshot: Snapshot, observation: Any = None) -> int:
-        """The number of a state: a new one if no equal state was met before."""
-        number = self._enter(Seen(snapshot))
+    def number(self, snapshot: Snapshot, observation: Any = None, legal_A: np.ndarray | None = None) -> int:
+        """The number of a state: a new one if no equal state was met before. Where no action is legal the episode was
+        over, and which are legal there is not known."""
+        number = self._enter(Seen(snapshot, legal=legal_A.tobytes() if legal_A is not None and legal_A.any() else None))
         if observation is not None and self._seen[number].observation is None:
             self._seen[number].observation = observed(observation, self._observe)
         return number
@@ -92,10 +100,19 @@ class SnapshotModel(Model):
         if number == self.num_states:
             self.num_states += 1
             self._seen.append(seen)
-        elif (known := self._seen[number]).observation is None:
+            return number
+        known = self._seen[number]
+        if known.observation is None:
             known.observation = seen.observation
         else:
             seen.observation = known.observation
+        if seen.legal is not None and seen.legal != known.legal:
+            if known.legal is not None:
+                raise ModelMismatch(
+                    f"{self.name} allows the actions {_allowed(seen.legal)} where it allowed {_allowed(known.legal)} "
+                    f"before, in {self.state_text(number)}: its action mask must be a function of what get_state gives"
+                )
+            known.legal = seen.legal
         return number
 
     def _entered(self, step: Step) -> tuple[Step, int]:
@@ -105,13 +122,22 @@ class SnapshotModel(Model):
         step.child = self._seen[number]
         return step, number
 
-    def export(self, state_N: Int[Tensor, "N"]) -> list[tuple[Snapshot, Any]]:
-        """The snapshot of each state and what `observe` made of its observation, for `adopt` in another process."""
-        return [(self.snapshot(state), self._seen[state].observation) for state in state_N.tolist()]
+    def export(self, state_N: Int[Tensor, "N"]) -> list[tuple[Any, ...]]:
+        """The snapshot of each state, what `observe` made of its observation, and its legal actions where these are
+        known, for `adopt` in another process."""
+        each = [self._seen[state] for state in self._checked("state", state_N, self.num_states)]
+        return [(seen.snapshot, seen.observation, *([] if seen.legal is None else [seen.legal])) for seen in each]
 
-    def adopt(self, exported: Iterable[tuple[Snapshot, Any]]) -> Int[Tensor, "N"]:
+    def adopt(self, exported: Iterable[tuple[Any, ...]]) -> Int[Tensor, "N"]:
         """The numbers of states that another model of the same environment has exported."""
-        return torch.tensor([self._enter(Seen(*one)) for one in exported], dtype=torch.int64, device=self.device)
+        numbers = [self._enter(Seen(one[0], one[1], legal=one[2] if len(one) > 2 else None)) for one in exported]
+        return torch.tensor(numbers, dtype=torch.int64, device=self.device)
+
+    def legal(self, state_N: Int[Tensor, "N"]) -> Bool[np.ndarray, "N A"]:
+        """The legal actions in each state; all where they are not known, as after an end."""
+        every = b"\1" * self.num_actions
+        rows = [self._seen[state].legal or every for state in self._checked("state", state_N, self.num_states)]
+        return np.frombuffer(b"".join(rows), dtype=bool).reshape(len(rows), self.num_actions)
 
     def snapshot(self, state: int) -> Snapshot:
         """The snapshot behind the number of a state."""
@@ -169,3 +195,7 @@ class SnapshotModel(Model):
     def _check(self, what: str, number: int, count: int) -> None:
         if not 0 <= number < count:
             raise PgtsError(f"{self.name}: {what} {number} does not exist; there are {count}, from 0 on")
+
+
+def _allowed(legal: bytes) -> list[int]:
+    return [action for action, is_legal in enumerate(legal) if is_legal]

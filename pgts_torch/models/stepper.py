@@ -13,6 +13,7 @@ from pgts_torch.models.adapters_generic import Layered, inside
 from pgts_torch.models.answers import Seen, Step, observed
 from pgts_torch.models.chance import Chance
 from pgts_torch.models.environments import EnvSource, Given
+from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.snapshots import SnapshotAdapter, env_name
 from pgts_torch.models.steps import (
@@ -36,7 +37,7 @@ class Stepper:
     steps: how often it was stepped.   chance: its generator, watched.   clock: what `Clock` says of it.
 
     Args:
-        env, gamma, actions, adapter, observe: as in `SimulatorModel`, which says what is raised.
+        env, gamma, actions, adapter, observe, masks: as in `SimulatorModel`, which says what is raised.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class Stepper:
         actions: Sequence[Any] | None,
         adapter: SnapshotAdapter | None,
         observe: Callable[[Any], Any] | None,
+        masks: ActionMasks | None = None,
     ) -> None:
         self.made = EnvSource.of(env).make_one()
         self.name = env_name(self.made)
@@ -55,7 +57,7 @@ class Stepper:
         # Wrappers that belong to the instance itself are no transforms of what it gives.
         self.transforms = Transforms() if isinstance(self.adapter, Layered) else transforms_of(self.made)
         self.space = self.made.observation_space
-        self._pays, self._observe = bool(self.transforms.rewards), observe
+        self._pays, self._observe, self._masks = bool(self.transforms.rewards), observe, masks
         # Actions as the outermost wrapper takes them, and as the bare instance does.
         outer = all_actions(self.made.action_space) if actions is None else actions
         self.actions = [self.transforms.action(action) for action in outer]
@@ -126,6 +128,8 @@ class Stepper:
         if truncated and discount:
             reached = reached._replace(cut=True)
         seen = Seen(reached, self._kept(observation) if shown else None)
+        if self._masks is not None:
+            seen.legal = self._legal(info, terminated, truncated)
         return Step(total, discount, seen, random, reading if repeat == 1 else None)
 
     def follow_each(
@@ -150,7 +154,7 @@ class Stepper:
             set_state(env, data)
             if random := is_random(env, taken):
                 self.chance.seed(0)
-            observation, reward, terminated, truncated, _ = step(taken)
+            observation, reward, terminated, truncated, info = step(taken)
             self.steps += 1
             reading = None if clock is None else clock.reading(reward, truncated)
             if not (as_paid and type(reward) is float and -LARGEST_REWARD <= reward <= LARGEST_REWARD):
@@ -166,7 +170,10 @@ class Stepper:
             reached = get_state(env)
             if truncated and gamma and not terminated:
                 reached = reached._replace(cut=True)
-            found.append(Step(reward, 0.0 if terminated else gamma, Seen(reached, kept), random, reading))
+            seen = Seen(reached, kept)
+            if self._masks is not None:
+                seen.legal = self._legal(info, terminated, truncated)
+            found.append(Step(reward, 0.0 if terminated else gamma, seen, random, reading))
         if rows is not None and not np.isfinite(rows).all():
             first = int(np.flatnonzero(~np.isfinite(rows).reshape(len(rows), -1).all(1))[0])
             del found[first:]
@@ -189,7 +196,14 @@ class Stepper:
         reached = self.clock.at(seen.snapshot, count)
         if count >= reading.limit and step.discount:
             reached = reached._replace(cut=True)
-        return Step(reward, step.discount, Seen(reached, seen.observation, seen.like or seen), step.random, reading)
+        now = Seen(reached, seen.observation, seen.like or seen, seen.legal)
+        return Step(reward, step.discount, now, step.random, reading)
+
+    def _legal(self, info: Any, terminated: bool, truncated: bool) -> bytes | None:
+        """The legal actions after a step, as `Seen` has them."""
+        assert self._masks is not None
+        legal_A = self._masks.after(self.made, info, terminated, truncated)
+        return legal_A.tobytes() if legal_A.any() else None
 
     def _reward(self, paid: Any, rewards: RewardRange | None) -> float:
         """A reward outside of the wrappers; what is not finite is found before it is transformed."""

@@ -1,17 +1,20 @@
 """Short trials of an environment: random walks in which an error of its code is told from one of ours."""
 
+import contextlib
 import itertools
 import time
+import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import gymnasium
 import numpy as np
+from jaxtyping import Bool
 
 from pgts_torch.errors import Failed, ModelMismatch, PgtsError, text_of
 from pgts_torch.models.exact_model import CONTRADICTED, ExactModel, Happened
+from pgts_torch.models.masks import ActionMasks, masks_in
 from pgts_torch.models.steps import discount_of, names_discounts, number_of
 
 SECONDS = 0.3
@@ -23,7 +26,7 @@ _LEAST_EPISODES = 3
 _COMPARED_STEPS, _LONGEST_EPISODE = 400, 40
 
 
-@contextmanager
+@contextlib.contextmanager
 def environment_code() -> Iterator[None]:
     """Whatever the code of an environment raises in this context is `Failed`, so that it is told from an error of our
     own code; Ctrl-C is passed on."""
@@ -54,8 +57,8 @@ class Taken(NamedTuple):
 def reset(env: gymnasium.Env, *, seed: int | None = None) -> Taken:
     """Reset an environment; Failed if it raises, or returns something else than two values."""
     with environment_code():
-        observation, _ = env.reset(seed=seed)
-        return Taken(None, observation)
+        observation, info = env.reset(seed=seed)
+        return Taken(None, observation, info=info if isinstance(info, Mapping) else MappingProxyType({}))
 
 
 def step(env: gymnasium.Env, action: Any) -> Taken:
@@ -63,6 +66,51 @@ def step(env: gymnasium.Env, action: Any) -> Taken:
     with environment_code():
         observation, reward, terminated, truncated, info = env.step(action)
         return Taken(action, observation, reward, bool(terminated), bool(truncated), dict(info))
+
+
+@final
+class Trial:
+    """Resets and steps of environments of one kind, in which an action is replaced by a legal one where it is known to
+    be none.
+
+    Args:
+        actions: those that are taken.
+        masks: how action masks say which of them are legal; None: all are.
+    """
+
+    def __init__(self, actions: Sequence[Any], masks: ActionMasks | None) -> None:
+        self._actions, self.masks = actions, masks
+        self._info = weakref.WeakKeyDictionary[gymnasium.Env, Mapping[str, Any]]()
+
+    def reset(self, env: gymnasium.Env, *, seed: int | None = None) -> Taken:
+        taken = reset(env, seed=seed)
+        self._info[env] = taken.info
+        return taken
+
+    def step(self, env: gymnasium.Env, action: Any) -> Taken:
+        taken = step(env, action if self.masks is None else self._legal(env, action))
+        self._info[env] = taken.info
+        return taken
+
+    def forget(self, env: gymnasium.Env) -> None:
+        """Its state is another one now."""
+        self._info.pop(env, None)
+
+    def legal(self, env: gymnasium.Env) -> Bool[np.ndarray, "A"] | None:
+        """The legal actions in the present state; None where that is not known."""
+        if self.masks is None:
+            return None
+        with environment_code(), contextlib.suppress(PgtsError):
+            return self.masks.of(env, self._info.get(env, {}))
+        return None
+
+    def _legal(self, env: gymnasium.Env, action: Any) -> Any:
+        legal_A = self.legal(env)
+        if legal_A is None:
+            return action
+        place = next(k for k, one in enumerate(self._actions) if np.array_equal(one, action))
+        (legal,) = legal_A.nonzero()
+        return action if legal_A[place] else self._actions[int(legal[place % len(legal)])]
 
 
 def random_walk(
@@ -73,18 +121,26 @@ def random_walk(
     steps: int,
     longest: int,
     seconds: float = SECONDS,
+    any_action: bool = False,
 ) -> Iterator[Taken]:
     """Resets and steps of random episodes: three, and more until there are `steps` steps or the time is over.
 
     An episode is ended after `longest` steps, and after its next step once the time is over.
+
+    Args:
+        any_action: whether actions are taken that are not legal by the environment's action masks.
     """
-    until, taken = time.monotonic() + seconds, 0
+    until, taken, trial = time.monotonic() + seconds, 0, Trial(actions, None)
     for episode in itertools.count():
         if episode >= _LEAST_EPISODES and (taken >= steps or time.monotonic() > until):
             return
-        yield reset(env, seed=int(generator.integers(2**31)))
+        now = trial.reset(env, seed=int(generator.integers(2**31)))
+        if episode == 0 and not any_action:
+            with contextlib.suppress(PgtsError):
+                trial.masks = masks_in(env, actions, now.info)
+        yield now
         for _ in range(longest):
-            now = step(env, actions[int(generator.integers(len(actions)))])
+            now = trial.step(env, actions[int(generator.integers(len(actions)))])
             taken += 1
             yield now
             if now.ends or time.monotonic() > until:
@@ -99,6 +155,7 @@ def compare(
     *,
     gamma: float,
     seconds: float = SECONDS,
+    any_action: bool = False,
 ) -> int:
     """Compare a random walk with a model that claims to be the environment (`ExactModel.outcome_of`).
 
@@ -107,6 +164,7 @@ def compare(
         env: an instance for this alone, in the wrappers that the model is meant for, with actions from 0 on.
         state_of: the state of the model in which a step or a reset has left the environment; it may raise too.
         gamma: discount of a step that names none.
+        any_action: as in `random_walk`.
 
     Returns:
         How many steps were compared. An error of the environment ends the walk: it is no contradiction, and reported
@@ -118,7 +176,13 @@ def compare(
     rows, state, named = list[tuple[Any, ...]](), 0, names_discounts(env)
     try:
         for taken in random_walk(
-            env, range(model.num_actions), generator, steps=_COMPARED_STEPS, longest=_LONGEST_EPISODE, seconds=seconds
+            env,
+            range(model.num_actions),
+            generator,
+            steps=_COMPARED_STEPS,
+            longest=_LONGEST_EPISODE,
+            seconds=seconds,
+            any_action=any_action,
         ):
             before, state = state, state_of(taken)
             if taken.action is not None:

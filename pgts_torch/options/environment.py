@@ -32,6 +32,11 @@ class Observed(Part):
     """Which axis of images has the channels, or the stacked frames; null: as their shape tells, and it is an error
     where that does not."""
 
+    action_masks: Literal["auto", "on", "off"] = "auto"
+    """Whether actions are never taken that are not legal by action_masks() of the environment or info["action_mask"].
+    off: both are ignored. on: it must have one. auto: as on, where it has one; but info["action_mask"] is ignored
+    beside a table that says what every action does (Taxi)."""
+
 
 class Env(Observed, Made):
     """The environment."""

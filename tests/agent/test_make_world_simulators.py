@@ -265,7 +265,7 @@ def test_an_error_of_the_environment_in_a_trial_is_left_to_the_training():
         ("restoring.sample_keys", Walk),
         ("restoring.bits", Walk),
         ("attributes.different", InDict),
-        ("wrappers.fingerprint", lambda: wrappers.FlattenObservation(Walk())),
+        ("wrapper_trial.fingerprint", lambda: wrappers.FlattenObservation(Walk())),
         ("trial.number_of", lambda: gymnasium.make("CartPole-v1")),
     ],
 )
