@@ -1,24 +1,23 @@
-"""Gymnasium's classic control written in torch: CartPole, Acrobot, MountainCar and Pendulum, many states at a time.
+"""Gymnasium's classic control: CartPole, Acrobot, MountainCar and Pendulum, many states at a time.
 
-The arithmetic is Gymnasium's, operation by operation. On the CPU in float64 rewards, ends and states are those of the
-environment bit for bit (sines, cosines and powers by numpy, as there); on other devices, and where numpy's cosine is
+The arithmetic is Gymnasium's, operation by operation, by numpy on the CPU and by torch on other devices. On the CPU in
+float64 rewards, ends and states are those of the environment bit for bit; on other devices, and where numpy's cosine is
 not that of Python's `math`, which MountainCar uses, up to the last bits. The observations are float32 roundings of
 states and no part of the dynamics. After an end Gymnasium leaves undefined what follows; here an ended state is stepped
 like any other.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, final
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv, MountainCarEnv, PendulumEnv
 from jaxtyping import Float
 from torch import Tensor
 
-from pgts_torch.models.dynamics import DynamicsModel
+from pgts_torch.models.dynamics import Arrays, DynamicsModel
 
 
 @final
@@ -41,18 +40,21 @@ class CartPole(DynamicsModel):
     def _reward_range(self) -> tuple[float, float]:
         return (-1.0, 0.0) if self._c._sutton_barto_reward else (0.0, 1.0)
 
-    def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
+    def _move(self, xp: Any, state: Arrays, effect: Arrays) -> tuple[Any, Any, Arrays]:
         (x, x_dot, theta, theta_dot), (force,), c = state, effect, self._c
-        cos, sin = _cos(theta), _sin(theta)
-        push = (force + c.polemass_length * theta_dot.square() * sin) / c.total_mass
-        theta_acc = (c.gravity * sin - cos * push) / (c.length * (4.0 / 3.0 - c.masspole * cos.square() / c.total_mass))
+        cos, sin = xp.cos(theta), xp.sin(theta)
+        push = (force + c.polemass_length * xp.square(theta_dot) * sin) / c.total_mass
+        lever = c.length * (4.0 / 3.0 - c.masspole * xp.square(cos) / c.total_mass)
+        theta_acc = (c.gravity * sin - cos * push) / lever
         x_acc = push - c.polemass_length * theta_acc * cos / c.total_mass
         before, after = (x_dot, theta_dot), (x_dot + c.tau * x_acc, theta_dot + c.tau * theta_acc)
         # Euler's method moves by the old velocities, the semi-implicit one by the new ones.
         by_x, by_theta = before if c.kinematics_integrator == "euler" else after
         x, theta, (x_dot, theta_dot) = x + c.tau * by_x, theta + c.tau * by_theta, after
-        terminated = (x.abs() > c.x_threshold) | (theta.abs() > c.theta_threshold_radians)
-        reward = -terminated.to(self.dtype) if c._sutton_barto_reward else torch.ones_like(x)
+        terminated = (abs(x) > c.x_threshold) | (abs(theta) > c.theta_threshold_radians)
+        reward = xp.ones_like(x)
+        if c._sutton_barto_reward:
+            reward = -xp.where(terminated, reward, 0.0)
         return reward, terminated, (x, x_dot, theta, theta_dot)
 
 
@@ -76,8 +78,8 @@ class Acrobot(DynamicsModel):
 
     def observe(self, state_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N O"]:
         """Cosine and sine of the angles, and the velocities."""
-        first, second, *speeds = state_ND.unbind(-1)
-        return torch.stack([_cos(first), _sin(first), _cos(second), _sin(second), *speeds], -1).float()
+        xp, (first, second, *speeds) = self._columns(state_ND)
+        return self._rows([xp.cos(first), xp.sin(first), xp.cos(second), xp.sin(second), *speeds]).float()
 
     def _effect(self, action: Any) -> tuple[float, ...]:
         return (self._c.AVAIL_TORQUE[action],)
@@ -85,39 +87,39 @@ class Acrobot(DynamicsModel):
     def _reward_range(self) -> tuple[float, float]:
         return -1.0, 0.0
 
-    def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
-        start_4N, (torque,), c = torch.stack(list(state)), effect, self._c
-        k1 = self._slope(start_4N, torque)
-        k2 = self._slope(start_4N + c.dt / 2.0 * k1, torque)
-        k3 = self._slope(start_4N + c.dt / 2.0 * k2, torque)
-        k4 = self._slope(start_4N + c.dt * k3, torque)
+    def _move(self, xp: Any, state: Arrays, effect: Arrays) -> tuple[Any, Any, Arrays]:
+        start_4N, (torque,), c = xp.stack(list(state)), effect, self._c
+        k1 = self._slope(xp, start_4N, torque)
+        k2 = self._slope(xp, start_4N + c.dt / 2.0 * k1, torque)
+        k3 = self._slope(xp, start_4N + c.dt / 2.0 * k2, torque)
+        k4 = self._slope(xp, start_4N + c.dt * k3, torque)
         first, second, speed1, speed2 = start_4N + c.dt / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
-        first, second = _wrapped(first), _wrapped(second)
-        speed1, speed2 = speed1.clamp(-c.MAX_VEL_1, c.MAX_VEL_1), speed2.clamp(-c.MAX_VEL_2, c.MAX_VEL_2)
-        terminated = -_cos(first) - _cos(second + first) > 1.0
-        return terminated.to(self.dtype) - 1.0, terminated, (first, second, speed1, speed2)
+        first, second = _wrapped(xp, first), _wrapped(xp, second)
+        speed1, speed2 = xp.clip(speed1, -c.MAX_VEL_1, c.MAX_VEL_1), xp.clip(speed2, -c.MAX_VEL_2, c.MAX_VEL_2)
+        terminated = -xp.cos(first) - xp.cos(second + first) > 1.0
+        return xp.where(terminated, 0.0, -xp.ones_like(first)), terminated, (first, second, speed1, speed2)
 
-    def _slope(self, state_4N: Tensor, torque: Tensor) -> Tensor:
+    def _slope(self, xp: Any, state_4N: Any, torque: Any) -> Any:
         """The time derivative of the state."""
         c, g = self._c, 9.8
         m1, m2, inertia = c.LINK_MASS_1, c.LINK_MASS_2, c.LINK_MOI
         l1, lc1, lc2 = c.LINK_LENGTH_1, c.LINK_COM_POS_1, c.LINK_COM_POS_2
         first, second, speed1, speed2 = state_4N
-        cos2, sin2 = _cos(second), _sin(second)
+        cos2, sin2 = xp.cos(second), xp.sin(second)
         d1 = m1 * lc1**2 + m2 * (l1**2 + lc2**2 + 2 * l1 * lc2 * cos2) + inertia + inertia
         d2 = m2 * (lc2**2 + l1 * lc2 * cos2) + inertia
-        phi2 = m2 * lc2 * g * _cos(first + second - math.pi / 2.0)
+        phi2 = m2 * lc2 * g * xp.cos(first + second - math.pi / 2.0)
         phi1 = (
-            -m2 * l1 * lc2 * _squared(speed2) * sin2
+            -m2 * l1 * lc2 * _squared(xp, speed2) * sin2
             - 2 * m2 * l1 * lc2 * speed2 * speed1 * sin2
-            + (m1 * lc1 + m2 * l1) * g * _cos(first - math.pi / 2)
+            + (m1 * lc1 + m2 * l1) * g * xp.cos(first - math.pi / 2)
             + phi2
         )
         pull = torque + d2 / d1 * phi1
         if c.book_or_nips != "nips":
-            pull = pull - m2 * l1 * lc2 * _squared(speed1) * sin2
-        acc2 = (pull - phi2) / (m2 * lc2**2 + inertia - _squared(d2) / d1)
-        return torch.stack([speed1, speed2, -(d2 * acc2 + phi1) / d1, acc2])
+            pull = pull - m2 * l1 * lc2 * _squared(xp, speed1) * sin2
+        acc2 = (pull - phi2) / (m2 * lc2**2 + inertia - _squared(xp, d2) / d1)
+        return xp.stack([speed1, speed2, -(d2 * acc2 + phi1) / d1, acc2])
 
 
 @final
@@ -136,14 +138,14 @@ class MountainCar(DynamicsModel):
     def _reward_range(self) -> tuple[float, float]:
         return -1.0, 0.0
 
-    def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
+    def _move(self, xp: Any, state: Arrays, effect: Arrays) -> tuple[Any, Any, Arrays]:
         (position, velocity), (push,), c = state, effect, self._c
-        velocity = velocity + (push + _cos(3 * position) * -c.gravity)
-        velocity = velocity.clamp(-c.max_speed, c.max_speed)
-        position = (position + velocity).clamp(c.min_position, c.max_position)
-        velocity = velocity.masked_fill((position == c.min_position) & (velocity < 0), 0.0)
+        velocity = velocity + (push + xp.cos(3 * position) * -c.gravity)
+        velocity = xp.clip(velocity, -c.max_speed, c.max_speed)
+        position = xp.clip(position + velocity, c.min_position, c.max_position)
+        velocity = xp.where((position == c.min_position) & (velocity < 0), 0.0, velocity)
         terminated = (position >= c.goal_position) & (velocity >= c.goal_velocity)
-        return -torch.ones_like(position), terminated, (position, velocity)
+        return -xp.ones_like(position), terminated, (position, velocity)
 
 
 @final
@@ -155,8 +157,8 @@ class Pendulum(DynamicsModel):
 
     def observe(self, state_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N O"]:
         """Cosine and sine of the angle, and the velocity."""
-        angle, speed = state_ND.unbind(-1)
-        return torch.stack([_cos(angle), _sin(angle), speed], -1).float()
+        xp, (angle, speed) = self._columns(state_ND)
+        return self._rows([xp.cos(angle), xp.sin(angle), speed]).float()
 
     def _effect(self, action: Any) -> tuple[float, ...]:
         c = self._c
@@ -167,13 +169,13 @@ class Pendulum(DynamicsModel):
         dearest = float(self._effect_AE[:, 1].max())
         return -(math.pi**2 + 0.1 * self._c.max_speed**2 + dearest), 0.0
 
-    def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
+    def _move(self, xp: Any, state: Arrays, effect: Arrays) -> tuple[Any, Any, Arrays]:
         (angle, speed), (push, price), c = state, effect, self._c
-        upright = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
-        cost = _squared(upright) + 0.1 * _squared(speed) + price
-        speed = speed + (3 * c.g / (2 * c.l) * _sin(angle) + push) * c.dt
-        speed = speed.clamp(-c.max_speed, c.max_speed)
-        return -cost, torch.zeros_like(cost, dtype=torch.bool), (angle + speed * c.dt, speed)
+        upright = xp.remainder(angle + math.pi, 2 * math.pi) - math.pi
+        cost = _squared(xp, upright) + 0.1 * _squared(xp, speed) + price
+        speed = speed + (3 * c.g / (2 * c.l) * xp.sin(angle) + push) * c.dt
+        speed = xp.clip(speed, -c.max_speed, c.max_speed)
+        return -cost, xp.zeros_like(cost, dtype=bool), (angle + speed * c.dt, speed)
 
 
 CLASSIC: tuple[type[DynamicsModel], ...] = (CartPole, Acrobot, MountainCar, Pendulum)
@@ -184,23 +186,13 @@ def dynamics_of(env: gymnasium.Env) -> Callable[..., DynamicsModel] | None:
     return next((model for model in CLASSIC if not model.obstacle(env)), None)
 
 
-def _wrapped(angle: Tensor) -> Tensor:
+def _wrapped(xp: Any, angle: Any) -> Any:
     """The angle between -pi and pi."""
     turn = 2 * math.pi
-    angle = angle - turn * ((angle - math.pi) / turn).ceil().clamp(min=0)
-    return angle + turn * ((-math.pi - angle) / turn).ceil().clamp(min=0)
+    angle = angle - turn * xp.clip(xp.ceil((angle - math.pi) / turn), 0, None)
+    return angle + turn * xp.clip(xp.ceil((-math.pi - angle) / turn), 0, None)
 
 
-def _sin(x: Tensor) -> Tensor:
-    """On the CPU numpy's, whose last bits are those of the environments."""
-    return torch.from_numpy(np.sin(x.numpy())) if x.device.type == "cpu" else x.sin()
-
-
-def _cos(x: Tensor) -> Tensor:
-    return torch.from_numpy(np.cos(x.numpy())) if x.device.type == "cpu" else x.cos()
-
-
-def _squared(x: Tensor) -> Tensor:
+def _squared(xp: Any, x: Any) -> Any:
     """x**2 as numpy has it for single numbers: by a power, one time in a thousand one bit off the product."""
-    exact = x.device.type == "cpu" and x.dtype == torch.float64
-    return torch.from_numpy(np.float_power(x.numpy(), 2.0)) if exact else x.square()
+    return np.float_power(x, 2.0) if xp is np and x.dtype == np.float64 else xp.square(x)

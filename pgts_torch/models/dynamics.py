@@ -1,4 +1,4 @@
-"""Dynamics of one class of environments written in torch, with the constants of an instance of it."""
+"""Dynamics of one class of environments written for arrays, with the constants of an instance of it."""
 
 import math
 from abc import abstractmethod
@@ -23,6 +23,9 @@ from pgts_torch.models.state_index import Merge
 from pgts_torch.models.steps import number_of
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.models.wrappers import transforms_of
+
+Arrays = Sequence[Any]
+"""Columns [N], of numpy or of torch."""
 
 
 class DynamicsModel(TensorModel, ExactModel):
@@ -68,7 +71,11 @@ class DynamicsModel(TensorModel, ExactModel):
         actions, self.transforms = base_actions(env), transforms_of(env)
         options: dict[str, Any] = {"state_dtype": dtype, "dtype": dtype, "device": device, "merge": merge}
         super().__init__(self.size, len(actions), action_repeat=action_repeat, **options)
-        self._c = SimpleNamespace(**{name: getattr(env.unwrapped, name) for name in self.constants})
+        # As numbers of Python, which leave arrays in their dtype.
+        constants = {name: getattr(env.unwrapped, name) for name in self.constants}
+        self._c = SimpleNamespace(
+            **{name: x.item() if isinstance(x, np.generic) else x for name, x in constants.items()}
+        )
         self._effect_AE = torch.tensor([self._effect(action) for action in actions], dtype=dtype, device=self.device)
         if action_repeat == 1:  # an operator of repeated actions gives no upper bound of v*
             self.lowest_value, self.highest_value = value_range(self._transformed_range(), gamma)
@@ -127,14 +134,27 @@ class DynamicsModel(TensorModel, ExactModel):
         self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
         """Reward, discount (0 where the episode terminates) and next state."""
-        effect = self._effect_AE[action_N].unbind(-1)
-        reward_N, terminated_N, following = self._move(state_ND.unbind(-1), effect)
+        xp, state = self._columns(state_ND)
+        _, effect = self._columns(self._effect_AE.index_select(0, action_N))
+        paid, ends, following = self._move(xp, state, effect)
+        reward_N, terminated_N = map(torch.as_tensor, (paid, ends))
         if self.transforms.rewards:
             distinct, index_N = reward_N.unique(return_inverse=True)
-            paid = [number_of("reward", self.transforms.reward(reward)) for reward in distinct.tolist()]
-            reward_N = torch.tensor(paid, dtype=self.dtype, device=self.device)[index_N]
+            transformed = [number_of("reward", self.transforms.reward(reward)) for reward in distinct.tolist()]
+            reward_N = torch.tensor(transformed, dtype=self.dtype, device=self.device)[index_N]
         discount_N = torch.full_like(reward_N, self.gamma).masked_fill_(terminated_N, 0.0)
-        return reward_N, discount_N, torch.stack(list(following), -1)
+        return reward_N, discount_N, self._rows(following)
+
+    def _columns(self, x_ND: Float[Tensor, "N D"]) -> tuple[Any, Arrays]:
+        """The library that computes with the columns of a table, and these."""
+        if x_ND.device.type == "cpu":
+            return np, np.ascontiguousarray(x_ND.numpy().T)  # type: ignore[return-value]
+        return torch, x_ND.unbind(-1)
+
+    def _rows(self, columns: Arrays) -> Float[Tensor, "N D"]:
+        """A table of these columns."""
+        on_host = isinstance(columns[0], np.ndarray)
+        return torch.from_numpy(np.stack(columns, -1)) if on_host else torch.stack(list(columns), -1)
 
     @abstractmethod
     def observe(self, state_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N O"]:
@@ -149,8 +169,12 @@ class DynamicsModel(TensorModel, ExactModel):
         """No reward is lower or higher."""
 
     @abstractmethod
-    def _move(self, state: Sequence[Tensor], effect: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor]]:
-        """Reward, whether the episode terminates, and the columns of the next state, from those of the states."""
+    def _move(self, xp: Any, state: Arrays, effect: Arrays) -> tuple[Any, Any, Arrays]:
+        """Reward, whether the episode terminates, and the columns of the next state, from those of the states.
+
+        Args:
+            xp: numpy, which for few numbers takes a third of what torch does, or torch: the library of the arrays.
+        """
 
     def _transformed_range(self) -> tuple[float, float]:
         """No reward is lower or higher once wrappers have transformed it."""

@@ -104,6 +104,25 @@ def test_every_step_is_gymnasiums(variant, device):
         )
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_numpy_and_torch_take_the_same_steps_in_the_dtype_of_the_model(variant, dtype):
+    env = VARIANTS[variant]()
+    for name, value in vars(env.unwrapped).items():
+        if type(value) is float:  # constants of numpy's own type leave arrays as they are, too
+            setattr(env.unwrapped, name, np.float64(value))
+    model = dynamics_of(env)(env, gamma=GAMMA, dtype=dtype)
+    state, action, *_ = walk(env, 300, hold=7)
+    state, effect = state.to(dtype).T, model._effect_AE[action].T
+    ours = model._move(np, state.numpy(), effect.numpy())
+    plain = model._move(torch, state, effect)
+    within = 1e-12 if dtype == torch.float64 else 1e-4
+    for x, y in [(ours[0], plain[0]), *zip(ours[2], plain[2], strict=True)]:
+        torch.testing.assert_close(torch.from_numpy(x), y, rtol=within, atol=within)
+        assert y.dtype == dtype
+    assert torch.equal(torch.from_numpy(ours[1]), plain[1])
+
+
 OTHER = {
     "CartPole-v1": {"gravity": 9.81},
     "Acrobot-v1": {"LINK_MOI": 1.001},
