@@ -13,6 +13,7 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv, MountainCarEnv, PendulumEnv
 from jaxtyping import Float
 from torch import Tensor
@@ -56,6 +57,19 @@ class CartPole(DynamicsModel):
         if c._sutton_barto_reward:
             reward = -xp.where(terminated, reward, 0.0)
         return reward, terminated, (x, x_dot, theta, theta_dot)
+
+    def _step_compiled(self, state_ND: np.ndarray, action_N: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+        from pgts_torch.models import classic_kernels
+
+        c, angle_N = self._c, state_ND[:, 2]
+        numbers = c.gravity, c.masspole, c.total_mass, c.length, c.polemass_length, c.tau
+        constants = tuple(map(float, (*numbers, c.theta_threshold_radians, c.x_threshold)))
+        rules = constants, c.kinematics_integrator == "euler", bool(c._sutton_barto_reward), float(self.gamma)
+        answer = np.empty(len(state_ND)), np.empty(len(state_ND)), np.empty(state_ND.shape)
+        force_A = self._effect_AE.numpy()[:, 0]
+        classic_kernels.cart_pole(state_ND, action_N, force_A, np.cos(angle_N), np.sin(angle_N), *rules, *answer)
+        reward_N, discount_N, next_ND = map(torch.from_numpy, answer)
+        return reward_N, discount_N, next_ND
 
 
 @final

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.compiled import pays
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.actions import base_actions
 from pgts_torch.models.exact_model import ExactModel
@@ -134,16 +135,27 @@ class DynamicsModel(TensorModel, ExactModel):
         self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
         """Reward, discount (0 where the episode terminates) and next state."""
-        xp, state = self._columns(state_ND)
-        _, effect = self._columns(self._effect_AE.index_select(0, action_N))
-        paid, ends, following = self._move(xp, state, effect)
-        reward_N, terminated_N = map(torch.as_tensor, (paid, ends))
+        loops = state_ND.dtype == torch.float64 and pays(self.device, state_ND.shape[0])
+        answer = self._step_compiled(state_ND.contiguous().numpy(), action_N.numpy()) if loops else None
+        reward_N, discount_N, next_ND = self._step(state_ND, action_N) if answer is None else answer
         if self.transforms.rewards:
             distinct, index_N = reward_N.unique(return_inverse=True)
             transformed = [number_of("reward", self.transforms.reward(reward)) for reward in distinct.tolist()]
             reward_N = torch.tensor(transformed, dtype=self.dtype, device=self.device)[index_N]
+        return reward_N, discount_N, next_ND
+
+    def _step(self, state_ND: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As `step`, with the reward of the bare environment."""
+        xp, state = self._columns(state_ND)
+        _, effect = self._columns(self._effect_AE.index_select(0, action_N))
+        paid, ends, following = self._move(xp, state, effect)
+        reward_N, terminated_N = map(torch.as_tensor, (paid, ends))
         discount_N = torch.full_like(reward_N, self.gamma).masked_fill_(terminated_N, 0.0)
         return reward_N, discount_N, self._rows(following)
+
+    def _step_compiled(self, state_ND: np.ndarray, action_N: np.ndarray) -> tuple[Tensor, Tensor, Tensor] | None:
+        """The same by a loop in float64; None where there is none."""
+        return None
 
     def _columns(self, x_ND: Float[Tensor, "N D"]) -> tuple[Any, Arrays]:
         """The library that computes with the columns of a table, and these."""

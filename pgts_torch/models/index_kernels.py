@@ -9,6 +9,9 @@ _FACTORS = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _27, _30, _31 = np.uint64(27), np.uint64(30), np.uint64(31)
 """Of SplitMix64, as in `seeding`. All numbers are unsigned: with others numba makes them floats."""
 
+ALL_COUNT, SOME_COUNT, OFF = range(3)
+"""What `survey` may say."""
+
 _EMPTY = np.iinfo(np.int64).max
 """As in `state_index`."""
 
@@ -20,6 +23,38 @@ def _mixed(key):  # type: ignore[no-untyped-def]
     x = (x ^ (x >> _30)) * _FACTORS[0]
     x = (x ^ (x >> _27)) * _FACTORS[1]
     return x ^ (x >> _31)
+
+
+@jit
+def survey(reward_N, discount_N, next_ND):  # type: ignore[no-untyped-def]
+    """`ALL_COUNT` where these steps are as they must be, and all of their next states count; `OFF` where something
+    seems to be off."""
+    answer = ALL_COUNT
+    for n in range(len(reward_N)):
+        if not 0 <= discount_N[n] <= 1:
+            return OFF
+        if discount_N[n] > 0 and reward_N[n] > -np.inf:
+            for d in range(next_ND.shape[1]):
+                if next_ND[n, d] != next_ND[n, d]:
+                    return OFF
+        else:
+            answer = SOME_COUNT
+    return answer
+
+
+@jit
+def place(bits_RD, given_ND, first, minus_zero, infinity):  # type: ignore[no-untyped-def]
+    """Write rows from the row `first` on, with 0 in place of the bits `minus_zero`. The first row that holds what is
+    above `infinity`, and so is not a number; -1 if there is none."""
+    N, D = given_ND.shape
+    off = -1
+    for n in range(N - 1, -1, -1):
+        for d in range(D):
+            bits = given_ND[n, d]
+            if bits & ~minus_zero > infinity:
+                off = n
+            bits_RD[first + n, d] = 0 if bits == minus_zero else bits
+    return off
 
 
 @jit
@@ -64,21 +99,23 @@ def enter(bits_RD, slots, number_L, hash_L):  # type: ignore[no-untyped-def]
 
 
 @jit
-def number(bits_RD, slots, first, hash_N, looks_N, number_N):  # type: ignore[no-untyped-def]
-    """Number the rows from the row `first` on: those that `looks_N` marks (all if it is empty) are looked up, and
-    entered where they are new. New rows move together behind `first`. How many are new, and how many are entered."""
-    count, entered, all_look = first, 0, len(looks_N) == 0
+def number(bits_RD, slots, hash_N, number_N, first, sample_bits):  # type: ignore[no-untyped-def]
+    """Number the rows from the row `first` on: those whose hash begins with so many zeros are looked up, and entered
+    where they are new. New rows move together behind `first`. How many are new, are looked up, and are entered."""
+    count, looked_up, entered = first, 0, 0
     for i in range(len(number_N)):
         n = first + i
-        if all_look or looks_N[i]:
+        if sample_bits == 0 or hash_N[i] >> (64 - sample_bits) == 0:
+            looked_up += 1
             slot = _slot(bits_RD, slots, n, hash_N[i])
             if slots[slot] != _EMPTY:
                 number_N[i] = slots[slot]
                 continue
             slots[slot] = count
             entered += 1
-        for d in range(bits_RD.shape[1]):
-            bits_RD[count, d] = bits_RD[n, d]
+        if count < n:
+            for d in range(bits_RD.shape[1]):
+                bits_RD[count, d] = bits_RD[n, d]
         number_N[i] = count
         count += 1
-    return count - first, entered
+    return count - first, looked_up, entered

@@ -1,8 +1,8 @@
 """Numbers for states that are vectors: equal rows get the same number, also where hashes collide."""
 
-from typing import Literal, final
+import functools
+from typing import Any, Literal, final
 
-import numpy as np
 import torch
 from jaxtyping import Int, Num
 from torch import Tensor
@@ -32,8 +32,12 @@ _PAYS, _PAYS_AGAIN = 1.01, 1.05
 _SAMPLE_BITS = 4
 """While lookups are given up, rows whose hash begins with so many zeros are still looked up, as a sample."""
 
-_ALL = np.empty(0, np.bool_)
-"""No marks: all rows are looked up."""
+
+@functools.cache
+def _kernels() -> Any:
+    from pgts_torch.models import index_kernels  # numba is imported with it
+
+    return index_kernels
 
 
 def hash_rows(bits_ND: Int[Tensor, "N D"]) -> Int[Tensor, "N"]:
@@ -42,10 +46,8 @@ def hash_rows(bits_ND: Int[Tensor, "N D"]) -> Int[Tensor, "N"]:
     Multilinear hashing (Lemire and Kaser 2014) with SplitMix64 as finaliser: one round however long the row.
     """
     if can_compile(bits_ND.device):
-        from pgts_torch.models import index_kernels
-
-        hash_N = torch.empty(len(bits_ND), dtype=torch.int64)
-        index_kernels.hash_rows(bits_ND.contiguous().numpy(), hash_N.numpy())
+        hash_N = torch.empty(bits_ND.shape[0], dtype=torch.int64)
+        _kernels().hash_rows(bits_ND.contiguous().numpy(), hash_N.numpy())
         return hash_N
     # Odd factors, so that no bit of a number is lost modulo 2**64.
     odd_D = mix(torch.arange(bits_ND.shape[1], device=bits_ND.device), 0) | 1
@@ -86,8 +88,16 @@ class StateIndex:
             raise PgtsError(f"merge is {merge!r}; it must be 'auto', True or False")
         self._merge = merge
         with torch.inference_mode(False):
-            # _rows: the row of each number, with room for more. _slots: the table, numbers or _EMPTY.
+            # _rows: the row of each number, with room for more; _bits_RD: the same memory as bits.
+            # _slots: the table, numbers or _EMPTY.
             self._rows = torch.empty(0, num_columns, dtype=dtype, device=device)
+        # What a float of this size has as bits where it is -0.0, and infinite; no integer has them in its stead.
+        floats, bits = dtype.is_floating_point, torch.iinfo(_BITS.get(dtype, dtype))
+        infinity = torch.tensor(torch.inf, dtype=dtype).view(_BITS[dtype]).item() if floats else bits.max
+        self._minus_zero, self._infinity = bits.min if floats else 0, infinity
+        # How many rows there were when all were dropped, and how many of them in the table.
+        self._expected, self._expected_entered = 0, 0
+        self._count = self._entered = 0
         self.clear()
 
     def __len__(self) -> int:
@@ -100,75 +110,65 @@ class StateIndex:
     @property
     def capacity(self) -> int:
         """How many rows there is room for before memory grows."""
-        return len(self._rows)
+        return self._rows.shape[0]
 
     @property
     def merging(self) -> bool:
         """Whether all rows are looked up at present."""
         return self._merging
 
-    # What is kept must be ordinary tensors even if the caller is in inference mode.
     @torch.inference_mode(False)
     def clear(self) -> None:
-        """Drop all rows and free their memory."""
+        """Drop all rows and free their memory. The next ones get as much at once."""
+        if self._count:
+            self._expected, self._expected_entered = self._count, self._entered
         self._count = self._entered = self._looked_up = self._new = 0
         self._merging = self._merge is not False
-        self._rows = self._rows.new_empty(0, self._rows.shape[1])
+        self._hold(self._rows.new_empty(0, self._rows.shape[1]))
         self._slots = self._empty_slots(_LEAST_SLOTS)
 
     def rows(self, number_N: Int[Tensor, "N"]) -> Num[Tensor, "N D"]:
         """The rows with these numbers."""
         return self._rows.index_select(0, number_N)
 
-    @torch.inference_mode(False)
-    @torch.no_grad()
     def number(self, row_ND: Num[Tensor, "N D"]) -> Int[Tensor, "N"]:
         """The number of each row; rows not seen before get the next ones.
 
         Raises:
             PgtsError: the rows have another width or dtype than was given, or one holds a NaN (naming it).
         """
-        row_ND = self._checked(row_ND)
-        first, last = self._count, self._count + len(row_ND)
-        self._make_room(last)
+        if torch.is_inference_mode_enabled():  # what is kept must be ordinary tensors
+            with torch.inference_mode(False):
+                return self.number(row_ND)
+        row_ND, N, first = row_ND.detach(), row_ND.shape[0], self._count
         # All rows are first written behind the known ones, where they can be compared with these and each other: row i
         # is new, with the number `first + i`, unless an equal one is found.
-        self._rows[first:last] = row_ND
-        fresh_N = torch.arange(first, last, device=self.device)
+        self._write(row_ND, first)
         if self._merge is False:
-            self._count = last
-            return fresh_N
-        hash_N = self._hashed(self._rows[first:last])
-        # looks_N: which rows are looked up; None: all.
-        looks_N = None if self._merging else hash_N >> (64 - _SAMPLE_BITS) == 0
-        looked_up = row_ND.shape[0] if looks_N is None else int(looks_N.sum())
+            self._count += N
+            return torch.arange(first, first + N, device=self.device)
+        hash_N = hash_rows(self._bits_RD[first : first + N])
         # At most half of the slots are full even if all these rows are new.
-        needed = 2 * (self._entered + looked_up)
-        if needed > len(self._slots):
+        needed = 2 * (self._entered + N if self._count else max(N, self._expected_entered))
+        if needed > self._slots.shape[0]:
             self._enter(self._slots[self._slots != _EMPTY], needed)
+        sample_bits = 0 if self._merging else _SAMPLE_BITS
         if can_compile(self.device):
-            from pgts_torch.models import index_kernels
-
-            number_N = fresh_N
-            new, entered = index_kernels.number(
-                self._bits(self._rows).numpy(),
-                self._slots.numpy(),
-                first,
-                hash_N.numpy(),
-                _ALL if looks_N is None else looks_N.numpy(),
-                number_N.numpy(),
-            )
+            number_N = torch.empty(N, dtype=torch.int64)
+            known, given = (self._bits_RD.numpy(), self._slots.numpy()), (hash_N.numpy(), number_N.numpy())
+            new, looked_up, entered = _kernels().number(*known, *given, first, sample_bits)
         else:
-            everywhere_N = torch.ones_like(fresh_N, dtype=torch.bool)
-            number_N, new, entered = self._numbered(fresh_N, hash_N, everywhere_N if looks_N is None else looks_N)
+            number_N, new, looked_up, entered = self._numbered(first, hash_N, sample_bits)
         self._count, self._entered = first + new, self._entered + entered
         if self._merge == "auto":
             self._judge(looked_up, entered)
         return number_N
 
-    def _numbered(self, fresh_N: Tensor, hash_N: Tensor, looks_N: Tensor) -> tuple[Tensor, int, int]:
-        """The numbers of the rows behind the known ones, how many are new, and how many of these are entered."""
-        first = self._count
+    def _numbered(self, first: int, hash_N: Tensor, sample_bits: int) -> tuple[Tensor, int, int, int]:
+        """The numbers of the rows from row `first` on, how many are new, how many are looked up: those whose hash
+        begins with so many zeros; and how many of these are entered."""
+        fresh_N = torch.arange(first, first + len(hash_N), device=self.device)
+        looks_N = hash_N >> (64 - sample_bits) == 0 if sample_bits else torch.ones_like(fresh_N, dtype=torch.bool)
         # looking_L: the L rows that are looked up; found_L: the first row equal to each, which may be itself.
         looking_L = fresh_N[looks_N]
         found_L, slot_L = self._look_up(looking_L, hash_N[looks_N])
@@ -183,7 +183,7 @@ class StateIndex:
         # The others take the number of what was found: an old row's own, or the one that a row of this call just got.
         at_L = (found_L - first).clamp(min=0)
         number_N[looking_L - first] = torch.where(found_L < first, found_L, number_N[at_L])
-        return number_N, len(new), len(own)
+        return number_N, len(new), len(looking_L), len(own)
 
     def _judge(self, looked_up: int, new: int) -> None:
         """Give up lookups, or resume them, by how often the rows that were looked up have recurred."""
@@ -200,51 +200,59 @@ class StateIndex:
             self._enter(torch.arange(self._count, device=self.device), 2 * self._count)
         self._looked_up = self._new = 0
 
-    def _checked(self, row_ND: Tensor) -> Tensor:
-        """The rows without -0.0."""
+    def _write(self, row_ND: Tensor, first: int) -> None:
+        """Write the rows from row `first` on, without -0.0, so that equal ones have equal bits.
+
+        Raises:
+            PgtsError: as `number`.
+        """
         D, dtype = self._rows.shape[1], self._rows.dtype
         if row_ND.ndim != 2 or row_ND.shape[1] != D or row_ND.dtype != dtype:
             raise PgtsError(f"the rows are {row_ND.dtype} {tuple(row_ND.shape)}; they must be {dtype} [N, {D}]")
-        if not dtype.is_floating_point:
-            return row_ND
-        # NaN equals nothing, not even itself: such a row would be new each time. The sum is one cheap call.
-        if bool(row_ND.sum().isnan()) and bool((bad_N := row_ND.isnan().any(-1)).any()):
-            n = int(torch.nonzero(bad_N)[0, 0])
-            raise NotFinite(f"row {n} is {row_ND[n].tolist()}; what is not a number equals nothing", what="state")
-        return row_ND + 0.0  # -0.0 becomes 0.0, so that equal rows have equal bits
+        self._make_room(first + row_ND.shape[0])
+        if can_compile(self.device):
+            given_ND = self._bits(row_ND).contiguous().numpy()
+            off = _kernels().place(self._bits_RD.numpy(), given_ND, first, self._minus_zero, self._infinity)
+        else:
+            self._rows[first : first + row_ND.shape[0]] = row_ND + 0.0 if dtype.is_floating_point else row_ND
+            # The sum is one cheap call.
+            is_off = dtype.is_floating_point and bool(row_ND.sum().isnan()) and bool(row_ND.isnan().any())
+            off = int(torch.nonzero(row_ND.isnan().any(-1))[0, 0]) if is_off else -1
+        if off >= 0:  # such a row would be new each time
+            text = f"row {off} is {row_ND[off].tolist()}; what is not a number equals nothing"
+            raise NotFinite(text, what="state")
 
     def _bits(self, row_ND: Tensor) -> Tensor:
         return row_ND.view(_BITS[row_ND.dtype]) if row_ND.dtype in _BITS else row_ND
-
-    def _hashed(self, row_ND: Tensor) -> Int[Tensor, "N"]:
-        return hash_rows(self._bits(row_ND))
 
     def _empty_slots(self, count: int) -> Tensor:
         return torch.full((count,), _EMPTY, dtype=torch.int64, device=self.device)
 
     def _make_room(self, count: int) -> None:
-        """Memory for so many rows, or for twice as many as before."""
-        if count > len(self._rows):
-            more = self._rows.new_empty(max(count, 2 * len(self._rows)), self._rows.shape[1])
+        """Memory for so many rows, or for twice as many as before; at first for as many as are expected."""
+        room = self.capacity
+        if count > room:
+            more = self._rows.new_empty(max(count, 2 * room or self._expected), self._rows.shape[1])
             more[: self._count] = self._rows[: self._count]
-            self._rows = more
+            self._hold(more)
+
+    def _hold(self, row_RD: Tensor) -> None:
+        self._rows, self._bits_RD = row_RD, self._bits(row_RD)
 
     def _enter(self, number_L: Tensor, num_slots: int) -> None:
         """A new table of at least so many slots, with these rows."""
         self._slots = self._empty_slots(max(_LEAST_SLOTS, 1 << (num_slots - 1).bit_length()))
-        hash_L = self._hashed(self._rows[number_L])
+        hash_L = hash_rows(self._bits_RD[number_L])
         if can_compile(self.device):
-            from pgts_torch.models import index_kernels
-
-            given = self._bits(self._rows), self._slots, number_L, hash_L
-            self._entered = index_kernels.enter(*(x.numpy() for x in given))
+            given = self._bits_RD, self._slots, number_L, hash_L
+            self._entered = _kernels().enter(*(x.numpy() for x in given))
         else:
             self._entered = int((self._look_up(number_L, hash_L)[0] == number_L).sum())
 
     def _look_up(self, looking_L: Tensor, hash_L: Tensor) -> tuple[Tensor, Tensor]:
         """For each of these rows the number of the first one that equals it, and its slot; rows that equal none before
         them are entered. The caller counts them."""
-        last_slot = len(self._slots) - 1
+        last_slot = self._slots.shape[0] - 1
         found_L, at_L = torch.empty_like(looking_L), torch.empty_like(looking_L)
         # index: which of the rows are still looking. In each round they compare themselves with the row in their slot,
         # and those that differ go on to the next slot.

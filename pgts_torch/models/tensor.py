@@ -8,10 +8,14 @@ from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
+from pgts_torch.compiled import pays
 from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.exact_model import CONTRADICTED, Happened, step_text
 from pgts_torch.models.state_index import Merge, StateIndex
+
+_SURVEYED = {torch.float32, torch.float64, torch.int64}
+"""Dtypes of what a compiled loop can look through."""
 
 _ROUNDING = 1e-12
 """By how much dynamics that do the same arithmetic in another order, or on another device, may be off."""
@@ -70,9 +74,8 @@ class TensorModel(EnumeratingModel, SamplingModel):
         self.dtype = dtype
         self.action_repeat = action_repeat
         self.is_certain = True
-        # All actions again and again, and a probability.
-        self._action_N = torch.empty(0, dtype=torch.int64, device=self.device)
-        self._one = torch.ones((), dtype=dtype, device=self.device)
+        # All actions again and again, and as many probabilities.
+        self._action_N, self._one_N = torch.empty(0, dtype=torch.int64), torch.empty(0)
         self.simulator_steps = 0
         """For how many (state, action) `step` was called."""
 
@@ -119,8 +122,9 @@ class TensorModel(EnumeratingModel, SamplingModel):
         N, A = state_N.shape[0], self.num_actions
         if N * A > self._action_N.shape[0]:
             self._action_N = torch.arange(A, device=self.device).repeat(2 * N)
+            self._one_N = torch.ones(2 * N * A, dtype=self.dtype, device=self.device)
         reward_N, discount_N, next_N = self._followed(state_N.repeat_interleave(A), self._action_N[: N * A])
-        certain_NAK = self._one.expand(N, A, 1)
+        certain_NAK = self._one_N[: N * A].view(N, A, 1)
         return Outcomes(
             reward_N.view(-1, A), certain_NAK, discount_N.view(-1, A, 1), next_N.view(-1, A, 1), self.num_states
         )
@@ -154,11 +158,14 @@ class TensorModel(EnumeratingModel, SamplingModel):
     @torch.no_grad()
     def _followed(self, state_N: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Reward, discount and number of the next state; where nothing counts after an outcome, the state itself."""
-        reward_N, discount_N, next_ND = self._stepped(self.states(state_N), action_N)
+        reward_N, discount_N, next_ND, all_count = self._stepped(self.states(state_N), action_N)
         for _ in range(self.action_repeat - 1):
             # on: the pairs whose action is taken once more, and then those of them where it is allowed.
-            on = torch.nonzero((discount_N > 0) & (reward_N > -torch.inf)).flatten()
-            more_N, then_N, ahead_ND = self._stepped(next_ND.index_select(0, on), action_N.index_select(0, on))
+            on = torch.nonzero(_counts(reward_N, discount_N)).flatten()
+            more_N, then_N, ahead_ND, more_count = self._stepped(
+                next_ND.index_select(0, on), action_N.index_select(0, on)
+            )
+            all_count = all_count and more_count
             allowed_N = more_N > -torch.inf
             if not bool(allowed_N.all()):
                 on, more_N, then_N, ahead_ND = (x[allowed_N] for x in (on, more_N, then_N, ahead_ND))
@@ -167,28 +174,42 @@ class TensorModel(EnumeratingModel, SamplingModel):
             discount_N = discount_N.index_copy(0, on, weight_N * then_N)
             next_ND = next_ND.index_copy(0, on, ahead_ND)
         # Next states that count get a number; a terminal one may be anything, and is no state of the model.
-        counts_N = (discount_N > 0) & (reward_N > -torch.inf)
-        if bool(counts_N.all()):
+        if all_count:
             return reward_N, discount_N, self.number(next_ND)
+        counts_N = _counts(reward_N, discount_N)
         next_N = state_N.clone()
         next_N[counts_N] = self.number(next_ND[counts_N])
         return reward_N, discount_N, next_N
 
-    def _stepped(self, state_ND: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What `step` returns, checked."""
-        self.simulator_steps += len(state_ND)
-        reward_N, discount_N, next_ND = self.step(state_ND, action_N)
-        given = tuple(reward_N.shape), tuple(discount_N.shape), tuple(next_ND.shape)
-        expected = tuple(action_N.shape), tuple(action_N.shape), tuple(state_ND.shape)
+    def _stepped(self, state_ND: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor, bool]:
+        """What `step` returns, checked; and whether all that follows counts."""
+        self.simulator_steps += state_ND.shape[0]
+        reward_N, discount_N, next_ND = answer = self.step(state_ND, action_N)
+        given = reward_N.shape, discount_N.shape, next_ND.shape
+        expected = action_N.shape, action_N.shape, state_ND.shape
         if given != expected:
+            shapes, must_be = (tuple(map(tuple, each)) for each in (given, expected))
             raise PgtsError(
-                f"step returned shapes {given}; for {len(action_N)} states and actions they must be {expected}"
+                f"step returned shapes {shapes}; for {len(action_N)} states and actions they must be {must_be}"
             )
         if not reward_N.dtype == discount_N.dtype == self.dtype:
             raise PgtsError(
                 f"step returned rewards in {reward_N.dtype} and discounts in {discount_N.dtype}; "
                 f"the dtype of the model is {self.dtype}"
             )
+        if self.reward_range is not None:
+            self.reward_range.check(reward_N.cpu())
+        if {self.dtype, next_ND.dtype} <= _SURVEYED and pays(self.device, next_ND.numel()):
+            from pgts_torch.models import index_kernels
+
+            found = index_kernels.survey(*(x.detach().contiguous().numpy() for x in answer))
+            if found < index_kernels.OFF:
+                return *answer, found == index_kernels.ALL_COUNT
+        self._check(state_ND, action_N, *answer)
+        return *answer, bool(_counts(reward_N, discount_N).all())
+
+    def _check(self, state_ND: Tensor, action_N: Tensor, reward_N: Tensor, discount_N: Tensor, next_ND: Tensor) -> None:
+        """PgtsError if a discount is none, or a state that counts is not a number."""
         in_range = len(discount_N) == 0 or all(0 <= float(end) <= 1 for end in discount_N.aminmax())
         if not in_range:
             n = int(torch.nonzero(~((discount_N >= 0) & (discount_N <= 1)))[0, 0])
@@ -196,20 +217,22 @@ class TensorModel(EnumeratingModel, SamplingModel):
                 f"step returned the discount {float(discount_N[n])} for state {state_ND[n].tolist()} and action "
                 f"{int(action_N[n])}; it must be in [0, 1]"
             )
-        if self.reward_range is not None:
-            self.reward_range.check(reward_N.cpu())
         # A sum is one cheap call; only where it is not a number single ones are looked at.
         if not bool(next_ND.sum().isnan()):
-            return reward_N, discount_N, next_ND
-        counts_N = (discount_N > 0) & (reward_N > -torch.inf)
-        if bool((bad_N := next_ND.isnan().any(-1) & counts_N).any()):
+            return
+        bad_N = next_ND.isnan().any(-1) & _counts(reward_N, discount_N)
+        if bool(bad_N.any()):
             n = int(torch.nonzero(bad_N)[0, 0])
             raise NotFinite(
                 f"step leads from state {state_ND[n].tolist()} by action {int(action_N[n])} to {next_ND[n].tolist()}; "
                 "what is not a number equals nothing",
                 what="state",
             )
-        return reward_N, discount_N, next_ND
+
+
+def _counts(reward_N: Tensor, discount_N: Tensor) -> Bool[Tensor, "N"]:
+    """Which steps something counts after."""
+    return (discount_N > 0) & (reward_N > -torch.inf)
 
 
 def _close(x: Tensor, y: Tensor) -> Tensor:

@@ -123,6 +123,19 @@ def test_numpy_and_torch_take_the_same_steps_in_the_dtype_of_the_model(variant, 
     assert torch.equal(torch.from_numpy(ours[1]), plain[1])
 
 
+@pytest.mark.parametrize("variant", [name for name in VARIANTS if name.startswith("CartPole")])
+def test_steps_of_cartpole_in_a_compiled_loop_have_the_bits_of_those_by_numpy(variant):
+    pytest.importorskip("numba")
+    env = VARIANTS[variant]()
+    model = CartPole(env, gamma=GAMMA)
+    state, action, *_ = walk(env, 600, hold=7)
+    state[::50, 1] = -0.0
+    looped = model._step_compiled(state.numpy(), action.numpy())
+    plain = model._step(state, action)
+    assert all(torch.equal(x.view(torch.int64), y.view(torch.int64)) for x, y in zip(looped, plain, strict=True))
+    assert not torch.equal(looped[2], model._step(state, 1 - action)[2])
+
+
 OTHER = {
     "CartPole-v1": {"gravity": 9.81},
     "Acrobot-v1": {"LINK_MOI": 1.001},
