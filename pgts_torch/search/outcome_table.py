@@ -63,6 +63,12 @@ class OutcomeTable(Table):
     def missing(self, state_N: Int[Tensor, "N"]) -> Int[Tensor, "missing"]:
         """Those of the states that have no row."""
         self.row_S = with_room(self.row_S, self.model.num_states)
+        if pays(self.device, state_N.shape[0]):
+            from pgts_torch.search import table_kernels
+
+            found_N = torch.empty_like(state_N)
+            count = table_kernels.missing(state_N.numpy(), self.arrays[-1], found_N.numpy())
+            return found_N[:count]
         missing_N = self.row_S.index_select(0, state_N) < 0
         return state_N if bool(missing_N.all()) else state_N[missing_N]
 
@@ -80,28 +86,27 @@ class OutcomeTable(Table):
         """
         # The states are distinct, so that none is queried, or gets a row, twice.
         missing = self.missing(state_N)
-        if len(missing) and self.meter is not None:
+        if missing.shape[0] and self.meter is not None:
             # Numbers that a learned model answers may depend on how many states it is asked for.
             known, divides = self.num_queried, self.model.exact
             self.meter.query(missing, self._ask, self._children, known=known, divides=divides)
-        elif len(missing):
+        elif missing.shape[0]:
             self._ask(missing)
 
     def _ask(self, missing: Int[Tensor, "missing"]) -> None:
         answer = self.model.outcomes(missing)
         self._count(missing)
-        row_N = self._written(answer) if self._can_write(len(missing), answer) else None
-        if row_N is None:
-            check_outcomes(self.model, missing, answer)
-            row_N = self._append(
-                reward_RA=answer.reward_NA,
-                prob_RAK=answer.prob_NAK,
-                discount_RAK=answer.discount_NAK,
-                child_RAK=answer.child_NAK,
-            )
         # The model may have met new states, which get room before their ids are used.
         self.row_S = with_room(self.row_S, self.model.num_states)
-        self.row_S[missing] = row_N
+        if self._can_write(missing.shape[0], answer) and self._write(missing, answer):
+            return
+        check_outcomes(self.model, missing, answer)
+        self.row_S[missing] = self._append(
+            reward_RA=answer.reward_NA,
+            prob_RAK=answer.prob_NAK,
+            discount_RAK=answer.discount_NAK,
+            child_RAK=answer.child_NAK,
+        )
 
     def _children(self, state_N: Int[Tensor, "N"]) -> tuple[Int[Tensor, "C"], Int[Tensor, "D"]]:
         """The distinct states that follow these queried ones; and those of them that were not queried."""
@@ -138,20 +143,19 @@ class OutcomeTable(Table):
         fits = len(dtypes) == 1 and tuple(answer.reward_NA.shape) == (states, self.num_actions)
         return fits and self.dtype in (torch.float32, torch.float64) and pays(self.device, answer.child_NAK.numel())
 
-    def _written(self, answer: Outcomes) -> Int[Tensor, "N"] | None:
-        """The rows of the answer, checked and written in one pass; None where something seems to be off."""
+    def _write(self, state_N: Int[Tensor, "N"], answer: Outcomes) -> bool:
+        """Write the answer for these states, checked in the same pass; False where something seems to be off."""
         from pgts_torch.search import table_kernels
 
         first, last = self.count, self.count + answer.num_states
         if last > self.reward_RA.shape[0] or answer.num_outcomes > self.num_outcomes:
             self._reserve(answer.num_states, answer.num_outcomes)
-        given = answer.reward_NA, answer.prob_NAK, answer.discount_NAK, answer.child_NAK
-        columns = self.reward_RA, self.prob_RAK, self.discount_RAK, self.child_RAK
-        arrays = [x.detach().contiguous().numpy() for x in (*given, *columns)]
-        if not table_kernels.write(first, self.model.num_states, _TOLERANCE, *arrays):
-            return None
+        given = state_N, answer.reward_NA, answer.prob_NAK, answer.discount_NAK, answer.child_NAK
+        arrays = [x.detach().contiguous().numpy() for x in given]
+        if not table_kernels.write(first, self.model.num_states, _TOLERANCE, *arrays, *self.arrays):
+            return False
         self.count = last
-        return torch.arange(first, last)
+        return True
 
     def _rows(self, at: Tensor | slice) -> Outcomes:
         columns = self.reward_RA[at], self.prob_RAK[at], self.discount_RAK[at], self.child_RAK[at]

@@ -7,11 +7,11 @@ from pgts_torch.compiled import jit
 
 @jit
 def write(  # type: ignore[no-untyped-def]
-    first, num_states, tolerance, reward_NA, prob_NAK, discount_NAK, child_NAK, to_reward, to_prob, to_discount,
-    to_child,
+    first, num_states, tolerance, state_N, reward_NA, prob_NAK, discount_NAK, child_NAK, to_reward, to_prob,
+    to_discount, to_child, row_S,
 ):  # fmt: skip
-    """Write the rows from `first` on, whose other outcomes are padding. False where `check_outcomes` may object: then
-    nothing that was written counts."""
+    """Write the rows of these states from `first` on, whose other outcomes are padding. False where `check_outcomes`
+    may object: then nothing that was written counts."""
     N, A, K = child_NAK.shape
     for n in range(N):
         highest = -np.inf
@@ -33,4 +33,17 @@ def write(  # type: ignore[no-untyped-def]
                 return False
         if highest == -np.inf:
             return False
+    for n in range(N):
+        row_S[state_N[n]] = first + n
     return True
+
+
+@jit
+def missing(state_N, row_S, missing_N):  # type: ignore[no-untyped-def]
+    """List the states that have no row; how many there are."""
+    count = 0
+    for s in state_N:
+        if row_S[s] < 0:
+            missing_N[count] = s
+            count += 1
+    return count
