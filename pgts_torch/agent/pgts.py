@@ -31,6 +31,7 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.environments import Given, close_environments
 from pgts_torch.models.masks import ActionMasks, Masked
+from pgts_torch.options.arguments import shortest
 from pgts_torch.ranks import present_ranks
 from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.seeding import drawn_seed, stream
@@ -218,6 +219,17 @@ class PGTS:
             if isinstance(self.world, SimulatedWorld):
                 self.world.model.env.close()
 
+    def __repr__(self) -> str:
+        """The call that makes such a training; what its lookahead queries, and how far it is."""
+        others = {name: self._arguments[name] for name in ("gamma", "env_kwargs", "seed", "device")}
+        given = shortest(self.options) | {
+            name: each for name, each in others.items() if each not in (None, {}, 0, "cpu")
+        }
+        model = getattr(self.world, "model", None)
+        queried = "no model" if self.depth_choice is None or model is None else type(model).__name__
+        arguments = [repr(self.source.name), *(f"{name}={value!r}" for name, value in given.items())]
+        return f"PGTS({', '.join(arguments)})  # {queried}, {self.num_env_steps:,} steps"
+
     def __enter__(self) -> Self:
         return self
 
@@ -246,14 +258,17 @@ class PGTS:
         generator = Draws.of(self.ranks, self.seed, self.num_iterations, self.device).search()
         return self.depth_choice.look(state_N, depth=depth, generator=generator)
 
-    def learn(self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool = False) -> Self:
+    def learn(
+        self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool | None = None
+    ) -> Self:
         """Iterate until there are `total_steps` environment steps, including those before this call.
 
         Args:
             callback: one or more, each called with (self, iteration) after each iteration; if one returns False,
                 training ends in all processes.
-            progress: show a progress bar, and say what an iteration costs. From a second on that is always said, before
-                it is spent where the lookahead takes long; from 30 seconds on with what makes it cheaper.
+            progress: show a progress bar, and say what an iteration costs; None: the bar alone, and only on a terminal.
+                From a second on the cost is always said, before it is spent where the lookahead takes long; from 30
+                seconds on with what makes it cheaper.
 
         Raises:
             PgtsError: a callback that cannot be called; or the environment failed, naming step and seeds.
@@ -261,8 +276,8 @@ class PGTS:
         callbacks = [callback] if callable(callback) else callback
         if not isinstance(callbacks, Sequence) or not all(map(callable, callbacks)):
             raise PgtsError(f"callback is {callback!r}; it must be a function of (model, iteration), or a list of such")
-        shown = progress and self.ranks.leads
-        with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=not shown) as bar:
+        hidden = True if not self.ranks.leads else None if progress is None else not progress
+        with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=hidden) as bar:
             while self.num_env_steps < total_steps:
                 iteration = self.iterate()
                 bar.update(iteration.num_steps)

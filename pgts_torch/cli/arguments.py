@@ -35,7 +35,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def command_name(function: Callable[..., Any]) -> str:
-    return function.__name__.replace("_", "-")
+    return function.__name__.rstrip("_").replace("_", "-")
 
 
 def summary(function: Callable[..., Any]) -> str:

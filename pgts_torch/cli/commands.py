@@ -45,7 +45,11 @@ def train(arguments: Arguments) -> None:
     """Train a policy with tree search."""
     usage = "%(prog)s [--config FILE | --resume RUN_DIR] [--KEY VALUE ...]"
     parser = Parser(train, usage=usage)
-    parser.add_argument("--config", metavar="FILE", help="YAML file with any of the keys below; none: the defaults")
+    parser.add_argument(
+        "--config",
+        metavar="FILE",
+        help="YAML file with any of the keys below, or a name of pgts list; none: the defaults",
+    )
     parser.add_argument("--resume", metavar="RUN_DIR", type=run_folder, help="go on with an unfinished run")
     parser.add_argument("--overwrite", action="store_true", help="start from the beginning, as --run.overwrite")
     parser.add_argument(
@@ -163,6 +167,18 @@ def report(arguments: Arguments) -> None:
 
     answer = write(given.run_dir, given.out, trust_imports=given.trust_imports)
     print(json.dumps(answer) if given.json else answer["page"])
+
+
+@command
+def list_(arguments: Arguments) -> None:
+    """List configurations, and environments with a model at hand."""
+    parser = Parser(list_)
+    parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
+    given = parser.parse_args(arguments)
+    from pgts_torch.experiment.at_hand import at_hand, describe
+
+    answer = at_hand()
+    print(json.dumps(answer) if given.json else describe(answer))
 
 
 STATIONARY_OPTIONS = {

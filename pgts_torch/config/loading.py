@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from pgts_torch import files
 from pgts_torch.config import strict_yaml
 from pgts_torch.config.config import Config
+from pgts_torch.config.shipped import found
 from pgts_torch.config.strict_yaml import Document, Place, YamlMistake
 from pgts_torch.errors import PgtsError
 from pgts_torch.options.mistakes import escape, explain, quote, show, what
@@ -34,7 +35,7 @@ def load(path: str | Path | None = None, arguments: Sequence[str] = ()) -> Confi
     """Return the configuration: defaults, replaced by a file, replaced by command-line arguments.
 
     Args:
-        path: a YAML file with some of the keys; None: none.
+        path: a YAML file with some of the keys, or the name of a shipped one; None: none.
         arguments: overrides as on the command line, `--KEY VALUE` or `--KEY=VALUE`; later ones win. A mapping as the
             value replaces the whole section; a single key changes only itself.
 
@@ -42,7 +43,7 @@ def load(path: str | Path | None = None, arguments: Sequence[str] = ()) -> Confi
         ConfigError: with every mistake in the file and in the arguments.
     """
     given = _Given()
-    is_read = path is None or given.read_file(Path(path))
+    is_read = path is None or given.read_file(found(path))
     given.read_arguments(arguments)
     config = given.validated(is_whole=is_read)
     if given.mistakes or config is None:

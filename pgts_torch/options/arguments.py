@@ -63,6 +63,44 @@ def described(options: Training) -> dict[str, Any]:
     return flat | {name: plain[name] for name in _PARTS} | {"search": kind, "horizon": plain["rollout"]["horizon"]}
 
 
+def shortest(options: Training) -> dict[str, Any]:
+    """Return the arguments from which `read` returns the same options: the parts, and of other options those that are
+    not the default. A part is a word, or a mapping with what is not its default."""
+    given = {
+        name: getattr(part, name)
+        for section, names in _FLAT.items()
+        for name in names
+        if getattr(part := getattr(options, section), name) != type(part).model_fields[name].default or name == "depth"
+    }
+    if "horizon" in given:
+        given["horizon"] = _short(options.rollout.horizon)
+    kind = {
+        name: value for name, value in _changed(options.search).items() if name not in LookaheadOptions.model_fields
+    }
+    parts = {name: _short(getattr(options, name)) for name in _PARTS}
+    parts["search"] = {"type": options.search.kind} | kind if kind else options.search.kind
+    return given | {name: word for name, word in parts.items() if word != _MOSTLY.get(name)}
+
+
+_MOSTLY = {"estimator": "lookahead", "model": "auto", "replay": "none", "search": "auto"}
+"""Parts that need not be named."""
+
+
+def _short(part: Any) -> Any:
+    changed = _changed(part)
+    return {"type": part.type} | changed if changed else part.type
+
+
+def _changed(part: Part) -> dict[str, Any]:
+    """Return the options of a part that are not the default, without its type."""
+    changed = {}
+    for name, field in type(part).model_fields.items():
+        value = getattr(part, name)
+        if name not in ("type", "kind") and value is not None and value != field.default:
+            changed[field.alias or name] = _short(value) if isinstance(value, Part) else value
+    return changed
+
+
 def _with_never(value: Any) -> Any:
     """Return a part with None replaced by never, where a plain mapping says so of a clip."""
     if not isinstance(value, Mapping):

@@ -347,3 +347,22 @@ def test_without_a_seed_one_is_drawn_and_said(capsys, tmp_path):
     assert torch.equal(first.policy_table(), again.policy_table())
     first.save(tmp_path / "model.pt")
     assert PGTS.load(tmp_path / "model.pt").seed == first.seed
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"env": "CartPole-v1", "depth": 1, "policy": {"type": "mlp", "hidden": [32]}, "gamma": 0.9},
+        {"env": "pgts/Ladder-v0", "depth": "adaptive", "max_depth": 6, "seed": 3},
+        {"env": "pgts/DeepSea-v0", "env_kwargs": {"n": 5}, "model": "counts", "depth": 4},
+        {"env": "CartPole-v1", "depth": 0, "estimator": "sampled", "update": {"type": "ppo", "clip_range": 0.1}},
+        {"env": "CartPole-v1", "search": {"type": "mcts", "simulations": 8}, "max_roots": 5, "horizon": "geometric"},
+    ],
+)
+def test_what_is_printed_of_a_training_makes_the_same_one_again(arguments):
+    model = PGTS(**arguments)
+    again = eval(repr(model))
+    assert again.options == model.options
+    assert (again.gamma, again.seed, again.source.name) == (model.gamma, model.seed, model.source.name)
+    assert repr(again) == repr(model)
+    assert repr(PGTS(**{**arguments, "seed": 9})) != repr(model)

@@ -271,3 +271,26 @@ def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
         process.stdout.close()
         assert process.stderr.read() == ""
         assert process.wait(PATIENCE) == 141
+
+
+def test_a_shipped_configuration_is_found_by_its_name_from_any_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "--config", "learned/cartpole", "--print-config"]) == 0
+    shown = capsys.readouterr().out
+    assert shown == dump(load(ROOT / "configs/learned/cartpole.yaml"))
+    (tmp_path / "ladder").write_text("name: mine\n")  # a file comes before a name
+    assert main(["train", "--config", "ladder", "--print-config"]) == 0
+    assert "name: mine" in capsys.readouterr().out
+    assert main(["train", "--config", "laddder"]) == 2
+
+
+def test_list_names_every_configuration_in_lines_that_fit(capsys):
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 79
+    for path in (ROOT / "configs").rglob("*.yaml"):
+        assert any(
+            line.split()[:1] == [path.relative_to(ROOT / "configs").with_suffix("").as_posix()] for line in lines
+        )
+    assert main(["list", "--json"]) == 0
+    assert "pgts/Ladder-v0" in json.loads(capsys.readouterr().out)["environments"]["table"]
