@@ -12,7 +12,7 @@ from typing import Self
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pgts_torch.compiled import can_compile
@@ -122,6 +122,16 @@ class Outcomes:
         columns = (self.weight.values(), self.weight.col_indices())
         values, child = (x.view(N * A, K).index_select(0, row_N).view(-1) for x in columns)
         return self.reward_NA.reshape(-1).index_select(0, row_N), _rows(values, child, K, self.num_children)
+
+    @cached_property
+    def legal_NA(self) -> Bool[Tensor, "N A"]:
+        """Which actions are allowed."""
+        return self.reward_NA > -torch.inf
+
+    @property
+    def finite_rewards(self) -> Float[Tensor, "R"]:
+        """The rewards of actions that are allowed."""
+        return self.reward_NA[self.legal_NA]
 
     def expected(self, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
         """sum_k p_k gamma_k v(s'_k)."""

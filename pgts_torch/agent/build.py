@@ -118,8 +118,9 @@ def make_policy(options: Any, world: World, *, seed: int) -> Policy:
     """Make a policy, a table or a network."""
     if isinstance(options, Network):
         return NetworkPolicy(world.perceived_space, world.num_actions, options, seed=seed, device=world.device)
-    S, A = _tabular(world, f"the policy {options.type!r}").mdp_shape
-    return _made(_TABLES, options)(S, A, options, seed=seed, device=world.device)
+    tabular = _tabular(world, f"the policy {options.type!r}")
+    shared = {"legal_SA": tabular.legal_SA, "seed": seed, "device": world.device}
+    return _made(_TABLES, options)(*tabular.mdp_shape, options, **shared)
 
 
 def make_update(options: Part, policy: Policy) -> Update:
@@ -154,7 +155,7 @@ def make_critic(
         )
     tabular = _tabular(world, f"the critic {options.type!r}")
     if isinstance(options, TabularValues):
-        return TabularCritic(*tabular.mdp_shape, options, device=world.device)
+        return TabularCritic(*tabular.mdp_shape, options, legal_SA=tabular.legal_SA, device=world.device)
     if isinstance(options, RolloutValues):
         if not isinstance(tabular.model, SamplingModel):
             raise MissingModel(
@@ -167,6 +168,19 @@ def make_critic(
     return ExactCritic(tabular.mdp, options)
 
 
+def _check_legal(world: World, policy: Policy) -> None:
+    """PgtsError unless the policy leaves out the actions that a table does not allow."""
+    if not isinstance(world, TabularWorld) or (legal_SA := world.legal_SA) is None:
+        return
+    if not isinstance(policy, TabularPolicy):
+        raise PgtsError(
+            f"{env_name(world.env)} allows some actions in some states only, as its table says, which a "
+            f"{type(policy).__name__} does not see: take the policy softmax or simplex"
+        )
+    if ((policy.table() > 0) & ~legal_SA.cpu()).any():
+        raise PgtsError("the policy has a positive probability of an action that the table does not allow")
+
+
 def check_parts(arguments: Mapping[str, Any], world: World, policy: Policy, update: Update) -> None:
     """PgtsError where parts do not fit each other, or the gamma given to `PGTS` would have no effect."""
     update.check(policy)
@@ -174,6 +188,7 @@ def check_parts(arguments: Mapping[str, Any], world: World, policy: Policy, upda
         shape, found = _tabular(world, "the policy").mdp_shape, (policy.num_states, policy.num_actions)
         if found != shape:
             raise PgtsError(f"the policy is one of (states, actions) = {found}; the environment has {shape}")
+    _check_legal(world, policy)
     if arguments["gamma"] not in (None, world.gamma):
         raise PgtsError(f"gamma is {arguments['gamma']}; the environment has its own, {world.gamma}")
 

@@ -7,10 +7,11 @@ from functools import partial
 from typing import Any, Literal, TypeVar, final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.advantages import critic_targets
+from pgts_torch.agent.components import legal_only
 from pgts_torch.agent.policies import Policy, exact_probs, fitting
 from pgts_torch.agent.rollout import Rollout, simulated_returns
 from pgts_torch.bellman import policy_mean
@@ -131,6 +132,7 @@ class TabularCritic(Critic):
             cells that were never visited have the value w for which the mean of the iteration's targets is w, where
             episodes that were cut off in such a cell are bootstrapped with w. A constant c added to all rewards of a
             continuing task adds c / (1 - gamma) to w, as to all values; a factor multiplies it.
+        legal_SA: the actions that are allowed, the others have Q = -inf; None: all are.
     """
 
     options: TabularValues
@@ -141,11 +143,13 @@ class TabularCritic(Critic):
         num_actions: int,
         options: TabularValues = TabularValues(),  # noqa: B008 - frozen
         *,
+        legal_SA: Bool[Tensor, "S A"] | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         self.num_states, self.num_actions = num_states, num_actions
         self.options, self.target = options, options.target
         self._policy: Policy | None = None
+        self._legal_SA = legal_SA
         cells = num_states if self.target == "v" else num_states * num_actions
         first = 0.0 if options.initial == "mean" else options.initial
         self._value_C = torch.full((cells,), first, dtype=torch.float64, device=device)
@@ -189,7 +193,8 @@ class TabularCritic(Critic):
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
         if self.target != "q":
             raise PgtsError("this critic learns v; it has no Q. Make it with target='q', or search with v_leaf")
-        return self._value_C.view(self.num_states, self.num_actions)[state_N]
+        q_NA = self._value_C.view(self.num_states, self.num_actions)[state_N]
+        return legal_only(q_NA, None if self._legal_SA is None else self._legal_SA[state_N])
 
     def state_dict(self) -> dict[str, Any]:
         return {"value_C": self._value_C.cpu().clone(), "count_C": self._count_C.cpu().clone()}

@@ -170,7 +170,9 @@ def _first_model(request: _Request, *, plain: bool) -> tuple[ModelWorld | None, 
     env, reasons = request.env, list[str]()
     if type(env) is TabularVectorEnv:
         _check_single(request.action_repeat, "in a table")
-        return TabularWorld(env, env.mdp, observed=request.observed, device=request.device), []
+        return TabularWorld(
+            env, env.mdp, observed=request.observed, masks=_own_masks(env.mdp), device=request.device
+        ), []
     if type(env) is not SyncVectorEnv:
         return None, [f"{request.name} is a VectorEnv of unknown kind; a simulator needs a SyncVectorEnv ({SLOW})"]
     try:
@@ -245,7 +247,13 @@ def _table(request: _Request) -> TabularWorld | None:
             "to 1,000 resets",
             stacklevel=4,
         )
-    return TabularWorld(request.env, mdp, starts_known=starts_known, masks="off", device=request.device)
+    masks = "off" if mdp.outcomes.legal_NA.all() else request.masks
+    return TabularWorld(request.env, mdp, starts_known=starts_known, masks=masks, device=request.device)
+
+
+def _own_masks(mdp: TabularMDP) -> ActionMasks | None:
+    """How our environments of a table say which actions it allows; None: all are."""
+    return None if mdp.outcomes.legal_NA.all() else ActionMasks.plain(mdp.num_actions, by_method=False)
 
 
 def _dynamics(request: _Request) -> DynamicsWorld | None:

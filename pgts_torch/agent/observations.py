@@ -136,6 +136,8 @@ class Observations:
 
     def encode(self, observation: Any) -> Tensor:
         """As `World.encode`."""
+        if isinstance(observation, Masked) and self.masked is None:
+            observation = observation.observation
         if isinstance(observation, Masked):
             rows = self.with_legal(self.rows(observation.observation), observation.legal_A)
         else:

@@ -5,19 +5,41 @@ from abc import ABC, abstractmethod
 from typing import Any, final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pgts_torch.agent.components import legal_only
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.options.policies import Biased, Init, Random, Simplex, Softmax, Uniform
 from pgts_torch.seeding import stream
 
 
-def initial(init: Init, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
+def initial(
+    init: Init,
+    num_states: int,
+    num_actions: int,
+    generator: torch.Generator,
+    legal_SA: Bool[Tensor, "S A"] | None = None,
+) -> Float[Tensor, "S A"]:
     """Return the probabilities of the initial policy.
 
     `Biased(action=0, probability=1)` on the Ladder is the paper's "always left".
+
+    Args:
+        legal_SA: the actions that are allowed, over which each row is; None: all are. Where these have probability 0
+            together it is uniform over them.
     """
+    probs_SA = _initial(init, num_states, num_actions, generator)
+    if legal_SA is None:
+        return probs_SA
+    legal_SA = legal_SA.to(probs_SA)
+    kept_SA = probs_SA * legal_SA
+    kept_SA = torch.where(kept_SA.sum(-1, keepdim=True) > 0, kept_SA, legal_SA)
+    return kept_SA / kept_SA.sum(-1, keepdim=True)
+
+
+def _initial(init: Init, num_states: int, num_actions: int, generator: torch.Generator) -> Float[Tensor, "S A"]:
+    """The same where all actions are allowed."""
     if isinstance(init, Biased) and init.action >= num_actions:
         raise PgtsError(f"policy.init.action is {init.action}; actions are 0 to {num_actions - 1}")
     if isinstance(init, Uniform) or num_actions == 1:
@@ -83,7 +105,11 @@ class TabularPolicy(Policy):
 
 @final
 class SoftmaxPolicy(TabularPolicy):
-    """pi(a|s) ~ exp(logits[s, a]): every action keeps a positive probability."""
+    """pi(a|s) ~ exp(logits[s, a]): every action that is allowed keeps a positive probability.
+
+    Args:
+        legal_SA: the actions that are allowed; None: all are. The logits of the others are -inf.
+    """
 
     def __init__(
         self,
@@ -91,28 +117,35 @@ class SoftmaxPolicy(TabularPolicy):
         num_actions: int,
         options: Softmax = Softmax(),  # noqa: B008 - frozen
         *,
+        legal_SA: Bool[Tensor, "S A"] | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
         self.options = options
-        probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy"))
+        probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy"), legal_SA)
         self.num_states, self.num_actions = num_states, num_actions
         self.logits_SA = probs_SA.log().to(device)
+        self._legal_SA = None if legal_SA is None else legal_SA.to(device)
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         """softmax(logits[s])."""
         return self.logits_SA[observation_N].softmax(-1)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"logits_SA": self.logits_SA.cpu().clone()}
+        """Return the logits, 0 in place of -inf."""
+        return {"logits_SA": legal_only(self.logits_SA, self._legal_SA, 0.0).cpu().clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.logits_SA = fitting(state, "logits_SA", self.logits_SA)
+        self.logits_SA = legal_only(fitting(state, "logits_SA", self.logits_SA), self._legal_SA)
 
 
 @final
 class SimplexPolicy(TabularPolicy):
-    """The paper's direct parametrisation: pi(a|s) is the parameter itself, and may be 0 or 1.        [PGTS Sec. 2]"""
+    """The paper's direct parametrisation: pi(a|s) is the parameter itself, and may be 0 or 1.        [PGTS Sec. 2]
+
+    Args:
+        legal_SA: as in `SoftmaxPolicy`.
+    """
 
     def __init__(
         self,
@@ -120,12 +153,13 @@ class SimplexPolicy(TabularPolicy):
         num_actions: int,
         options: Simplex = Simplex(),  # noqa: B008 - frozen
         *,
+        legal_SA: Bool[Tensor, "S A"] | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
         self.options = options
         self.num_states, self.num_actions = num_states, num_actions
-        self.probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy")).to(device)
+        self.probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy"), legal_SA).to(device)
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         """The rows of the table."""

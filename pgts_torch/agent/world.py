@@ -13,12 +13,12 @@ import torch
 from gymnasium.spaces import Space
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import iterate
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from pgts_torch.agent.observations import Observations
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import Model
+from pgts_torch.models.base import EnumeratingModel, LearningModel, Model
 from pgts_torch.models.dynamics import DynamicsModel
 from pgts_torch.models.masks import ActionMasks, Masked
 from pgts_torch.models.provenance import draws_its_own
@@ -48,6 +48,7 @@ class World:
     mdp: the exact MDP, where it is known.
     start_S: the start distribution mu over all states; None where it is known from episodes only.
     reward_range: the bounds that rewards of single steps are checked against; None: they are not checked.
+    shows_masks: whether what `encode` returns has the legal actions; else policies know them by the state.
     masks: how action masks are read, so that observations are `Masked`; "off": they are not, if there are any; None:
         there are none.
 
@@ -62,6 +63,7 @@ class World:
     perceive: Callable[[Tensor], Tensor]
     perceived_space: Space[Any]
     warned: bool = False
+    shows_masks: bool = True
     model: Model | None = None
     mdp: TabularMDP | None = None
     start_S: Float[Tensor, "S"] | None = None
@@ -79,7 +81,7 @@ class World:
     ) -> None:
         self.env, self.gamma, self.masks, self.device = env, gamma, masks, torch.device(device)
         self.num_actions = int(env.single_action_space.n)  # type: ignore[attr-defined]  # checked before
-        masked = self.num_actions if isinstance(masks, ActionMasks) else None
+        masked = self.num_actions if isinstance(masks, ActionMasks) and self.shows_masks else None
         self.observations = Observations(env, observed, self.device, numbered=numbered, masked=masked)
         self.observation_space = self.perceived_space = self.observations.space
         self.perceive = _as_it_is
@@ -92,7 +94,8 @@ class World:
     def of(self, env: VectorEnv) -> "World":
         """A world without a model for other environments of the same kind; warnings are not repeated in it."""
         seen, shared = self.observations, {"masks": self.masks, "device": self.device}
-        world = World(env, gamma=self.gamma, observed=seen.options, numbered=seen.numbered, **shared)  # type: ignore[arg-type]
+        kind = World if self.shows_masks else _StateWorld
+        world = kind(env, gamma=self.gamma, observed=seen.options, numbered=seen.numbered, **shared)  # type: ignore[arg-type]
         world.warned, world.perceive, world.perceived_space = True, self.perceive, self.perceived_space
         return world
 
@@ -121,6 +124,12 @@ class World:
     def draws_its_own(self) -> bool:
         """Whether the environments are known to use random generators of their own only."""
         return all(map(draws_its_own, each_of(self.env)))
+
+
+class _StateWorld(World):
+    """Environments whose observations are states, by which policies know the legal actions."""
+
+    shows_masks = False
 
 
 class ModelWorld(World, ABC):
@@ -178,6 +187,7 @@ class TabularWorld(ModelWorld):
     """
 
     keeps_numbers = True
+    shows_masks = False
 
     def __init__(
         self,
@@ -201,6 +211,16 @@ class TabularWorld(ModelWorld):
     def mdp_shape(self) -> tuple[int, int]:
         """S and A."""
         return self.model.num_states, self.num_actions
+
+    @cached_property
+    def legal_SA(self) -> Bool[Tensor, "S A"] | None:
+        """The actions that a table does not forbid, with rewards of -inf; None: all are allowed."""
+        model = self.model
+        if not isinstance(model, EnumeratingModel) or isinstance(model, LearningModel):
+            return None
+        every_S = torch.arange(model.num_states, device=self.device)
+        legal_SA = (model.outcomes(every_S) if model.table is None else model.table).legal_NA
+        return None if legal_SA.all() else legal_SA
 
     def read(self, observation: Any, encoded_B: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
         return encoded_B

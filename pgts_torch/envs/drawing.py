@@ -4,7 +4,6 @@ import math
 from typing import final
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pgts_torch.errors import PgtsError
@@ -113,7 +112,8 @@ def _layout(mdp: TabularMDP) -> tuple[int, int]:
 
 def _entered(mdp: TabularMDP) -> Bool[np.ndarray, "S"]:
     """The states that some episode enters, the terminal ones included."""
-    uniform_SA = torch.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions, dtype=torch.float64)
+    legal_SA = mdp.outcomes.legal_NA.double()
+    uniform_SA = legal_SA / legal_SA.sum(-1, keepdim=True)
     entered_S = exact.support(mdp, uniform_SA)
     outcomes = mdp.outcomes.rows(entered_S.nonzero().flatten())
     entered_S[outcomes.child_NAK[outcomes.prob_NAK > 0]] = True

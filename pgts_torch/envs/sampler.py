@@ -1,10 +1,11 @@
 """Sampling outcomes and start states of a tabular MDP, for one environment or many at once."""
 
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from pgts_torch.errors import PgtsError
 from pgts_torch.tabular.mdp import TabularMDP
 
 
@@ -18,7 +19,8 @@ class OutcomeSampler:
     possible outcome on, so that a row which sums to a little less than 1 has no gap at its end.
 
     Pairs (s, a) and outcomes are named by their position in the flattened tables: `pair = s * A + a`, and an outcome
-    indexes `reward_SAK`, `child_SAK` and `discount_SAK` by `take`. K is padded to a power of two.
+    indexes `reward_SAK`, `child_SAK` and `discount_SAK` by `take`. K is padded to a power of two. `legal_SA` are the
+    actions that are allowed; None: all are.
     """
 
     def __init__(self, mdp: TabularMDP) -> None:
@@ -29,6 +31,7 @@ class OutcomeSampler:
         self.discount_SAK = _pad(outcomes.discount_NAK.numpy(), self.width, 0.0)
         self.child_SAK = _pad(outcomes.child_NAK.numpy(), self.width, 0)
         self.cumulative_SAK = _pad(_distribution_function(outcomes.prob_NAK.numpy()), self.width, 1.0)
+        self.legal_SA = None if outcomes.legal_NA.all() else outcomes.legal_NA.numpy()
         self.start_cumulative_S = _distribution_function(mdp.start_S.numpy())
 
     def outcomes(self, random: np.random.Generator, pair_B: Int[np.ndarray, "B"]) -> Int[np.ndarray, "B"]:
@@ -47,6 +50,16 @@ class OutcomeSampler:
             outcome_B += half * (self.cumulative_SAK.take(outcome_B + (half - 1)) <= uniform_B)
             half //= 2
         return outcome_B
+
+    def masks(self, state: Any) -> dict[str, np.ndarray]:
+        """What `info` says of the actions that are allowed in a state, or in each of several; nothing if all are."""
+        return {} if self.legal_SA is None else {"action_mask": self.legal_SA[state].astype(np.int8)}
+
+    def check_legal(self, state_B: Int[np.ndarray, "B"], action_B: Int[np.ndarray, "B"]) -> None:
+        """PgtsError where one of these actions is not allowed."""
+        if self.legal_SA is not None and not (legal_B := self.legal_SA[state_B, action_B]).all():
+            b = int(legal_B.argmin())
+            raise PgtsError(f"action {action_B[b]} is not allowed in state {state_B[b]}")
 
     def starts(self, random: np.random.Generator, count: int) -> Int[np.ndarray, "count"]:
         """`count` states sampled from the start distribution."""

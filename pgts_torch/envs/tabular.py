@@ -21,14 +21,15 @@ class TabularEnv(gymnasium.Env):
     """A tabular MDP to act in: the observation is the state's number.
 
     A step pays the reward of the sampled outcome. `info["discount"]` is its discount (`metadata["discounts"]`), and
-    `terminated` says that it is 0. There is no time limit inside; registration adds one as a wrapper.
+    `terminated` says that it is 0. Where the MDP does not allow all actions, `info["action_mask"]` has a 1 for those
+    that it does. There is no time limit inside; registration adds one as a wrapper.
 
     Args:
         mdp: the MDP; kept as `mdp`.
         render_mode: "ansi", "rgb_array" or None.
 
     Raises:
-        PgtsError: the render mode, an action, or a state to start in does not exist.
+        PgtsError: the render mode, an action, or a state to start in does not exist; or an action is not allowed.
         ResetNeeded: `step` or `render` before the first reset, or `step` after the end of the episode.
     """
 
@@ -70,7 +71,7 @@ class TabularEnv(gymnasium.Env):
         self.last_action = None
         self.num_steps = 0
         assert self._state is not None
-        return self._state, {}
+        return self._state, {**self._sampler.masks(self._state)}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
         """Sample one outcome of the state and the action."""
@@ -80,6 +81,7 @@ class TabularEnv(gymnasium.Env):
             raise ResetNeeded(f"the episode ended in state {self._state}; call env.reset() before the next env.step()")
         if not self.action_space.contains(action):
             raise PgtsError(f"action {action!r} does not exist; actions are 0 to {self.mdp.num_actions - 1}")
+        self._sampler.check_legal(np.array([self._state]), np.array([action]))
         pair = self._state * self.mdp.num_actions + int(action)
         (outcome,) = self._sampler.outcomes(self.np_random, np.array([pair]))
         discount = float(self._sampler.discount_SAK.take(outcome))
@@ -87,7 +89,8 @@ class TabularEnv(gymnasium.Env):
         self._ended = discount == 0
         self.last_action = int(action)
         self.num_steps += 1
-        return self._state, float(self._sampler.reward_SAK.take(outcome)), self._ended, False, {"discount": discount}
+        info = {"discount": discount, **self._sampler.masks(self._state)}
+        return self._state, float(self._sampler.reward_SAK.take(outcome)), self._ended, False, info
 
     def render(self) -> RenderFrame | list[RenderFrame] | None:
         """A text or a picture [height, width, 3], as `render_mode` says."""

@@ -31,8 +31,8 @@ Flags = Bool[np.ndarray, "B"]
 class TabularVectorEnv(gymnasium.vector.VectorEnv):
     """`num_envs` environments of one MDP that share one random generator; a step is a few array operations for all.
 
-    Rewards and `info["discount"]` are those of `TabularEnv`. An environment is truncated when it has made
-    `max_episode_steps` steps. What then happens to it is Gymnasium's `AutoresetMode`:
+    Rewards, `info["discount"]` and `info["action_mask"]` are those of `TabularEnv`. An environment is truncated when it
+    has made `max_episode_steps` steps. What then happens to it is Gymnasium's `AutoresetMode`:
 
         NEXT_STEP   the next step starts a new episode instead of stepping: reward 0, its action ignored
         SAME_STEP   a new episode starts at once; the last state is in `info["final_obs"]`
@@ -108,7 +108,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         self._seed(seed)
         self._start_episodes(mask_B, state_B)
         self._was_reset = True
-        return self._state_B.copy(), {}
+        return self._state_B.copy(), self._sampler.masks(self._state_B)
 
     def step(self, actions: ArrayLike) -> tuple[States, Rewards, Flags, Flags, dict[str, Any]]:
         """Sample one outcome for every environment: states, rewards, terminated, truncated, info, each of shape [B]."""
@@ -120,6 +120,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
                 f"the episode of environment {int(self._over_B.argmax())} is over; "
                 f"reset it with env.reset(options={{'reset_mask': mask}}) before the next env.step()"
             )
+        self._sampler.check_legal(self._state_B[~self._over_B], action_B[~self._over_B])
         pair_B = self._state_B * self.mdp.num_actions + action_B
         outcome_B = self._sampler.outcomes(self.np_random, pair_B)
         self._state_B = self._sampler.child_SAK.take(outcome_B)
@@ -137,6 +138,7 @@ class TabularVectorEnv(gymnasium.vector.VectorEnv):
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over_B.any():
             info |= self._final(discount_B)
             self._start_episodes(self._over_B)
+        info |= self._sampler.masks(self._state_B)
         return self._state_B.copy(), reward_B, terminated_B, truncated_B, info
 
     def render(self) -> tuple[RenderFrame, ...]:

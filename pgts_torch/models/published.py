@@ -173,7 +173,10 @@ def _transformed(mdp: TabularMDP, positions: Sequence[int], transforms: Transfor
     order, old = torch.tensor(positions), mdp.outcomes
     reward_SA = old.reward_NA[:, order]
     if transforms.rewards:
-        reward_SA = reward_SA.clone().apply_(lambda reward: number_of("reward", transforms.reward(reward)))
+        legal_SA = reward_SA > -torch.inf
+        paid_SA = torch.where(legal_SA, reward_SA, 0.0)
+        paid_SA.apply_(lambda reward: number_of("reward", transforms.reward(reward)))
+        reward_SA = torch.where(legal_SA, paid_SA, -torch.inf)
     prob_SAK, discount_SAK, child_SAK = (x[:, order] for x in (old.prob_NAK, old.discount_NAK, old.child_NAK))
     outcomes = Outcomes(reward_SA, prob_SAK, discount_SAK, child_SAK, old.num_children)
     return replace(mdp, outcomes=outcomes, action_names=tuple(mdp.action_names[a] for a in positions))

@@ -91,7 +91,7 @@ def projected_step(
 
     pi'(.|s) = proj[ pi(.|s) + eta w(s) q(s, .) ]
     """
-    return project_simplex(pi_NA + step_size * weight_N[:, None] * q_NA)
+    return project_simplex(pi_NA + scaled(q_NA, step_size * weight_N))
 
 
 def mirror_step(
@@ -101,7 +101,12 @@ def mirror_step(
 
     pi'(a|s) ~ pi(a|s) exp(eta w(s) q(s, a)) = argmax_p  eta w(s) <p, q(s, .)> - KL(p, pi(.|s))
     """
-    return (pi_NA.log() + step_size * weight_N[:, None] * q_NA).softmax(-1)
+    return (pi_NA.log() + scaled(q_NA, step_size * weight_N)).softmax(-1)
+
+
+def scaled(q_NA: Float[Tensor, "N A"], factor_N: Float[Tensor, "N"]) -> Float[Tensor, "N A"]:
+    """factor(s) q(s, a); -inf where an action is not allowed, also where the factor is 0."""
+    return torch.where(q_NA > -math.inf, factor_N[:, None] * q_NA, -math.inf)
 
 
 def softmax_direction(

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pgts_torch.bellman import Outcomes, backup
+from pgts_torch.bellman import Outcomes, backup, policy_mean
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.tabular.improvement import improve, total_weights
 from pgts_torch.tabular.mdp import TabularMDP
@@ -75,7 +75,7 @@ def policy_values(
         near_S: values near them, from which an iterative solve starts. Default: 0.
     """
     pi_SA = check_policy(mdp, pi_SA)
-    return _solve(mdp, pi_SA, (pi_SA * mdp.outcomes.reward_NA).sum(-1), transpose=False, near_S=near_S)
+    return _solve(mdp, pi_SA, policy_mean(pi_SA, mdp.outcomes.reward_NA), transpose=False, near_S=near_S)
 
 
 def occupancy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S"]:
@@ -139,7 +139,8 @@ def optimal(mdp: TabularMDP, tolerance: float | None = None) -> Optimum:
         pi_SA = torch.nn.functional.one_hot(action_S, mdp.num_actions).double()
         v_S = policy_values(mdp, pi_SA, near_S=v_S)
         q_SA = backup(mdp.outcomes, v_S)
-        rounding = 1e-11 * max(float(q_SA.abs().max()), float(mdp.outcomes.reward_NA.abs().max()))
+        legal_SA = mdp.outcomes.legal_NA
+        rounding = 1e-11 * max(float(q_SA[legal_SA].abs().max()), float(mdp.outcomes.finite_rewards.abs().max()))
         kept_S = q_SA.gather(1, action_S[:, None]).squeeze(1)
         better_S = q_SA.amax(-1) > kept_S + rounding
         if not better_S.any():
@@ -161,7 +162,8 @@ def _optimal_within(mdp: TabularMDP, tolerance: float) -> Optimum:
 
 
 def check_policy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, "S A"]:
-    """pi in float64, its rows summing to 1 in that precision; PgtsError unless each row is a distribution."""
+    """pi in float64, its rows summing to 1 in that precision; PgtsError unless each row is a distribution over the
+    actions that are allowed."""
     if pi_SA.shape != (mdp.num_states, mdp.num_actions):
         raise PgtsError(f"pi_SA has shape {tuple(pi_SA.shape)}; the MDP needs {(mdp.num_states, mdp.num_actions)}")
     tolerance = 1e-9 if pi_SA.dtype == torch.float64 else 1e-5
@@ -170,6 +172,9 @@ def check_policy(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Float[Tensor, 
     if bad_S.any():
         s = int(torch.nonzero(bad_S)[0])
         raise PgtsError(f"pi_SA[{s}] is not a distribution: {pi_SA[s].tolist()}")
+    if (illegal_SA := (pi_SA > 0) & ~mdp.outcomes.legal_NA).any():
+        s, a = torch.nonzero(illegal_SA)[0].tolist()
+        raise PgtsError(f"pi_SA[{s}, {a}] is {float(pi_SA[s, a])}; action {a} is not allowed in state {s}")
     return pi_SA / pi_SA.sum(-1, keepdim=True)
 
 
@@ -206,9 +211,10 @@ def ends(outcomes: Outcomes) -> Bool[Tensor, "S A"]:
 
 def _ending_actions(outcomes: Outcomes, action_S: Tensor) -> Tensor:
     """The given actions, but in states from which these might never end, one that leads toward an end."""
-    ends_SA, found_S = ends(outcomes), torch.zeros(outcomes.num_states, dtype=torch.bool)
+    ends_SA, found_S = ends(outcomes) & outcomes.legal_NA, torch.zeros(outcomes.num_states, dtype=torch.bool)
     while True:
-        leads_SA = ends_SA | (torch.mv(outcomes.weight, found_S.double()).view(ends_SA.shape) > 0)
+        leads_SA = torch.mv(outcomes.weight, found_S.double()).view(ends_SA.shape) > 0
+        leads_SA = ends_SA | (leads_SA & outcomes.legal_NA)
         new_S = leads_SA.any(-1) & ~found_S
         if not new_S.any():
             return action_S

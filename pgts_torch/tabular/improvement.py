@@ -46,7 +46,8 @@ def improve(outcomes: Outcomes, *, error: float) -> Improved:
             Infinite: it ends as soon as the actions stay the same.
     """
     low, high = total_weights(outcomes)
-    largest_reward, rounding = float(outcomes.reward_NA.abs().max()), (outcomes.num_outcomes + 4) * _EPS / (1 - high)
+    largest_reward = float(outcomes.finite_rewards.abs().max())
+    rounding = (outcomes.num_outcomes + 4) * _EPS / (1 - high)
     v_S = torch.zeros(outcomes.num_states, dtype=outcomes.dtype)
     before_S, best, stalled, times = None, None, 0, _EVALUATIONS
     while True:

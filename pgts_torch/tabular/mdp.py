@@ -26,7 +26,9 @@ class TabularMDP:
     """Outcomes over all S states and a start distribution, in float64.
 
     Args:
-        outcomes: what may follow every state; children are states.
+        outcomes: what may follow every state; children are states. A reward of -inf says that an action is not allowed
+            there: no policy takes it and its value is -inf. What follows it does not matter; it becomes what follows
+            the first action that is allowed.
         start_S: start distribution mu [PGTS Sec. 2].
         action_names: one word an action, for pictures and messages. Default "0", "1", ...
         shape: (rows, columns) in which a picture lays the states out, row by row. Default one row.
@@ -45,6 +47,7 @@ class TabularMDP:
     reward_SAK: Float[Tensor, "S A K"] | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "outcomes", _allowed_only(self.outcomes))
         _check_outcomes(self.outcomes)
         if not self.action_names:
             object.__setattr__(self, "action_names", tuple(str(a) for a in range(self.num_actions)))
@@ -196,6 +199,22 @@ class TabularMDP:
             raise PgtsError(f"{path}: {npz.in_words_of_the_file(str(error))}") from error
 
 
+def _allowed_only(outcomes: Outcomes) -> Outcomes:
+    """The outcomes with those of the first action that is allowed in place of those of each action that is not. So what
+    may follow a state at all is what follows the actions that are allowed."""
+    if outcomes.reward_NA.ndim != 2 or outcomes.child_NAK.ndim != 3 or outcomes.reward_NA.shape[1] == 0:
+        return outcomes  # which is no table
+    legal_NA = outcomes.legal_NA
+    if legal_NA.all() or legal_NA.shape != outcomes.child_NAK.shape[:2] or outcomes.reward_NA.isnan().any():
+        return outcomes
+    action_NA = torch.where(legal_NA, torch.arange(legal_NA.shape[1]), legal_NA.int().argmax(-1, keepdim=True))
+    state_N1 = torch.arange(len(legal_NA))[:, None]
+    prob_NAK, discount_NAK, child_NAK = (
+        x[state_N1, action_NA] for x in (outcomes.prob_NAK, outcomes.discount_NAK, outcomes.child_NAK)
+    )
+    return Outcomes(outcomes.reward_NA, prob_NAK, discount_NAK, child_NAK, outcomes.num_children)
+
+
 def check_gamma(gamma: float) -> None:
     """Raise PgtsError unless gamma is in [0, 1]."""
     if not 0 <= gamma <= 1:
@@ -218,9 +237,10 @@ def _check_rewards(reward_SAK: Tensor, outcomes: Outcomes) -> None:
             f"reward_SAK is {reward_SAK.dtype} with shape {tuple(reward_SAK.shape)}; it must be torch.float64 with "
             f"shape {tuple(outcomes.prob_NAK.shape)}"
         )
-    _refuse(~torch.isfinite(reward_SAK).all(-1), "reward_SAK[{}, {}] is", reward_SAK, "rewards must be finite")
+    off_SA = ~torch.isfinite(reward_SAK).all(-1) & outcomes.legal_NA
+    _refuse(off_SA, "reward_SAK[{}, {}] is", reward_SAK, "rewards must be finite")
     mean_SA, largest_SA = (outcomes.prob_NAK * reward_SAK).sum(-1), reward_SAK.abs().amax(-1)
-    off_SA = (mean_SA - outcomes.reward_NA).abs() > MEAN_TOLERANCE * largest_SA
+    off_SA = ((mean_SA - outcomes.reward_NA).abs() > MEAN_TOLERANCE * largest_SA) & outcomes.legal_NA
     must = "reward_NA must be the same; reward_SAK=None where each outcome pays the mean"
     _refuse(off_SA, "reward_SAK[{}, {}] has the mean", mean_SA, must)
 
@@ -237,7 +257,9 @@ def _check_outcomes(outcomes: Outcomes) -> None:
             raise PgtsError(f"{name} has shape {tuple(tensor.shape)}; child_NAK needs {tuple(child.shape[:axes])}")
         if tensor.dtype != torch.float64:
             raise PgtsError(f"{name} is {tensor.dtype}; the exact world is float64")
-    _refuse(~torch.isfinite(reward), "R_SA[{}, {}] is", reward, "rewards must be finite")
+    off_SA = ~torch.isfinite(reward) & (reward != -torch.inf)
+    _refuse(off_SA, "R_SA[{}, {}] is", reward, "rewards must be finite, or -inf where an action is not allowed")
+    _refuse(~outcomes.legal_NA.any(-1), "R_SA[{}] is", reward, "one action of each state must be allowed")
     off_SA = ~((prob >= 0) & (prob <= 1 + EXACT)).all(-1)
     _refuse(off_SA, "P_SAS[{}, {}] has probabilities", prob, "each must be in [0, 1]")
     total_SA = prob.sum(-1)
@@ -248,7 +270,7 @@ def _check_outcomes(outcomes: Outcomes) -> None:
     # So that no value, 1 / (1 - discount) times a reward, and no difference of values is infinite.
     most = LARGEST_VALUE * max(1 - float(discount.max()), 1e-100)
     must = f"with discounts up to {discount.max():.6g} rewards may be at most {most:.2g} in size"
-    _refuse(reward.abs() > most, "R_SA[{}, {}] is", reward, must)
+    _refuse((reward.abs() > most) & outcomes.legal_NA, "R_SA[{}, {}] is", reward, must)
     off_SA = ((child < 0) | (child >= outcomes.num_children)).any(-1)
     _refuse(off_SA, "child_NAK[{}, {}] is", child, f"states are 0 to {outcomes.num_children - 1}")
 

@@ -109,7 +109,7 @@ def worst_case_bound(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -
 
 def worst_policy(mdp: TabularMDP) -> Float[Tensor, "S A"]:
     """A deterministic policy with the least value in every state: the optimum of the negated rewards."""
-    negated = replace(mdp.outcomes, reward_NA=-mdp.outcomes.reward_NA)
+    negated = replace(mdp.outcomes, reward_NA=torch.where(mdp.outcomes.legal_NA, -mdp.outcomes.reward_NA, -math.inf))
     return exact.optimal(replace(mdp, outcomes=negated, reward_SAK=None)).pi_SA
 
 
@@ -174,7 +174,7 @@ def _reward_bound(mdp: TabularMDP, depth: int, states_S: Bool[Tensor, "S"]) -> f
     if not states_S.any():
         return 0.0
     outcomes, gamma = mdp.outcomes.rows(states_S.nonzero().flatten()), largest_discount(mdp.outcomes)
-    low, high = float(outcomes.reward_NA.min()), float(outcomes.reward_NA.max())
+    low, high = (float(x) for x in torch.aminmax(outcomes.finite_rewards))
     if _has_ends(outcomes, gamma):
         low, high = min(low, 0.0), max(high, 0.0)
     if high == low:

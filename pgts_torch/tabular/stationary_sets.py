@@ -86,10 +86,13 @@ def enumerate_sets(
 
     Raises:
         PgtsError: the MDP has more than `max_policies` deterministic policies, or one without a value (gamma is 1 and
-            it never ends).
+            it never ends), or does not allow all actions.
     """
     S, A = mdp.num_states, mdp.num_actions
     check_enumerable(S, A, max_policies=max_policies)
+    if not mdp.outcomes.legal_NA.all():
+        s, a = torch.nonzero(~mdp.outcomes.legal_NA)[0].tolist()
+        raise PgtsError(f"action {a} is not allowed in state {s}; policies are enumerated where all actions are")
     _check_all_end(mdp.outcomes)
     optimum = exact.optimal(mdp)
     slack = _slack(mdp, optimum, tolerance)
@@ -209,7 +212,15 @@ def _policies(low: int, high: int, num_states: int, num_actions: int) -> Int[Ten
 
 def _slack(mdp: TabularMDP, optimum: exact.Optimum, tolerance: float) -> float:
     """The tolerance in reward units; multiplying all rewards by a number changes no stationary set."""
-    return tolerance * float(torch.maximum(optimum.q_SA.abs().max(), mdp.outcomes.reward_NA.abs().max()))
+    largest_q = optimum.q_SA[mdp.outcomes.legal_NA].abs().max()
+    return tolerance * float(torch.maximum(largest_q, mdp.outcomes.finite_rewards.abs().max()))
+
+
+def _check_all_allowed(outcomes: Outcomes) -> None:
+    """PgtsError where not all actions are allowed, so that not every table of actions is a policy."""
+    if not outcomes.legal_NA.all():
+        s, a = torch.nonzero(~outcomes.legal_NA)[0].tolist()
+        raise PgtsError(f"action {a} is not allowed in state {s}; policies are enumerated where all actions are")
 
 
 def _check_all_end(outcomes: Outcomes) -> None:

@@ -85,7 +85,7 @@ def probs_by_state(model: PGTS) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("env", "search"),
-    [*itertools.product(ENVIRONMENTS, ["m = 0", "expectimax", "none"]), *[("info", search) for search in SEARCHES]],
+    [*itertools.product(ENVIRONMENTS, ["expectimax", "none"]), *[("info", search) for search in SEARCHES]],
 )
 def test_no_illegal_action_is_taken_in_training_evaluation_and_after_loading(env, search, tmp_path):
     make = lambda: TimeLimit(ENVIRONMENTS[env](), 6)  # noqa: E731
