@@ -11,6 +11,7 @@ from torch import Tensor
 from pgts_torch.agent.advantages import critic_targets
 from pgts_torch.agent.components import legal_only
 from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.dense_steps import dense_steps
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.networks import Network, Trunk, default_network, make_trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
@@ -198,22 +199,31 @@ class NetworkCritic(Critic):
             self._rescale(target_V, share.ranks)
         y_V = torch.where(self._scale == 0, 0.0, (target_V - self._mean) / self._scale)
         columns = input_V, action_V, y_V.float()
-        for _ in range(num_passes):
-            made_of = minibatches(columns, self.options.minibatch_size, share, generator=generator)
-            for count, (input_N, action_N, y_N) in made_of:
-                made = Forward(self.network, input_N)
-                off_N = self._taken(made.output_ND, action_N) - y_N
-                # The gradient of mean_n off_n^2 in the outputs, of which each row has one that counts.
-                down_N1 = (2 / count * off_N)[:, None]
-                if self.target == "v":
-                    down_ND = down_N1
-                else:
-                    down_ND = torch.zeros_like(made.output_ND).scatter_(-1, action_N[:, None], down_N1)
-                own = made.gradients(down_ND), off_N.square().sum() / count
-                gradients, (loss,) = share.ranks.summed("the gradient of values", *own)
-                readings.add(value_grad_norm=self._optimiser.step(self.network.weights, gradients, loss, "value"))
+        with dense_steps(self.network, self._optimiser) as steps:
+            for _ in range(num_passes):
+                for count, part in minibatches(columns, self.options.minibatch_size, share, generator=generator):
+                    if steps is None:
+                        norm: Tensor | float = self._step(count, part, share.ranks)
+                    else:
+                        norm = steps.values(count, part, share.ranks)[0]
+                    readings.add(value_grad_norm=norm)
         self._num_fits += 1
         self._move_target_network()
+
+    def _step(self, count: int, part: tuple[Tensor, ...], ranks: Ranks) -> Tensor:
+        """Take a step on these rows of a minibatch, which has `count` in all processes. Return the gradient's norm."""
+        input_N, action_N, y_N = part
+        made = Forward(self.network, input_N)
+        off_N = self._taken(made.output_ND, action_N) - y_N
+        # The gradient of mean_n off_n^2 in the outputs, of which each row has one that counts.
+        down_N1 = (2 / count * off_N)[:, None]
+        if self.target == "v":
+            down_ND = down_N1
+        else:
+            down_ND = torch.zeros_like(made.output_ND).scatter_(-1, action_N[:, None], down_N1)
+        own = made.gradients(down_ND), off_N.square().sum() / count
+        gradients, (loss,) = ranks.summed("the gradient of values", *own)
+        return self._optimiser.step(self.network.weights, gradients, loss, "value")
 
     def v(self, observation_N: Tensor) -> Float[Tensor, "N"]:
         """The network's value; for a network of Q, sum_a pi(a|o) Q(o, a)."""

@@ -8,8 +8,10 @@ from the action taken, A_t / pi(a_t|s_t) for it and 0 for the others, a row for 
     sum_a pi_old(a|s) min(rho_a adv, clip(rho_a) adv)           is                    min(rho A_t, clip(rho) A_t)
 """
 
+import math
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, final
 
@@ -18,6 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pgts_torch.agent.components import legal_only
+from pgts_torch.agent.dense_steps import dense_steps
 from pgts_torch.agent.gradients import Forward, through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
@@ -41,12 +44,14 @@ class NetworkUpdate(Update):
     """Gradient steps on the parameters of a network policy.
 
     now: the options, with the present values of those that are schedules.
+    form: what its objective is for `DenseSteps.policy`.
 
     The batch is added to running statistics of observations after the steps, so that these start from the policy that
     collected it; only the first batch of all is added before.
     """
 
     policies = (NetworkPolicy,)
+    form: str
 
     def __init__(self, options: Any) -> None:
         self.options, self.state_weight = options, options.state_weight
@@ -115,24 +120,63 @@ class NetworkUpdate(Update):
             log pi before and after the steps, without gradient.
         """
 
-    def step(
-        self, made: Forward, down_NA: Float[Tensor, "N A"], ranks: Ranks, *losses: Tensor, most: float | None = None
-    ) -> tuple[Tensor, Sequence[Tensor]] | None:
-        """Take one step (see `Optimiser.step`) down the sum of a loss over ranks.
+    @abstractmethod
+    def objective(
+        self, log_NA: Float[Tensor, "N A"], part: Sequence[Tensor], count: int
+    ) -> tuple[Float[Tensor, "N A"], list[Tensor]]:
+        """Return the gradient of the loss in log pi(a|s), and these rows' parts of the loss and of KL(pi_old || pi).
 
         Args:
-            made: the pass of the rows of this process.
-            down_NA: the gradient of its part of the loss in the logits.
-            losses: its parts of the loss and of other numbers.
-            most: if the sum of the last one is above it no step is taken; None: one is.
-
-        Returns:
-            The norm of the gradient, and the sums of `losses`; None where no step was taken.
+            part: the columns of a minibatch but for its inputs, as `DenseSteps.policy` takes them.
+            count: its rows, these and those of other processes.
         """
-        gradients, sums = ranks.summed("the gradient of the policy", made.gradients(down_NA), *losses)
-        if most is not None and float(sums[-1]) > most:
+
+    def descend(
+        self,
+        network: Network,
+        parts: Iterable[tuple[int, Sequence[Tensor]]],
+        batch: Batch,
+        *,
+        clip: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        most: float | None = None,
+    ) -> Iterator[tuple[Tensor | float, Tensor | float]]:
+        """Take a step for each minibatch. Yield the norm of the gradient and the loss.
+
+        Args:
+            parts: how many rows the minibatch has in all processes, and those of this one (`with_legal`).
+            clip: the range of ratios, and the weight of entropy.
+            most: steps end once KL(pi_old || pi) is above it.
+        """
+        has_mask = batch.legal_NA is not None
+        with nullcontext() if has_mask else dense_steps(network, self._optimiser, clip) as steps:
+            for count, part in parts:
+                stepped: tuple[Tensor | float, Tensor | float] | None
+                if steps is None:
+                    rows, legal_NA = (part[:-1], part[-1]) if has_mask else (part, None)
+                    stepped = self._step(network, count, rows, legal_NA, batch.ranks, most)
+                else:
+                    stepped = steps.policy(self.form, count, part, batch.ranks, most)
+                if stepped is None:
+                    return
+                yield stepped
+
+    def _step(
+        self,
+        network: Network,
+        count: int,
+        part: Sequence[Tensor],
+        legal_NA: Bool[Tensor, "N A"] | None,
+        ranks: Ranks,
+        most: float | None,
+    ) -> tuple[Tensor, Tensor] | None:
+        made = Forward(network, part[0])
+        log_NA = log_softmax(made.output_ND, legal_NA)
+        down_NA, losses = self.objective(log_NA, part[1:], count)
+        own = made.gradients(through_log_softmax(log_NA, down_NA))
+        gradients, sums = ranks.summed("the gradient of the policy", own, *losses)
+        if most is not None and float(sums[1]) > most:
             return None
-        return self._optimiser.step(made.network.weights, gradients, sums[0], "policy"), sums
+        return self._optimiser.step(network.weights, gradients, sums[0], "policy"), sums[0]
 
 
 @final
@@ -145,6 +189,7 @@ class GradientUpdate(NetworkUpdate):
     """
 
     options: Gradient
+    form = "free"
 
     def __init__(self, options: Gradient = Gradient()) -> None:  # noqa: B008 - frozen
         super().__init__(options)
@@ -153,18 +198,22 @@ class GradientUpdate(NetworkUpdate):
         self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator, readings: Readings
     ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
         """Losses: policy, minus the objective without entropy, before the step; grad_norm, before clipping."""
-        made, coef = Forward(network, input_N), self.now.entropy_coef
-        log_NA, slope_NA = log_softmax(made.output_ND, batch.legal_NA), batch.advantage_NA.float()
-        pi_NA = log_NA.exp()
-        policy_loss = loss = -(batch.weight_N @ (pi_NA * slope_NA).sum(-1))
+        old_NA = torch.empty(batch.advantage_NA.shape, dtype=input_N.dtype, device=input_N.device)
+        rows = with_legal([input_N, old_NA, batch.advantage_NA.float(), batch.weight_N], batch.legal_NA)
+        for norm, loss in self.descend(network, [(1, rows)], batch, clip=(0.0, math.inf, self.now.entropy_coef)):
+            readings.add(policy=loss, grad_norm=norm)
+        return old_NA, log_probs(network, input_N, batch.legal_NA)
+
+    def objective(
+        self, log_NA: Float[Tensor, "N A"], part: Sequence[Tensor], count: int
+    ) -> tuple[Float[Tensor, "N A"], list[Tensor]]:
+        (old_NA, slope_NA, weight_N), coef, pi_NA = part, self.now.entropy_coef, log_NA.exp()
+        old_NA.copy_(log_NA)
+        loss = -(weight_N @ (pi_NA * slope_NA).sum(-1))
         if coef:
             # sum_a pi (adv - coef (log pi + 1)) d log pi  is the change of the objective of a state.
-            loss, slope_NA = loss - coef * (batch.weight_N @ entropy(log_NA)), slope_NA - coef * (log_NA + 1)
-        down_NA = -batch.weight_N[:, None] * slope_NA * pi_NA
-        stepped = self.step(made, through_log_softmax(log_NA, down_NA), batch.ranks, loss, policy_loss)
-        assert stepped is not None
-        readings.add(policy=stepped[1][1], grad_norm=stepped[0])
-        return log_NA, log_probs(network, input_N, batch.legal_NA)
+            slope_NA = slope_NA - coef * (log_NA + 1)
+        return -weight_N[:, None] * slope_NA * pi_NA, [loss]
 
 
 @final
@@ -181,6 +230,7 @@ class PPOUpdate(NetworkUpdate):
     """
 
     options: PPO
+    form = "clipped"
 
     def __init__(self, options: PPO = PPO()) -> None:  # noqa: B008 - frozen
         super().__init__(options)
@@ -191,21 +241,15 @@ class PPOUpdate(NetworkUpdate):
         """Losses: policy, minus the objective without entropy, mean over the steps; grad_norm, mean, before clipping;
         clip_fraction, the probability of actions whose rho is out of range after the steps; num_steps."""
         old_NA, advantage_NA = log_probs_before(network, input_N, batch), batch.advantage_NA.float()
-        share, most = batch.ranks.share("rows", len(input_N)), self.options.target_kl
+        share = batch.ranks.share("rows", len(input_N))
         weight_N = batch.weight_N / share.mean("weights", batch.weight_N)
         if self.options.normalize_advantage:
             advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N, share)
-        columns, num_steps = (input_N, old_NA, advantage_NA, weight_N), 0
-        made = passes(network, columns, batch.legal_NA, share, self.options, generator)
-        for forward, log_NA, count, (_, before_NA, part_NA, part_N) in made:
-            gain_NA, down_NA = self.objective(log_NA, before_NA, part_NA, part_N, count)
-            losses = [-mean(part_N, gain_NA.sum(-1), count)]
-            if most is not None:
-                losses.append(mean(part_N, divergence(before_NA, log_NA), count))
-            stepped = self.step(forward, through_log_softmax(log_NA, down_NA), batch.ranks, *losses, most=most)
-            if stepped is None:
-                break
-            readings.add(policy=stepped[1][0], grad_norm=stepped[0])
+        columns, num_steps, clip = [input_N, old_NA, advantage_NA, weight_N], 0, self.now.clip_range
+        parts = passes(with_legal(columns, batch.legal_NA), share, self.options, generator)
+        clips = 1 - clip, 1 + clip, self.now.entropy_coef
+        for norm, loss in self.descend(network, parts, batch, clip=clips, most=self.options.target_kl):
+            readings.add(policy=loss, grad_norm=norm)
             num_steps += 1
         new_NA = log_probs(network, input_N, batch.legal_NA)
         outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.now.clip_range
@@ -216,36 +260,26 @@ class PPOUpdate(NetworkUpdate):
         return old_NA, new_NA
 
     def objective(
-        self,
-        log_NA: Float[Tensor, "N A"],
-        old_NA: Float[Tensor, "N A"],
-        advantage_NA: Float[Tensor, "N A"],
-        weight_N: Float[Tensor, "N"],
-        count: int,
-    ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
-        """Return pi_old min(rho adv, clip(rho) adv), and the gradient of the loss, minus the objective, in log pi(a|s):
+        self, log_NA: Float[Tensor, "N A"], part: Sequence[Tensor], count: int
+    ) -> tuple[Float[Tensor, "N A"], list[Tensor]]:
+        """The gradient is that of minus the objective:
 
             -w(s) / count pi(a|s) ( adv(s, a) 1(not clipped) - entropy_coef (log pi(a|s) + 1) )
 
-        with the number of rows in the minibatch, these and those of other processes.
         It is written out because autograd through these operations would cost as much as the network itself.
         """
-        ratio_NA, pi_NA, before_NA = (log_NA - old_NA).exp(), log_NA.exp(), old_NA.exp()
+        old_NA, advantage_NA, weight_N = part
+        ratio_NA, pi_NA = (log_NA - old_NA).exp(), log_NA.exp()
         low, high, coef = 1 - self.now.clip_range, 1 + self.now.clip_range, self.now.entropy_coef
-        if self._optimiser.compiles:
-            from pgts_torch.agent import step_kernels
-
-            gain_NA, down_NA = torch.empty_like(log_NA), torch.empty_like(log_NA)
-            given = (log_NA, ratio_NA, pi_NA, before_NA, advantage_NA, weight_N)
-            arrays = tuple(each.numpy() for each in given)
-            step_kernels.clipped_objective(arrays, count, low, high, coef, gain_NA.numpy(), down_NA.numpy())
-            return gain_NA, down_NA
         free_NA = ratio_NA * advantage_NA
         least_NA = torch.minimum(free_NA, ratio_NA.clamp(low, high) * advantage_NA)
         slope_NA = torch.where(least_NA == free_NA, advantage_NA, 0.0)
         if coef:
             slope_NA = slope_NA - coef * (log_NA + 1)
-        return before_NA * least_NA, -(pi_NA * slope_NA) * (weight_N / count)[:, None]
+        losses = [-mean(weight_N, (old_NA.exp() * least_NA).sum(-1), count)]
+        if self.options.target_kl is not None:
+            losses.append(mean(weight_N, divergence(old_NA, log_NA), count))
+        return -(pi_NA * slope_NA) * (weight_N / count)[:, None], losses
 
 
 def entropy(log_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
@@ -277,26 +311,21 @@ def log_softmax(logit_NA: Float[Tensor, "N A"], legal_NA: Bool[Tensor, "N A"] | 
     return legal_only(legal_only(logit_NA, legal_NA).log_softmax(-1), legal_NA, _LOG_OF_ZERO)
 
 
+def with_legal(columns: Sequence[Tensor], legal_NA: Bool[Tensor, "N A"] | None) -> Sequence[Tensor]:
+    """The columns, and after them the legal actions where not all are."""
+    return columns if legal_NA is None else [*columns, legal_NA]
+
+
 def passes(
-    network: Network,
-    columns: Sequence[Tensor],
-    legal_NA: Bool[Tensor, "N A"] | None,
-    share: Share,
-    options: Any,
-    generator: torch.Generator,
-) -> Iterator[tuple[Forward, Float[Tensor, "N A"], int, tuple[Tensor, ...]]]:
-    """Yield minibatches of the columns, the first of which are inputs: their pass through the current network and log
-    pi, without gradient; how many rows the minibatch has in all processes; and those of this one.
+    columns: Sequence[Tensor], share: Share, options: Any, generator: torch.Generator
+) -> Iterator[tuple[int, tuple[Tensor, ...]]]:
+    """Yield the minibatches of all passes over the columns, as `minibatches`.
 
     Args:
         options: of an update, which say how many there are.
     """
-    rows = columns if legal_NA is None else [*columns, legal_NA]
     for _ in range(options.num_epochs):
-        for count, part in minibatches(rows, options.minibatch_size, share, generator=generator):
-            made = Forward(network, part[0])
-            log_NA = log_softmax(made.output_ND, None if legal_NA is None else part[-1])
-            yield made, log_NA, count, part[: len(columns)]
+        yield from minibatches(columns, options.minibatch_size, share, generator=generator)
 
 
 def mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"], count: int) -> Float[Tensor, ""]:

@@ -97,16 +97,22 @@ class Optimiser:
                 self._prepare(parameters)
             is_short = self.method == "adam" and len(gradient_D) <= _SHORT
             total = (self._compiled if is_short and self.compiles else self._move)(gradient_D, norm)
-            self._readings.check(loss, partial(_refuse, "loss", f"the {name} loss"))
-            self._readings.check(norm, partial(_refuse, "gradient", f"the gradient of the {name} loss"))
-            self._readings.check(total, partial(_refuse, "gradient", f"the step down the {name} loss"))
+            self._readings.check(loss, partial(refuse, "loss", f"the {name} loss"))
+            self._readings.check(norm, partial(refuse, "gradient", f"the gradient of the {name} loss"))
+            self._readings.check(total, partial(refuse, "gradient", f"the step down the {name} loss"))
             torch._foreach_add_(self._moved, self._pieces)
         return norm
 
     @property
     def compiles(self) -> bool:
-        """Whether compiled loops are used where they save time. No bit depends on it."""
+        """Whether compiled loops are used where they save time. No bit of a step depends on it; those of the gradients
+        of dense layers do (`dense_steps`)."""
         return self.num_steps >= _MANY and can_compile(self._step_D.device)
+
+    def compiles_all_of(self, parameters: Sequence[Tensor]) -> bool:
+        """Whether steps of these parameters are compiled as a whole, with their gradient."""
+        is_short = sum(each.numel() for each in parameters) <= _SHORT and parameters[0].dtype == torch.float32
+        return is_short and self.method == "adam" and self.compiles
 
     def _prepare(self, parameters: Sequence[Tensor]) -> None:
         """Make room for steps of these parameters, which is kept."""
@@ -133,14 +139,19 @@ class Optimiser:
         """As `_move` of Adam, by compiled loops."""
         from pgts_torch.agent import step_kernels
 
-        first_D, second_D = self._moments(gradient_D)
+        first_D, second_D, longest, epsilon, rate = self.next_step(gradient_D)
         first, second, total = first_D.numpy(), second_D.numpy(), torch.empty_like(norm)
-        longest = math.inf if self.max_grad_norm is None else self.max_grad_norm
         rates = 1 - _BETAS[0], _BETAS[1], 1 - _BETAS[1]
         step_kernels.move_moments(gradient_D.numpy(), norm.numpy(), longest, first, second, *rates)
         torch.sqrt(second_D, out=self._step_D)
-        step_kernels.steps(first, self._step_D.numpy(), *self._corrected(), total.numpy())
+        step_kernels.steps(first, self._step_D.numpy(), epsilon, rate, total.numpy())
         return total
+
+    def next_step(self, like_D: Tensor) -> tuple[Tensor, Tensor, float, float, float]:
+        """Count one more step of Adam, which the caller takes. Return the moments, which it changes in place, the
+        longest gradient, and e and c (`_corrected`)."""
+        longest = math.inf if self.max_grad_norm is None else self.max_grad_norm
+        return *self._moments(like_D), longest, *self._corrected()
 
     def _corrected(self) -> tuple[float, float]:
         """e and c for which c m / (sqrt(v) + e) is the step: the corrections of moments, taken out of the vectors."""
@@ -226,7 +237,7 @@ class Undo:
         optimiser.rewind(self._num_steps)
 
 
-def _refuse(what: str, name: str, value: float) -> None:
+def refuse(what: str, name: str, value: float) -> None:
     raise NotFinite(f"{name} is {value}; no parameter was changed", what=what)
 
 

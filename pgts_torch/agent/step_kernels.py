@@ -1,8 +1,8 @@
-"""Gradient steps of small networks as compiled loops: `Optimiser` and `PPOUpdate` use them on the CPU, where calls of
-torch take longer than the numbers.
+"""Steps of Adam as compiled loops: `Optimiser` uses them for small networks on the CPU, where calls of torch take
+longer than the numbers.
 
 Every number is rounded as torch rounds it, so no bit depends on whether they are used (on processors where torch rounds
-as here). Square roots and exponentials are left to torch, which does not round all of them to the nearest number.
+as here). Square roots are left to torch, which does not round all of them to the nearest number.
 """
 
 from typing import Any
@@ -44,25 +44,3 @@ def steps(first_D, root_D, epsilon, rate, total):  # type: ignore[no-untyped-def
         root_D[d] = first_D[d] / (root_D[d] + epsilon) * rate
         added += root_D[d]
     total[()] = added
-
-
-@jit
-def clipped_objective(given, count, low, high, coef, gain_NA, down_NA):  # type: ignore[no-untyped-def]
-    """Write pi_old min(rho adv, clip(rho) adv), and the gradient of the loss in log pi (`PPOUpdate.objective`).
-
-    given: log pi, rho, pi, pi_old and the advantages [N, A], and the weights [N].   count: the rows of the minibatch.
-    """
-    log_NA, ratio_NA, pi_NA, old_NA, advantage_NA, weight_N = given
-    number, (N, A) = log_NA.dtype.type, log_NA.shape
-    low, high, coef, none = number(low), number(high), number(coef), number(0)
-    for n in range(N):
-        weight = weight_N[n] / number(count)
-        for a in range(A):
-            advantage, ratio = advantage_NA[n, a], ratio_NA[n, a]
-            free, clipped = ratio * advantage, min(max(ratio, low), high) * advantage
-            least = clipped if clipped < free else free
-            slope = advantage if least == free else none
-            if coef != none:
-                slope -= coef * (log_NA[n, a] + number(1))
-            gain_NA[n, a] = old_NA[n, a] * least
-            down_NA[n, a] = -(pi_NA[n, a] * slope) * weight

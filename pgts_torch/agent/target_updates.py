@@ -1,13 +1,13 @@
 """Updates of network policies toward a target policy that is computed from the advantages of all actions."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, final
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pgts_torch.agent.gradients import through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural_updates import (
@@ -18,6 +18,7 @@ from pgts_torch.agent.neural_updates import (
     log_softmax,
     mean,
     passes,
+    with_legal,
 )
 from pgts_torch.options.updates import CMPO, Mirror
 from pgts_torch.ranks import ALONE, Ranks
@@ -34,6 +35,7 @@ class TargetUpdate(NetworkUpdate):
     """
 
     options: Any
+    form = "targets"
 
     @abstractmethod
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
@@ -54,18 +56,21 @@ class TargetUpdate(NetworkUpdate):
         share = batch.ranks.share("rows", len(input_N))
         weight_N = batch.weight_N / share.mean("weights", batch.weight_N)
         columns = input_N, target_NA, weight_N
-        made = passes(network, columns, batch.legal_NA, share, self.options, generator)
-        for forward, log_NA, count, (_, part_NA, part_N) in made:
-            # Of KL(target || pi) in log pi it is -target, and so in the logits pi - target.
-            down_NA = -(part_N * (1 / count))[:, None] * part_NA.exp()
-            loss = mean(part_N, divergence(part_NA, log_NA), count)
-            stepped = self.step(forward, through_log_softmax(log_NA, down_NA), batch.ranks, loss)
-            assert stepped is not None
-            readings.add(grad_norm=stepped[0])
+        parts = passes(with_legal(columns, batch.legal_NA), share, self.options, generator)
+        for norm, _ in self.descend(network, parts, batch):
+            readings.add(grad_norm=norm)
         new_NA = log_probs(network, input_N, batch.legal_NA)
         after = mean(weight_N, divergence(target_NA, new_NA), share.total)
         readings.add(policy=batch.ranks.sum("the loss of the policy", after))
         return old_NA, new_NA
+
+    def objective(
+        self, log_NA: Float[Tensor, "N A"], part: Sequence[Tensor], count: int
+    ) -> tuple[Float[Tensor, "N A"], list[Tensor]]:
+        target_NA, weight_N = part
+        # Of KL(target || pi) in log pi it is -target, and so in the logits pi - target.
+        down_NA = -(weight_N * (1 / count))[:, None] * target_NA.exp()
+        return down_NA, [mean(weight_N, divergence(target_NA, log_NA), count)]
 
 
 @final
