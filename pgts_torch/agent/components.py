@@ -81,6 +81,11 @@ def legal_in(seen: Space[Any], row_N: Shaped[Tensor, "N ..."]) -> Bool[Tensor, "
     return row_N[..., -size(last) :] != 0 if isinstance(last, ActionMask) else None
 
 
+def with_legal(row_ND: Float[Tensor, "N D"], legal_NA: Bool[Tensor, "N A"]) -> Float[Tensor, "N E"]:
+    """Return rows that end with the legal actions."""
+    return torch.cat([row_ND, legal_NA.to(row_ND)], -1)
+
+
 def legal_only(
     value_NA: Float[Tensor, "N A"], legal_NA: Bool[Tensor, "N A"] | None, other: float = -math.inf
 ) -> Float[Tensor, "N A"]:

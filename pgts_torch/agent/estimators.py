@@ -5,15 +5,18 @@ from abc import ABC, abstractmethod
 from typing import Any, final
 
 import torch
+from torch import Tensor
 
 from pgts_torch.agent.advantages import gae, score_function
+from pgts_torch.agent.components import legal_in
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.depth import DepthChoice
 from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.iteration import PolicyBatch
-from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.policies import Policy, TabularPolicy
 from pgts_torch.agent.rollout import Rollout, StateWeight
-from pgts_torch.agent.roots import roots_of
+from pgts_torch.agent.roots import Roots, roots_of
+from pgts_torch.errors import ModelMismatch
 from pgts_torch.tabular.ascent import centred
 
 _ROUNDINGS = 16
@@ -59,6 +62,7 @@ class LookaheadEstimator(Estimator):
         roots, ranks = roots_of(experience, self._look.world, self._weight, self._max_roots, draws), experience.ranks
         pi_NA = self._look.policy.probs(roots.observation_N)
         chosen = self._choose(experience, roots, pi_NA, draws)
+        self._check_legal(roots, chosen.look.q_BA)
         q_NA, count = chosen.look.q_BA, chosen.look.q_BA.numel()
         size: Any = torch.where(q_NA.isfinite(), q_NA, 0.0).abs().amax().double() if count else 0.0
         noise = chosen.look.noise if count else 0.0
@@ -78,6 +82,23 @@ class LookaheadEstimator(Estimator):
             pi_NA=pi_NA,
             **chosen._asdict(),
         )
+
+    def _check_legal(self, roots: Roots, q_NA: Tensor) -> None:
+        """ModelMismatch unless the model allows the actions that observations say are legal."""
+        world, policy = self._look.world, self._look.policy
+        legal_NA = legal_in(world.perceived_space, roots.observation_N)
+        if legal_NA is None and isinstance(policy, TabularPolicy):
+            return  # which knows the actions that the table allows
+        allowed_NA = q_NA > -math.inf
+        off_NA = allowed_NA != (torch.ones_like(allowed_NA) if legal_NA is None else legal_NA)
+        if off_NA.any():
+            n, a = torch.nonzero(off_NA)[0].tolist()
+            says = "allows" if allowed_NA[n, a] else "does not allow"
+            raise ModelMismatch(
+                f"{type(world.model).__name__} {says} action {a} in state {int(roots.state_N[n])}, and by what is "
+                f"observed it is {'not legal' if allowed_NA[n, a] else 'legal'}: correct one of them, or set forbids = "
+                "True in the model, which then says what is legal"
+            )
 
 
 @final

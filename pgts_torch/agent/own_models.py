@@ -12,7 +12,7 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from pgts_torch.agent.components import image_shape, num_combinations
+from pgts_torch.agent.components import image_shape, num_combinations, with_legal, with_mask
 from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.world import ModelWorld, TabularWorld, VectorStates, World
 from pgts_torch.errors import MissingModel, PgtsError, failure
@@ -44,16 +44,22 @@ class VectorWorld(VectorStates):
     def __init__(self, env: VectorEnv, model: TensorModel, *, gamma: float, **options: Any) -> None:
         super().__init__(env, gamma=gamma, **options)
         self.model: TensorModel = model
+        self._shows_legal = model.forbids or isinstance(self.masks, ActionMasks)
+        if self._shows_legal and not isinstance(self.masks, ActionMasks):
+            self.legal_of = lambda row_ND: model.legal(row_ND.to(model.state_dtype))
+            self.observation_space = self.perceived_space = with_mask(self.observation_space, self.num_actions)
         if isinstance(model, LatentModel):
             self.perceive, self.perceived_space = model.represent, model.space
 
     def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B ..."]:
         """The observations, because they are the states, or these are made of them."""
-        return encoded_B.to(self.model.state_dtype)
+        states_B = encoded_B[..., : -self.num_actions] if self._shows_legal else encoded_B
+        return states_B.to(self.model.state_dtype)
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Shaped[Tensor, "N D"]:
         """The states, because policies take them."""
-        return self.model.states(state_N)
+        state_ND = self.model.states(state_N)
+        return with_legal(state_ND, self.model.legal(state_ND)) if self._shows_legal else state_ND
 
 
 def learned_world(
@@ -152,7 +158,7 @@ def world_of(
         PgtsError: the model does not fit the environments.
     """
     shared: dict[str, Any] = {"gamma": gamma, "observed": observed, "masks": masks, "device": device}
-    world = World(env, **shared)
+    world = World(env, **shared | {"masks": None})
     space, name = world.observation_space, type(model).__name__
     if model.num_actions != world.num_actions:
         raise PgtsError(f"{name} has {model.num_actions} actions; {env_name(env)} has {world.num_actions}")

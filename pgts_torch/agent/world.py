@@ -16,6 +16,7 @@ from gymnasium.vector.utils import iterate
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from pgts_torch.agent.components import with_legal
 from pgts_torch.agent.observations import Observations
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel, LearningModel, Model
@@ -44,6 +45,7 @@ class World:
     perceive: makes what policies and critics take of what `encode` returns, in `perceived_space`: the same, unless a
         model represents observations as vectors.
     warned: whether the warning was given that the environments use the random generators of the whole process.
+    legal_of: finds the legal actions by the rows of observations; None: masks say them, or all are legal.
     model: what a lookahead may query; None: there is no model.
     mdp: the exact MDP, where it is known.
     start_S: the start distribution mu over all states; None where it is known from episodes only.
@@ -64,6 +66,7 @@ class World:
     perceived_space: Space[Any]
     warned: bool = False
     shows_masks: bool = True
+    legal_of: Callable[[Tensor], Tensor] | None = None
     model: Model | None = None
     mdp: TabularMDP | None = None
     start_S: Float[Tensor, "S"] | None = None
@@ -89,7 +92,8 @@ class World:
     def encode(self, observation: Any) -> Tensor:
         """Return one observation of an environment, or rows of them, as the tensor that a policy takes; PgtsError
         unless they are finite and in its observation space."""
-        return self.observations.encode(observation)
+        rows = self.observations.encode(observation)
+        return rows if self.legal_of is None else with_legal(rows, self.legal_of(rows))
 
     def of(self, env: VectorEnv) -> "World":
         """A world without a model for other environments of the same kind; warnings are not repeated in it."""
@@ -97,6 +101,7 @@ class World:
         kind = World if self.shows_masks else _StateWorld
         world = kind(env, gamma=self.gamma, observed=seen.options, numbered=seen.numbered, **shared)  # type: ignore[arg-type]
         world.warned, world.perceive, world.perceived_space = True, self.perceive, self.perceived_space
+        world.legal_of = self.legal_of
         return world
 
     def promise(self, reward_range: RewardRange) -> None:

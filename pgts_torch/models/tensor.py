@@ -43,6 +43,9 @@ class TensorModel(EnumeratingModel, SamplingModel):
 
     A model call is one (state, action) however often it is repeated; `simulator_steps` counts the steps.
 
+    forbids: whether it says which actions are legal, where the environment has no action masks: those whose reward is
+        not -inf. A class sets it to True whose rewards may be -inf.
+
     Args:
         state_size: D.
         num_actions: A.
@@ -54,6 +57,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
     """
 
     num_outcomes = 1
+    forbids: bool = False
 
     def __init__(
         self,
@@ -89,6 +93,14 @@ class TensorModel(EnumeratingModel, SamplingModel):
         the dtype of states. The reward is -inf where the action is not allowed. After a terminal outcome, discount 0,
         the next state may be anything, also nan.
         """
+
+    @torch.no_grad()
+    def legal(self, state_ND: Num[Tensor, "N D"]) -> Bool[Tensor, "N A"]:
+        """The actions that are allowed in these states, by their rewards; all where none is, as after an end."""
+        N, A = state_ND.shape[0], self.num_actions
+        reward_N, _, _ = self.step(state_ND.repeat_interleave(A, 0), torch.arange(A, device=self.device).repeat(N))
+        legal_NA = (reward_N > -torch.inf).view(N, A)
+        return legal_NA | ~legal_NA.any(-1, keepdim=True)
 
     @property
     def num_states(self) -> int:  # type: ignore[override]
