@@ -139,6 +139,7 @@ class PGTS:
         self.episodes, self.dyna, self.posterior = parts.episodes, parts.dyna, parts.posterior
         self.gamma, self.horizon = self.world.gamma, self.options.rollout.horizon
         self.num_iterations = self.num_env_steps = self.num_model_calls = 0
+        self._lacks: str | None = None
         depth = self.options.search.depth
         levels = depth + (self.critic.target == "v") if isinstance(depth, int) else None
         self.pricing = Pricing(
@@ -154,6 +155,7 @@ class PGTS:
         """Run one iteration: visit states, estimate Q^pi, look m steps ahead, update pi.        [PGTS Alg. 1]"""
         if self.world.env.closed:
             raise PgtsError("the environments of this training are closed: make another one, or load a saved one")
+        self.check_complete()
         with self.ranks.united():
             return self._iterate()
 
@@ -379,8 +381,16 @@ class PGTS:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of all parts, and the counters. If several processes train together all must call it."""
+        self.check_complete()
         return saved.state_of(self._parts, self.ranks) | {name: getattr(self, name) for name in saved.COUNTERS}
+
+    def check_complete(self) -> None:
+        """PgtsError where training cannot go on, because several processes have saved this model and not as many have
+        loaded it, while each has kept steps, or episodes, of its own. The policy can be used all the same."""
+        if self._lacks is not None:
+            raise PgtsError(self._lacks)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load what `state_dict` returned; PgtsError, and nothing is loaded, if it is no state of such a model."""
-        self.num_iterations, self.num_env_steps, self.num_model_calls = saved.restore(self._parts, self.ranks, state)
+        counters, self._lacks = saved.restore(self._parts, self.ranks, state)
+        self.num_iterations, self.num_env_steps, self.num_model_calls = counters

@@ -51,16 +51,22 @@ def state_of(parts: Parts, ranks: Ranks) -> dict[str, Any]:
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def restore(parts: Parts, ranks: Ranks, state: dict[str, Any]) -> tuple[int, int, int]:
-    """Load what `state_of` returned, and return the counters; nothing is loaded if it is no state of such a training.
+def restore(parts: Parts, ranks: Ranks, state: dict[str, Any]) -> tuple[tuple[int, int, int], str | None]:
+    """Load what `state_of` returned; nothing is loaded if it is no state of such a training.
+
+    Returns:
+        The counters; and, where it is of another number of processes, each of which has kept something of its own, what
+        is missing: the policy acts as the saved one, but training cannot go on. None: nothing is.
 
     Raises:
         PgtsError: the part of it that does not fit is named.
     """
     learned, check = _learned(parts), parts.model_check
     check_keys("the saved state", state, {*learned, "searches", "episodes", "model_check", *COUNTERS})
+    lacks = None
     if parts.dyna is not None:
-        state = {**state, "dyna": _kept(ranks, state["dyna"])}
+        own, lacks = _kept(ranks, state["dyna"])
+        state = {**state, "dyna": own}
     for name in COUNTERS:
         check_count(name, state[name], least=0)
     before = {name: part.state_dict() for name, part in learned.items()}
@@ -69,13 +75,13 @@ def restore(parts: Parts, ranks: Ranks, state: dict[str, Any]) -> tuple[int, int
             load_checked(name, state[name], part.load_state_dict, part.state_dict)
         parts.update.check(parts.policy)
         _restore_search(parts, ranks, state["searches"])
-        _restore_episodes(parts, ranks, state["episodes"])
+        lacks = _restore_episodes(parts, ranks, state["episodes"]) or lacks
         load_checked("model_check", state["model_check"], check.load_state_dict, check.state_dict, is_all=False)
     except PgtsError:
         for name, part in learned.items():
             part.load_state_dict(before[name])
         raise
-    return state["num_iterations"], state["num_env_steps"], state["num_model_calls"]
+    return (state["num_iterations"], state["num_env_steps"], state["num_model_calls"]), lacks
 
 
 def _learned(parts: Parts) -> dict[str, Policy | Critic | Update | Dyna | PosteriorCertificate]:
@@ -84,15 +90,21 @@ def _learned(parts: Parts) -> dict[str, Policy | Critic | Update | Dyna | Poster
     return {name: part for name in names if (part := getattr(parts, name)) is not None}
 
 
-def _kept(ranks: Ranks, state: Any) -> Any:
-    """The part of a replay that is of this rank."""
+def _kept(ranks: Ranks, state: Any) -> tuple[Any, str | None]:
+    """The replay of this rank, with the learned model, which is that of all; and what is missing."""
     saved = state.get("ranks", {0: state}) if isinstance(state, Mapping) else {0: state}
-    if not isinstance(saved, Mapping) or set(saved) != set(range(ranks.size)):
-        raise PgtsError(
-            f"the saved state has the replay of {len(saved)} processes, each of which has kept its own steps; this "
-            f"training has {ranks.size}: take as many"
-        )
-    return saved[ranks.rank]
+    if not isinstance(saved, Mapping) or set(saved) != set(range(len(saved))) or not saved:
+        raise PgtsError("the saved replay is not one of each rank")
+    return saved[ranks.rank % len(saved)], _missing(
+        ranks, len(saved), "the replay", "each of which has kept its own steps"
+    )
+
+
+def _missing(ranks: Ranks, count: int, what: str, why: str) -> str | None:
+    """Why training cannot go on from a state of `count` processes; None where it can."""
+    if count == ranks.size:
+        return None
+    return f"the saved state has {what} of {count} processes, {why}; this training has {ranks.size}: take as many"
 
 
 def _search_state(parts: Parts) -> dict[str, Any]:
@@ -119,18 +131,18 @@ def _restore_search(parts: Parts, ranks: Ranks, searches: Any) -> None:
     load_checked(f"searches.{rank}", searches[rank], load, lambda: _search_state(parts), has_bounds=True)
 
 
-def _restore_episodes(parts: Parts, ranks: Ranks, states: Any) -> None:
-    """Restore the episodes of this rank that go on."""
+def _restore_episodes(parts: Parts, ranks: Ranks, states: Any) -> str | None:
+    """Restore the episodes of this rank that go on. Return what is missing."""
     if parts.episodes is None:
-        return
-    if not isinstance(states, Mapping) or set(states) != set(range(ranks.size)):
-        raise PgtsError(
-            f"the saved state has the episodes of {len(states)} processes, which go on in the environments of each; "
-            f"this training has {ranks.size}: take as many"
+        return None
+    if not isinstance(states, Mapping) or set(states) != set(range(len(states))) or not states:
+        raise PgtsError("the saved episodes are not those of each rank")
+    missing = _missing(ranks, len(states), "the episodes", "which go on in the environments of each")
+    if missing is None:
+        load_checked(
+            f"episodes.{ranks.rank}", states[ranks.rank], parts.episodes.load_state_dict, parts.episodes.state_dict
         )
-    load_checked(
-        f"episodes.{ranks.rank}", states[ranks.rank], parts.episodes.load_state_dict, parts.episodes.state_dict
-    )
+    return missing
 
 
 def load_training(

@@ -53,6 +53,7 @@ class Start:
         """Load the state into the algorithm; PgtsError, naming the part, if it is no state of such a model."""
         try:
             algorithm.load_state_dict(self.state)
+            algorithm.check_complete()
         except PgtsError as error:
             raise PgtsError(
                 f"{self.path}: {error}\nif the environment has changed since it was written, {_ADVICE}"

@@ -1,6 +1,7 @@
 """A model of images, learned from steps."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,9 @@ from pgts_torch.models.base import Experience
 from pgts_torch.models.held_out import sequences
 from pgts_torch.models.replay import ReplayBuffer
 from pgts_torch.options import CNN, MLP, Latent, StepsHorizon, UniformReplay
+from pgts_torch.ranks import ALONE, Ranks, present_ranks
 from pgts_torch.seeding import stream
+from tests.forks import on_ranks
 
 GAMMA = 0.9
 SMALL = Latent(
@@ -243,6 +246,56 @@ def test_a_policy_that_catches_the_ball_is_learned_from_images():
     image = small_catch().reset(seed=0)[0]
     assert training.predict(image) in (0, 1, 2)
     assert training.predict(np.stack([image, image])).shape == (2,)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_latent_model_learns_on_ranks_as_one_process_does_from_the_steps_of_all(monkeypatch):
+    steps, parts = played(60), 1
+    columns = [*steps][:6]
+
+    def sampled(high: int, shape: tuple[int], **_: Any) -> torch.Tensor:
+        """Where one process samples for two, what both sample from their halves of the steps."""
+        own = torch.arange(shape[0] // parts) * 7 % (high // parts)
+        return torch.cat([own + part * (high // parts) for part in range(parts)])
+
+    def fitted(ranks: Ranks, own: slice) -> tuple[torch.Tensor, dict[str, float]]:
+        model = untrained(with_updates(5).model_copy(update={"minibatch_size": 16}))
+        losses = model.learn(Experience(*(column[own] for column in columns), ranks), generator=stream(0, "learn"))
+        return torch.cat([x.flatten() for x in model._representation.tensors + model._dynamics.tensors]), losses
+
+    monkeypatch.setattr(torch, "randint", sampled)
+    halves = on_ranks(2, lambda: fitted(ranks := present_ranks(), slice(30 * ranks.rank, 30 * ranks.rank + 30)))
+    parts = 2
+    (alone, losses), (half, _) = fitted(ALONE, slice(60)), fitted(ALONE, slice(30))
+    assert torch.equal(halves[0][0], halves[1][0])
+    for weights, found in halves:
+        assert {name: found[name] for name in losses} == pytest.approx(losses, rel=1e-3)
+        torch.testing.assert_close(weights, alone, rtol=1e-3, atol=2e-4)
+    assert (half - alone).abs().max() > 2e-3
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_latent_training_of_two_processes_is_used_by_one_but_does_not_go_on_there(tmp_path):
+    brief = TRAINING | {"model": with_updates(3), "num_envs": 2, "horizon": StepsHorizon(length=20, first=40)}
+    image_N = played(30).observation_N
+
+    def trained() -> list[torch.Tensor]:
+        training = PGTS(small_catch, **brief)
+        for _ in range(2):
+            training.iterate()
+        training.save(tmp_path / "model.pt")
+        return [training.policy.probs(training.world.perceive(image_N)), training.world.model.replay.rows("reward")]
+
+    (one, its), (other, others) = on_ranks(2, trained)
+    assert torch.equal(one, other)
+    assert not torch.equal(its, others)
+    loaded = PGTS.load(tmp_path / "model.pt", env=small_catch)
+    assert torch.equal(loaded.policy.probs(loaded.world.perceive(image_N)), one)
+    assert loaded.predict(image_N[0].numpy()) == int(one[0].argmax())
+    assert evaluate(loaded, episodes=4).episodes == 4
+    for use in (loaded.iterate, lambda: loaded.save(tmp_path / "again.pt")):
+        with pytest.raises(PgtsError, match=r"of 2 processes, which go on in the environments of each; .* take"):
+            use()
 
 
 def test_a_saved_training_goes_on_bit_for_bit(tmp_path):
