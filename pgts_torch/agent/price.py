@@ -31,18 +31,21 @@ class Price:
     """What an iteration costs: all its model calls, and its seconds.
 
     is_bound: whether they may be less, as in a tree search whose paths meet.
+    search: what is searched within a number of calls that was set; empty: there is none, or it is not known yet.
     advice: options that make a long iteration shorter.
     """
 
     calls: float
     seconds: float
     is_bound: bool = False
+    search: str = ""
     advice: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """In a sentence."""
         about = "up to" if self.is_bound else "about"
         said = f"an iteration takes {about} {_round(self.calls, 3):,} model calls and {_seconds(self.seconds)}"
+        said += f", by {self.search}" * bool(self.search)
         return said + (f"; cheaper: {', '.join(self.advice)}" if self.advice else "")
 
 
@@ -98,7 +101,9 @@ class Pricing:
         if self._search is None or self.meter is None:
             return
         if self.price is None and self._iterations == 2:
-            self.price = Price(model_calls, self.meter.seconds)
+            section = self._options.search
+            picked = isinstance(section, AutoSection) and section.max_calls is not None
+            self.price = Price(model_calls, self.meter.seconds, search=str(self._search) * picked)
             if self.price.seconds > SHORT:
                 self.say()
         self.meter = self._search.meter = None
@@ -128,7 +133,7 @@ class Pricing:
         advice: tuple[str, ...] = ()
         if total > LONG and updates > total / 2:
             advice = cheaper(self._options, search, roots=meter.roots, calls=calls, share=_AIM / total)
-        self.price = Price(all_calls, total, isinstance(search, MCTSSearch), advice)
+        self.price = Price(all_calls, total, isinstance(search, MCTSSearch), advice=advice)
         self.say()
 
 

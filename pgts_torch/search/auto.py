@@ -93,7 +93,8 @@ class AutoSearch(Search):
         if states < roots + expansions - 1:
             raise PgtsError(
                 f"search.max_calls is {max_calls}; {roots} states under {A} actions, and one below them on each of "
-                f"{expansions - 1} levels, need {(roots + expansions - 1) * A}: visit fewer, or allow more"
+                f"{expansions - 1} levels, need {(roots + expansions - 1) * A}: visit fewer, set search.max_roots, or "
+                "allow more"
             )
         return (states - roots) // (expansions - 1) if expansions > 1 else None
 
@@ -150,7 +151,8 @@ class AutoSearch(Search):
         if max_calls < math.inf and not fits(1):
             raise PgtsError(
                 f"search.max_calls is {max_calls}; one sample of each of {A} actions, {expansions} levels below "
-                f"{roots} states, may need more: visit fewer, or take a smaller depth or search.kind mcts"
+                f"{roots} states, may need more: visit fewer, set search.max_roots, or take a smaller depth or "
+                "search.kind mcts"
             )
         while True:
             try:

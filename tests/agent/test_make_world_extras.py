@@ -1,4 +1,4 @@
-"""Environments of ALE and MuJoCo: which are restored, and which have a state beside their family's snapshots."""
+"""Environments of ALE, MuJoCo and Box2D: which are restored, and which have a state beside their family's snapshots."""
 
 from typing import Any
 
@@ -6,8 +6,9 @@ import gymnasium
 import pytest
 from gymnasium.envs.registration import load_env_creator
 
+from pgts_torch import PGTS
 from pgts_torch.agent.world import SimulatedWorld, World
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.adapters_extra import Ale, Mujoco
 from tests.agent.cells import agrees, world_of
 
@@ -93,3 +94,13 @@ def test_emulators_whose_actions_stick_are_refused():
     kind = family("Pong")
     with pytest.raises(PgtsError, match=r"make it with repeat_action_probability=0"):
         world_of(lambda: kind("pong", obs_type="ram", repeat_action_probability=0.25), num_envs=1)
+
+
+def test_box2d_cannot_be_restored_and_is_learned_from_its_steps():
+    pytest.importorskip("Box2D", exc_type=ImportError)
+    with pytest.raises(MissingModel, match=r"LunarLander-v3 cannot be restored: .*model 'ensemble' where"):
+        PGTS("LunarLander-v3", depth=1, num_envs=2)
+    few = {"replay": {"updates_per_step": 0.05, "starts": 4, "length": 5}, "policy": {"hidden": [8]}}
+    model = {"type": "ensemble", "members": 2, "hidden": [16], "first_updates": 20}
+    training = PGTS("LunarLander-v3", depth=1, model=model, horizon={"type": "steps", "length": 20, "first": 40}, **few)
+    assert all(training.iterate().model_calls > 0 for _ in range(3))

@@ -167,6 +167,13 @@ def test_a_cheap_iteration_is_priced_by_the_second_one_and_said_to_who_wants_to_
     assert capsys.readouterr().err.count("note: an iteration takes about ") == 1
 
 
+def test_what_fits_a_number_of_model_calls_is_said():
+    model = PGTS(**CASES["few calls"])
+    model.iterate()
+    model.iterate()
+    assert re.search(r" s, by expectimax, \d+ states a level: ", str(model.pricing.price))
+
+
 def test_without_a_lookahead_there_is_no_price():
     model = PGTS("CartPole-v1", depth=0, estimator="sampled", policy="mlp", num_envs=2)
     model.learn(model.num_env_steps + 1200)

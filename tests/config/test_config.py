@@ -39,7 +39,7 @@ from pgts_torch.options import (
 from pgts_torch.options.arguments import read
 from pgts_torch.options.schema import Option, schema_of
 from pgts_torch.tabular import ladder
-from tests.config.shipped import SHIPPED
+from tests.config.shipped import SHIPPED, skip_unless_installed
 
 
 def test_without_file_and_overrides_the_defaults_apply() -> None:
@@ -117,8 +117,7 @@ def test_a_shipped_configuration_is_valid_and_says_what_it_shows(name: str) -> N
     config = load(SHIPPED[name])
     assert SHIPPED[name].read_text().startswith("# ")
     assert config.name == name
-    if "minigrid" in config.env.id.lower():
-        pytest.importorskip("minigrid", exc_type=ImportError)
+    skip_unless_installed(name)
     made = EnvSource.of(config.env.id, kwargs=config.env.kwargs).make_one()
     assert made.spec is not None
     assert made.spec.id == config.env.id
@@ -131,7 +130,8 @@ def test_the_shipped_configurations_are_those_of_the_paper_and_of_gymnasium() ->
     others = toy_text | {"acrobot", "cartpole", "mountain_car", "door_key"}
     images = {"catch", "minigrid_door_key", "minigrid_empty"}
     learned = {f"learned_{name}" for name in (toy_text | {"acrobot", "cartpole", "deep_sea", "mountain_car"} | images)}
-    assert set(SHIPPED) == own | others | learned
+    emulators = {"mujoco_inverted_pendulum"}
+    assert set(SHIPPED) == own | others | learned | emulators
     assert own | {"learned_deep_sea"} == {
         name for name, path in SHIPPED.items() if load(path).env.id.startswith("pgts/")
     }

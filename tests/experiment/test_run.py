@@ -27,11 +27,12 @@ from pgts_torch.models.environments import EnvSource
 from pgts_torch.options.models import LEARNED
 from pgts_torch.tabular import exact, stationary
 from pgts_torch.tabular.ascent import mirror_step
-from tests.config.shipped import SHIPPED
+from tests.config.shipped import SHIPPED, skip_unless_installed
 from tests.experiment.runs import TAGS
 
 ROOT = Path(__file__).parents[2]
 LESS_REPLAY = ["--rollout.num_envs", "1", "--rollout.horizon.first", "15", "--replay.updates_per_step", "0.02"]
+FEW_ROOTS = ["--search.max_roots", "2"]
 OF_EPISODES = {"charts/discounted_return", "charts/episodic_return", "charts/episodic_length"}
 """Tags of episodes that end, which an iteration need not have where they go on."""
 EXACT_TAGS = {"search/nodes", "search/stationarity_gap", "exact/J", "exact/optimality_gap", "exact/lookahead_error"}
@@ -53,12 +54,15 @@ def few_iterations(folder: Path, *arguments: str, config: Path = ROOT / "configs
 
 
 @pytest.mark.usefixtures("unchecked_shapes")  # other tests check them; here they cost half the time
-@pytest.mark.parametrize("config", SHIPPED.values(), ids=SHIPPED)
-def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(config, tmp_path, monkeypatch):
+@pytest.mark.filterwarnings("ignore:.*has wrappers that are part of the model")
+@pytest.mark.parametrize("name", SHIPPED)
+def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(name, tmp_path, monkeypatch):
+    skip_unless_installed(name)
+    config = SHIPPED[name]
     monkeypatch.setattr(pictures, "policy_picture", policy_picture)
     monkeypatch.setattr(EnvSource, "time_limit", 15)
     learns = isinstance(load(config).model, LEARNED)
-    less = LESS_REPLAY if learns else []
+    less = LESS_REPLAY if learns else FEW_ROOTS if load(config).search.max_roots is not None else []
     summary = run.train(few_iterations(tmp_path, *less, config=config))
     folder = tmp_path / "run"
     lines = read_metrics(folder)
