@@ -8,11 +8,13 @@ records what came of it.
 import json
 import re
 import sys
+import textwrap
 import warnings
 from pathlib import Path
 from typing import Any
 
 from tests.agent.kinds import KINDS
+from tests.agent.masked import ENVIRONMENTS, SEARCHES
 
 ROOT = Path(__file__).parents[1]
 DOCUMENT = ROOT / "docs" / "environments.md"
@@ -30,6 +32,19 @@ TRIED: dict[str, tuple[str, dict[str, Any]]] = {
     "tetris_gymnasium.envs:tetris_gymnasium/Tetris": ("tetris-gymnasium", {"depth": 1}),
 }
 """By id: the package, and the arguments of `PGTS`."""
+
+
+_MASKS = textwrap.wrap(
+    "An action that is not legal is never taken: not by the policy, a search, an imagined episode or an evaluation, "
+    "nor by `predict(observation, action_mask=...)`, which needs the mask. The environment says what is legal, by a "
+    'method `action_masks()` or by `info["action_mask"]` in each reset and step; in a searched state its simulator '
+    "does. A table says it by rewards of -inf, and then policies are tables, too; so does a `TensorModel` "
+    'with `forbids = True`. `action_masks="off"` ignores masks; `"auto"` ignores `info["action_mask"]` beside a '
+    'table that says what each action does (Taxi), and `"on"` does not. '
+    "Learned models (`counts`, `ensemble`, `latent`) refuse masks.",
+    width=116,
+    break_long_words=False,
+)
 
 
 def tried(name: str) -> dict[str, Any]:
@@ -97,6 +112,17 @@ def document() -> str:
         others = ", ".join([*policies[1:], *(["a table, with counts"] if learned == "counts" else [])])
         lines.append(f"| {kind} | `{shown}` | {policies[0]} | {others} | {learned or 'none'} |")
     lines += [
+        "",
+        "## Action masks",
+        "",
+        *_MASKS,
+        "",
+        "In each of these an illegal action is an error. They are trained in, saved, loaded, resumed and evaluated by",
+        "[tests/agent/test_action_masks.py](../tests/agent/test_action_masks.py), with and without a lookahead:",
+        "",
+        *[f"- `{name.partition(',')[0]}`{name[len(name.partition(',')[0]) :]}" for name in ENVIRONMENTS],
+        "",
+        f"`info` is searched by each of: {', '.join(search for search in SEARCHES if search != 'none')}.",
         "",
         "## Environments that were tried",
         "",

@@ -170,6 +170,8 @@ def _first_model(request: _Request, *, plain: bool) -> tuple[ModelWorld | None, 
     env, reasons = request.env, list[str]()
     if type(env) is TabularVectorEnv:
         _check_single(request.action_repeat, "in a table")
+        if request.observed.action_masks == "on" and _own_masks(env.mdp) is None:
+            raise PgtsError(f"action_masks is 'on'; the table of {request.name} allows all actions")
         return TabularWorld(
             env, env.mdp, observed=request.observed, masks=_own_masks(env.mdp), device=request.device
         ), []

@@ -97,7 +97,7 @@ class Truth:
         look_SA = exact.lookahead(self.mdp, evaluation.q_SA, iteration.depth)
         columns = iteration.state_N, iteration.look.q_BA, iteration.weight_N
         states, q_NA, weight_N = (column.cpu() for column in iteration.ranks.rows("rows of a table", *columns))
-        error_NA = q_NA - look_SA[states]
+        error_NA = (q_NA - look_SA[states])[self.mdp.outcomes.legal_NA[states]]
         tags["exact/lookahead_error"] = float(error_NA.abs().max())
         weight_S = evaluation.d_S if self.update.state_weight != "uniform" else (evaluation.d_S > 0).double()
         true_SA = self._direction(pi_SA, look_SA, weight_S)
@@ -109,7 +109,12 @@ class Truth:
         return tags
 
     def _direction(self, pi_NA: Tensor, q_NA: Tensor, weight_N: Tensor) -> Tensor:
-        """The update direction, projected on the tangent space of the simplex (its entries sum to 0)."""
+        """The update direction over the actions that are allowed, projected on the tangent space of the simplex (its
+        entries sum to 0)."""
         if isinstance(self.update, SoftmaxUpdate):
             return softmax_direction(pi_NA, q_NA, weight_N)
-        return weight_N[:, None] * (q_NA - q_NA.mean(-1, keepdim=True))
+        legal_NA = q_NA > -math.inf
+        if legal_NA.all():
+            return weight_N[:, None] * (q_NA - q_NA.mean(-1, keepdim=True))
+        mean_N1 = torch.where(legal_NA, q_NA, 0.0).sum(-1, keepdim=True) / legal_NA.sum(-1, keepdim=True)
+        return weight_N[:, None] * torch.where(legal_NA, q_NA - mean_N1, 0.0)

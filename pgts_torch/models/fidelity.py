@@ -19,6 +19,7 @@ from pgts_torch.models.attributes import own_to_each
 from pgts_torch.models.classic import dynamics_of
 from pgts_torch.models.clocks import check_clock
 from pgts_torch.models.environments import EnvSource, Given
+from pgts_torch.models.masks import masks_in
 from pgts_torch.models.published import compare_table, published_table
 from pgts_torch.models.restoring import (
     ACTIONS_TRIED,
@@ -169,6 +170,7 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
     random, alike = numpy_stream(seed, "check_model"), not own_to_each(make)
     setup = Setup(lambda: inside(make(), adapter), adapter, actions, random, alike=alike)
     try:
+        setup = replace(setup, masks=masks_in(new := setup.make(), actions, setup.reset(new, seed=seed).info))
         walks = walks_of(setup, continuations, length)
     except PgtsError as error:
         raise failure(f"{name} fails in random walks with seed {seed}", error) from error
@@ -233,8 +235,11 @@ def _claims(env: gymnasium.Env, *, seed: int) -> Iterator[Check]:
 def _answers(setup: Setup, walks: Sequence[Walk], shares: list[float]) -> str:
     """Query a model for some actions in each state; the share of those that chance decides is added to `shares`."""
     model = setup.model()
-    state_N = torch.tensor([model.number(walk.start) for walk in walks]).repeat_interleave(ACTIONS_TRIED)
+    numbers = [model.number(walk.start, legal_A=walk.legal_A) for walk in walks]
+    state_N = torch.tensor(numbers).repeat_interleave(ACTIONS_TRIED)
     action_N = torch.from_numpy(setup.random.integers(len(setup.actions), size=len(state_N)))
+    legal_NA = torch.tensor(model.legal(state_N))
+    action_N = torch.where(legal_NA.gather(1, action_N[:, None]).squeeze(1), action_N, legal_NA.int().argmax(1))
     shares.append(float(model.is_random(state_N, action_N).double().mean()))
     return f"{len(state_N)} (state, action) queried, {shares[-1]:.0%} of them decided by chance"
 
@@ -255,7 +260,8 @@ def _cost(setup: Setup, walks: Sequence[Walk]) -> Cost:
     """The times of the parts of a call, on one thread."""
     env, times = setup.fresh(), []
     for n in range(_TIMED_CALLS):
-        walk, action = walks[n % len(walks)], setup.action()
+        walk = walks[n % len(walks)]
+        action = walk.actions[0] if setup.masks else setup.action()
         with environment_code():
             begin = time.perf_counter()
             setup.adapter.set_state(env, walk.start.data)

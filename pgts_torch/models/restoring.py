@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from pgts_torch.errors import MissingModel
 from pgts_torch.models.adapters import methods_for
@@ -99,13 +100,15 @@ class Setup:
 
 @dataclass(frozen=True)
 class Walk:
-    """A recorded walk: its start, the key of its chance, its actions, what was seen and the names of its states."""
+    """A recorded walk: its start, the key of its chance, its actions, what was seen and the names of its states; and
+    the legal actions at its start, None where these are not known."""
 
     start: Snapshot
     key: int
     actions: tuple[Any, ...]
     seen: tuple[bytes, ...]
     states: tuple[Hashable, ...]
+    legal_A: Bool[np.ndarray, "A"] | None
 
 
 def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> float:
@@ -162,7 +165,7 @@ def walks_of(setup: Setup, count: int, length: int) -> list[Walk]:
 
 def _recorded(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Walk:
     """These actions from the present state, up to an end."""
-    start = setup.snapshot(env)
+    start, legal_A = setup.snapshot(env), setup.trial.legal(env)
     setup.seed(env, key)
     seen, states, made = list[bytes](), list[Hashable](), list[Any]()
     for action in actions:
@@ -172,7 +175,7 @@ def _recorded(setup: Setup, env: Any, key: int, actions: tuple[Any, ...]) -> Wal
         states.append(setup.snapshot(env).name)
         if taken.ends:
             break
-    return Walk(start, key, tuple(made), tuple(seen), tuple(states))
+    return Walk(start, key, tuple(made), tuple(seen), tuple(states), legal_A)
 
 
 def _again(setup: Setup, env: Any, walk: Walk) -> Walk:

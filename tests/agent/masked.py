@@ -98,3 +98,26 @@ def legal_mdp() -> TabularMDP:
     discount = torch.where(child_SA1 == 5, 0.0, GAMMA).double()
     outcomes = Outcomes(torch.from_numpy(reward_SA), torch.ones_like(discount), discount, child_SA1, 6)
     return TabularMDP(outcomes, torch.tensor([1, 1, 1, 0, 0, 0], dtype=torch.float64) / 3)
+
+
+ENVIRONMENTS: dict[str, Any] = {
+    "action_masks()": ByMethod,
+    "action_masks(), observed as vectors": lambda: ByMethod(vector=True),
+    "info": lambda: Strict("info"),
+    "info, observed as vectors": lambda: Strict("info", vector=True),
+    "action_masks(), of a wrapper": lambda: Masker(Strict("nothing")),
+    "action_masks(), of a wrapper within an action wrapper": lambda: Turned(Masker(Strict("nothing"))),
+    "info, within an action wrapper": lambda: Turned(Strict("info")),
+    "action_masks(), within an action wrapper": lambda: Turned(ByMethod()),
+}
+MAKERS: dict[str, Any] = {"method": ByMethod, "info": lambda: Strict("info")}
+SEARCHES: dict[str, dict[str, Any]] = {
+    "none": {"depth": 0, "estimator": "sampled"},
+    "m = 0": {"depth": 0},
+    "expectimax": {"depth": 2, "search": "expectimax"},
+    "pruned": {"depth": 3, "search": {"type": "expectimax", "max_width": 2}},
+    "sampled": {"depth": 2, "search": {"type": "sampled", "samples": 2}},
+    "mcts": {"depth": 3, "search": {"type": "mcts", "simulations": 8}},
+    "merged mcts": {"depth": 3, "search": {"type": "mcts", "simulations": 8, "merge": True}},
+    "auto": {"depth": 2},
+}

@@ -26,7 +26,7 @@ from pgts_torch.models.masks import ActionMasks, masks_in
 from pgts_torch.options import MLP
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact
-from tests.agent.masked import GAMMA, LEGAL_SA, ByMethod, Masker, Strict, Turned, legal_mdp
+from tests.agent.masked import ENVIRONMENTS, GAMMA, LEGAL_SA, MAKERS, SEARCHES, ByMethod, Strict, legal_mdp
 from tests.support import same_values
 
 SHORT: dict[str, Any] = {
@@ -35,27 +35,6 @@ SHORT: dict[str, Any] = {
 SAMPLED: dict[str, Any] = {"depth": 0, "estimator": "sampled"}
 Q: dict[str, Any] = {"critic": {"type": "network", "target": "q", "target_period": 2}}
 
-ENVIRONMENTS: dict[str, Any] = {
-    "a method": ByMethod,
-    "a method, of vectors": lambda: ByMethod(vector=True),
-    "info": lambda: Strict("info"),
-    "info, of vectors": lambda: Strict("info", vector=True),
-    "a wrapper": lambda: Masker(Strict("nothing")),
-    "a wrapper within another": lambda: Turned(Masker(Strict("nothing"))),
-    "info of turned actions": lambda: Turned(Strict("info")),
-    "a method of turned actions": lambda: Turned(ByMethod()),
-}
-MAKERS: dict[str, Any] = {"method": ByMethod, "info": lambda: Strict("info")}
-SEARCHES: dict[str, dict[str, Any]] = {
-    "none": SAMPLED,
-    "m = 0": {"depth": 0},
-    "expectimax": {"depth": 2, "search": "expectimax"},
-    "pruned": {"depth": 3, "search": {"type": "expectimax", "max_width": 2}},
-    "sampled": {"depth": 2, "search": {"type": "sampled", "samples": 2}},
-    "mcts": {"depth": 3, "search": {"type": "mcts", "simulations": 8}},
-    "merged mcts": {"depth": 3, "search": {"type": "mcts", "simulations": 8, "merge": True}},
-    "auto": {"depth": 2},
-}
 UPDATES: dict[str, dict[str, Any]] = {
     "gradient": {"type": "gradient", "entropy_coef": 0.1},
     "ppo": {"type": "ppo", "entropy_coef": 0.1},
@@ -158,7 +137,7 @@ def test_without_masks_the_same_training_fails():
 # Values
 
 
-@pytest.mark.parametrize("env", ["a method", "info"])
+@pytest.mark.parametrize("env", ["action_masks()", "info"])
 def test_a_lookahead_has_the_values_of_the_mdp_without_illegal_actions(env):
     model = PGTS(ENVIRONMENTS[env], **(SHORT | {"depth": 40, "search": "expectimax"}))
     state_N = model.iterate().state_N
