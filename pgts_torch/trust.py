@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from types import ModuleType
 from typing import Any
 
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, failure
 
 _NAMES_MODULE = re.compile(r"\s*([^\W\d]\w*(?:\.[^\W\d]\w*)*)\s*:\s*[^\W\d]")
 """MODULE:ID, as in ids of Gymnasium and entry points; it does not match a URL or a time."""
@@ -31,18 +31,34 @@ def import_named(module: str) -> ModuleType:
         raise
 
 
-def check_imports(source: object, env: Any, kwargs: Any, model: Any = None) -> None:
-    """Refuse a saved environment or model whose options name a module to import.
+def made_by(what: str, make: str, *given: Any, **arguments: Any) -> Any:
+    """Return what a class or a function that the user has named, MODULE:NAME, makes.
+
+    Args:
+        what: it is, in errors.
+
+    Raises:
+        PgtsError: its module cannot be imported, or has no such name, or the call fails.
+    """
+    module, _, name = make.partition(":")
+    try:
+        return getattr(import_named(module), name)(*given, **arguments)
+    except BaseException as error:
+        raise failure(f"{what} {make}, which cannot be made", error) from error
+
+
+def check_imports(source: object, env: Any, kwargs: Any, **parts: Any) -> None:
+    """Refuse a saved environment, or another part of a training, whose options name a module to import.
 
     Args:
         source: the file, as named in errors.
         env, kwargs: the id and the arguments of the environment.
-        model: the options of its model.
+        parts: the options of other parts, by name.
 
     Raises:
         PgtsError: a string in them names a module.
     """
-    named = [("environment", each) for each in _texts([env, kwargs])] + [("model", each) for each in _texts(model)]
+    named = [(name, each) for name, part in ({"environment": [env, kwargs]} | parts).items() for each in _texts(part)]
     for what, text in named:
         is_id = text is env and ":" in text
         if is_id or _NAMES_MODULE.match(text):

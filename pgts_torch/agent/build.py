@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from torch import nn
 
 from pgts_torch.agent.critics import Critic, ExactCritic, RolloutCritic, TabularCritic
 from pgts_torch.agent.latent import LatentModel
@@ -15,7 +16,7 @@ from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate, Update
 from pgts_torch.agent.world import TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.models.base import SamplingModel
+from pgts_torch.models.base import Model, SamplingModel
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.arguments import checked, described
 from pgts_torch.options.critics import (
@@ -40,6 +41,8 @@ from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch
 
 Description = str | Mapping[str, Any] | Part
 """Options; or their name, as "ppo"; or a mapping of plain values, as {"type": "ppo", "clip_range": 0.1}."""
+
+MakesModule = Callable[..., nn.Module]
 
 _Choices = Mapping[type[Part], Callable[..., Any]]
 
@@ -196,7 +199,7 @@ def check_parts(arguments: Mapping[str, Any], world: World, policy: Policy, upda
 def plain(arguments: Mapping[str, Any], options: Training) -> dict[str, Any]:
     """Return the arguments of `PGTS` as plain values; PgtsError where a part was given as an object."""
     for name in ("policy", "critic", "update", "model"):
-        if not isinstance(arguments[name], str | Mapping | Part | None):
+        if isinstance(arguments[name], Policy | Critic | Update | Model):
             raise PgtsError(f"{name} was given as {arguments[name]!r}; only models made from descriptions can be saved")
     return {**arguments, **described(options), "env_kwargs": dict(arguments["env_kwargs"] or {})}
 

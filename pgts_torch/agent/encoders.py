@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from pgts_torch.agent.components import Component, components, counts, image_shape, inputs, legal_in, row_shape
 from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.options.own import OwnModule
 from pgts_torch.options.policies import CNN, MLP
 from pgts_torch.ranks import ALONE, Ranks
 
@@ -68,7 +69,8 @@ class OneHot(nn.Module):
     def __init__(self, component: spaces.Discrete | spaces.MultiDiscrete) -> None:
         super().__init__()
         each = counts(component)
-        self.shape: tuple[int, ...] = (int(each.sum()),)
+        self.counts: list[int] = each.tolist()
+        self.shape: tuple[int, ...] = (sum(self.counts),)
         self.register_buffer("first", torch.from_numpy(each.cumsum() - each), persistent=False)
 
     def forward(self, number_N: Tensor) -> Float[Tensor, "N D"]:
@@ -76,24 +78,37 @@ class OneHot(nn.Module):
         zeros_ND = torch.zeros(len(number_N), *self.shape, dtype=torch.float32, device=number_N.device)
         return zeros_ND.scatter_(1, column_NK, 1.0)
 
+    def examples(self, count: int, generator: torch.Generator) -> Float[Tensor, "N D"]:
+        """Return random rows."""
+        return self.forward(torch.stack([torch.randint(n, (count,), generator=generator) for n in self.counts], 1))
+
 
 @final
 class Values(nn.Module):
-    """Numbers on a scale [N, *shape] as float32: an image as [N, C, H, W], everything else as [N, D].
+    """Numbers on a scale [N, *shape] as float32: an image as [N, C, H, W], everything else as [N, D], or in its own
+    shape.
 
     shape: of what is returned, without N.   norm: the running statistics, of each channel or entry.
 
     Args:
         image: the height, width and channels that it is seen as; None: as a vector.
+        keeps_shape: whether what is no image keeps its shape.
         normalize: whether there are running statistics.
         scale: by which values are divided; None: the largest that is possible in bytes and in images, else 1.
     """
 
     def __init__(
-        self, component: Component, *, image: tuple[int, int, int] | None, normalize: bool, scale: float | None
+        self,
+        component: Component,
+        *,
+        image: tuple[int, int, int] | None,
+        normalize: bool,
+        scale: float | None,
+        keeps_shape: bool = False,
     ) -> None:
         super().__init__()
-        self._layout = image or (math.prod(component.shape or ()),)
+        shape = component.shape or (1,)
+        self._is_image, self._layout = image is not None, image or (shape if keeps_shape else (math.prod(shape),))
         self.shape = self._layout if image is None else (image[2], *image[:2])
         self.scale = _scale_of(component) if scale is None else scale
         self.norm = RunningNorm(self._layout[-1]) if normalize else None
@@ -101,7 +116,11 @@ class Values(nn.Module):
     def forward(self, x_N: Tensor) -> Float[Tensor, "N ..."]:
         x = self._scaled(x_N)
         x = (x if self.norm is None else self.norm(x)).float()
-        return x.permute(0, 3, 1, 2) if len(self.shape) == 3 else x
+        return x.permute(0, 3, 1, 2) if self._is_image else x
+
+    def examples(self, count: int, generator: torch.Generator) -> Float[Tensor, "N ..."]:
+        """Return random inputs from [0, 1)."""
+        return torch.rand(count, *self.shape, generator=generator, dtype=torch.float32)
 
     def absorb(self, x_N: Tensor, ranks: Ranks) -> None:
         """Add these to the running statistics, where there are any."""
@@ -123,14 +142,15 @@ class Encoder(nn.Module):
     space: of the rows.   shapes: of the inputs of each component.
 
     Args:
-        network: a cnn sees images as such if its convolutions fit in, an mlp all entries alike.
+        network: a cnn sees images as such if its convolutions fit in, an mlp all entries alike, a module of the
+            caller's own always.
 
     Raises:
         PgtsError: another space, a normalisation where nothing has a scale, or a cnn where there is no image that its
             convolutions fit in.
     """
 
-    def __init__(self, space: Space[Any], network: MLP | CNN) -> None:
+    def __init__(self, space: Space[Any], network: MLP | CNN | OwnModule) -> None:
         super().__init__()
         parts = inputs(space)
         if network.normalize and not any(isinstance(part, spaces.Box) for part in parts):
@@ -152,8 +172,11 @@ class Encoder(nn.Module):
         return sum(map(math.prod, self.shapes))
 
     def forward(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
-        encoded = [part(x_N) for part, x_N in zip(self.parts, self._split(observation_N), strict=False)]
-        return encoded[0] if len(encoded) == 1 else torch.cat([x_N.flatten(1) for x_N in encoded], 1)
+        return _joined([part(x_N) for part, x_N in zip(self.parts, self._split(observation_N), strict=False)])
+
+    def examples(self, count: int, generator: torch.Generator) -> Float[Tensor, "N ..."]:
+        """Return random inputs: one-hot rows of numbers, all else from [0, 1)."""
+        return _joined([part.examples(count, generator) for part in self.parts])  # type: ignore[operator]
 
     def _split(self, observation_N: Tensor) -> tuple[Tensor, ...]:
         """The entries of each component, the legal actions too."""
@@ -182,6 +205,10 @@ class Encoder(nn.Module):
         return self.norm is not None and not bool(self.norm.count)
 
 
+def _joined(encoded: list[Tensor]) -> Float[Tensor, "N ..."]:
+    return encoded[0] if len(encoded) == 1 else torch.cat([x_N.flatten(1) for x_N in encoded], 1)
+
+
 def convolved(image: tuple[int, int, int], network: CNN) -> tuple[int, int] | None:
     """Return the height and width of what the convolutions leave of an image; None where it is too small for them."""
     height, width, _ = image
@@ -192,15 +219,18 @@ def convolved(image: tuple[int, int, int], network: CNN) -> tuple[int, int] | No
     return height, width
 
 
-def _encoder(component: Component, network: MLP | CNN) -> OneHot | Values:
+def _encoder(component: Component, network: MLP | CNN | OwnModule) -> OneHot | Values:
     if isinstance(component, spaces.Discrete | spaces.MultiDiscrete):
         return OneHot(component)
+    keeps_shape = isinstance(network, OwnModule)
     if isinstance(component, spaces.MultiBinary):
-        return Values(component, image=None, normalize=False, scale=1.0)
-    image = image_shape(component) if isinstance(network, CNN) else None
-    if image is not None and isinstance(network, CNN) and convolved(image, network) is not None:
-        return Values(component, image=image, normalize=network.normalize, scale=network.scale)
-    return Values(component, image=None, normalize=network.normalize, scale=None)
+        return Values(component, image=None, normalize=False, scale=1.0, keeps_shape=keeps_shape)
+    image = None if isinstance(network, MLP) else image_shape(component)
+    if image is not None and isinstance(network, CNN) and convolved(image, network) is None:
+        image = None
+    if image is not None and isinstance(network, CNN):
+        return Values(component, image=image, keeps_shape=keeps_shape, normalize=network.normalize, scale=network.scale)
+    return Values(component, image=image, keeps_shape=keeps_shape, normalize=network.normalize, scale=None)
 
 
 def _scale_of(component: Component) -> float:

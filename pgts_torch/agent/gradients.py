@@ -34,7 +34,10 @@ class Forward:
     def gradients(self, gradient_ND: Float[Tensor, "N D"]) -> list[Tensor]:
         """The gradient of a loss in each weight of the network, from that in its outputs."""
         if self._graph_ND is not None:
-            return list(torch.autograd.grad(self._graph_ND, self.network.weights, gradient_ND))
+            if not len(self.output_ND):
+                return [torch.zeros_like(weight) for weight in self.network.weights]
+            unused = {"materialize_grads": True}
+            return list(torch.autograd.grad(self._graph_ND, self.network.weights, gradient_ND, **unused))
         found: list[Tensor] = []
         layers, down_NX = self.network.layers, gradient_ND
         for k in reversed(range(len(layers))):

@@ -19,8 +19,10 @@ from torch.nn.utils import skip_init
 
 from pgts_torch.agent.components import components, image_shape
 from pgts_torch.agent.encoders import Encoder, convolved
+from pgts_torch.agent.own_modules import OwnLayers, own_layers
 from pgts_torch.agent.policies import fitting
 from pgts_torch.errors import PgtsError
+from pgts_torch.options.own import OwnModule
 from pgts_torch.options.policies import CNN, MLP
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
@@ -35,11 +37,17 @@ _LARGE_IMAGE = 32
 
 @final
 class Trunk(nn.Module):
-    """All layers of a network but the last. A policy and a critic that have the same trunk share its weights."""
+    """All layers of a network but the last. A policy and a critic that have the same trunk share its weights.
 
-    def __init__(self, encoder: Encoder, layers: nn.Sequential, num_features: int) -> None:
+    returns_outputs: whether it is a module of the caller's own that returns what otherwise the last layer does.
+    """
+
+    def __init__(
+        self, encoder: Encoder, layers: nn.Sequential, num_features: int, *, returns_outputs: bool = False
+    ) -> None:
         super().__init__()
         self.encoder, self.layers, self.num_features = encoder, layers, num_features
+        self.returns_outputs = returns_outputs
 
 
 def default_network(space: Space[Any], *, normalize: bool = False) -> MLP | CNN:
@@ -59,7 +67,9 @@ def default_network(space: Space[Any], *, normalize: bool = False) -> MLP | CNN:
     return MLP(normalize=normalize and any(isinstance(part, spaces.Box) for part in parts))
 
 
-def make_trunk(network: MLP | CNN, observation_space: Space[Any], *, generator: torch.Generator) -> Trunk:
+def make_trunk(
+    network: MLP | CNN | OwnModule, observation_space: Space[Any], *, generator: torch.Generator, num_outputs: int = 1
+) -> Trunk:
     """Make a trunk on the CPU, with orthogonal weights of gain sqrt(2) (Saxe et al. 2014) and biases 0.
 
     MLP: without hidden layers, and with one-hot states, the network is a table. CNN: convolutions without padding over
@@ -68,11 +78,16 @@ def make_trunk(network: MLP | CNN, observation_space: Space[Any], *, generator: 
 
     Args:
         observation_space: of the rows: a `Component`, or a Tuple of some.
+        num_outputs: of a module of the caller's own that returns outputs.
 
     Raises:
-        PgtsError: the network does not take such observations, or a layer would have more than 20 million weights.
+        PgtsError: the network does not take such observations, a layer would have more than 20 million weights, or
+            a module of the caller's own cannot be used.
     """
     encoder = Encoder(observation_space, network)
+    if isinstance(network, OwnModule):
+        own = own_layers(network, encoder, None if network.head else num_outputs, generator)
+        return Trunk(encoder, nn.Sequential(own), own.num_outputs, returns_outputs=not network.head)
     flat, layers = encoder.num_inputs, list[nn.Module]()
     if isinstance(network, CNN):
         branches = [_convolutions(network, shape, generator) for shape in encoder.shapes]
@@ -118,8 +133,24 @@ def _convolutions(network: CNN, shape: tuple[int, ...], generator: torch.Generat
 
 
 @final
+class Scaled(nn.Module):
+    """weight * x + bias, for each output; at first x."""
+
+    def __init__(self, num_outputs: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(num_outputs, dtype=torch.float32))
+        self.bias = nn.Parameter(torch.zeros(num_outputs, dtype=torch.float32))
+
+    def forward(self, output_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N D"]:
+        return torch.addcmul(self.bias, output_ND, self.weight)
+
+
+@final
 class Network(nn.Module):
-    """A trunk and a linear head. It must not be moved to another device after its first use.
+    """A trunk and a head. It must not be moved to another device after its first use.
+
+    The head is linear. Where the trunk returns outputs there is none, or `Scaled` if the outputs are rescaled, as those
+    of a critic are with the scale of its targets.
 
     Args:
         trunk: may be shared with another network.
@@ -127,16 +158,21 @@ class Network(nn.Module):
         gain: of the head's orthogonal weights; its biases are 0.
     """
 
-    def __init__(self, trunk: Trunk, num_outputs: int, *, gain: float, generator: torch.Generator) -> None:
+    def __init__(
+        self, trunk: Trunk, num_outputs: int, *, gain: float, generator: torch.Generator, rescaled: bool = False
+    ) -> None:
         super().__init__()
         self.trunk = trunk
-        self.head = _linear(trunk.num_features, num_outputs, gain, generator, trunk.encoder.space)
+        if trunk.returns_outputs:
+            self.head: nn.Module = Scaled(num_outputs) if rescaled else nn.Identity()
+        else:
+            self.head = _linear(trunk.num_features, num_outputs, gain, generator, trunk.encoder.space)
         self._most_rows = max(1, _MOST_INPUTS // max(trunk.encoder.num_inputs, trunk.num_features))
 
     @cached_property
     def weights(self) -> list[nn.Parameter]:
-        """All parameters, the trunk's first."""
-        return list(self.parameters())
+        """All parameters that are trained, the trunk's first."""
+        return [weight for weight in self.parameters() if weight.requires_grad]
 
     @cached_property
     def tensors(self) -> list[Tensor]:
@@ -159,7 +195,7 @@ class Network(nn.Module):
         return [
             partial(nn.functional.linear, weight=layer.weight, bias=layer.bias)
             if isinstance(layer, nn.Linear)
-            else layer.forward
+            else (layer if isinstance(layer, OwnLayers) else layer.forward)
             for layer in self.layers
         ]
 
@@ -206,7 +242,8 @@ class Network(nn.Module):
             raise PgtsError(f"{unknown[0]} belongs to another network; this one has {sorted(own)}")
         found = {name: fitting(dict(state), name, like) for name, like in own.items()}
         for name, value in found.items():
-            if name.rpartition(".")[2] in ("count", "square_D") and bool((value < 0).any()):
+            is_statistic = name.startswith("trunk.encoder.") and name.rpartition(".")[2] in ("count", "square_D")
+            if is_statistic and bool((value < 0).any()):
                 raise PgtsError(f"{name} is negative")
         for name, value in found.items():
             own[name].copy_(value)

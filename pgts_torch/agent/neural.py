@@ -6,14 +6,14 @@ from typing import Any, final
 import torch
 from gymnasium.spaces import Space
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from pgts_torch.agent.advantages import critic_targets
 from pgts_torch.agent.components import legal_only
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.dense_steps import dense_steps
 from pgts_torch.agent.gradients import Forward
-from pgts_torch.agent.networks import Network, Trunk, default_network, make_trunk
+from pgts_torch.agent.networks import Network, Scaled, Trunk, default_network, make_trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
@@ -22,7 +22,8 @@ from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.options.critics import NetworkValues
 from pgts_torch.options.fields import limit
-from pgts_torch.options.policies import CNN, MLP
+from pgts_torch.options.policies import MLP
+from pgts_torch.options.policies import Network as Options
 from pgts_torch.options.schedules import value_at
 from pgts_torch.ranks import Ranks, Share
 from pgts_torch.readings import Readings
@@ -51,13 +52,13 @@ class NetworkPolicy(Policy):
         self,
         observation_space: Space[Any],
         num_actions: int,
-        options: MLP | CNN = MLP(),  # noqa: B008 - frozen
+        options: Options = MLP(),  # noqa: B008 - frozen
         *,
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
         generator = stream(seed, "policy")
-        trunk = make_trunk(options, observation_space, generator=generator)
+        trunk = make_trunk(options, observation_space, generator=generator, num_outputs=num_actions)
         self.options = options
         self.network = Network(trunk, num_actions, gain=0.01, generator=generator).to(device)
         self.num_actions = num_actions
@@ -108,13 +109,13 @@ class NetworkCritic(Critic):
     ) -> None:
         self.options = filled = options.filled("sampled")
         self.target, self.num_actions = options.target, num_actions
+        outputs = 1 if self.target == "v" else num_actions
         generator = stream(seed, "critic")
         if trunk is None:
             own = options.network
-            network = own if isinstance(own, MLP | CNN) else default_network(observation_space)
-            trunk = make_trunk(network, observation_space, generator=generator)
-        outputs = 1 if self.target == "v" else num_actions
-        self.network = Network(trunk, outputs, gain=1.0, generator=generator).to(device)
+            network = own if isinstance(own, Options) else default_network(observation_space)
+            trunk = make_trunk(network, observation_space, generator=generator, num_outputs=outputs)
+        self.network = Network(trunk, outputs, gain=1.0, generator=generator, rescaled=True).to(device)
         self._lags = options.lags
         self._target_network = copy.deepcopy(self.network) if self._lags else self.network
         self._rate = filled.learning_rate
@@ -311,6 +312,7 @@ class NetworkCritic(Critic):
             factor = torch.where(self._scale == 0, 1.0, old_scale / self._scale)
             shift = torch.where(self._scale == 0, 0.0, (old_mean - mean) / self._scale)
             for network in {self.network, self._target_network}:
+                assert isinstance(network.head, nn.Linear | Scaled)
                 network.head.weight.mul_(factor)
                 network.head.bias.mul_(factor).add_(shift)
 

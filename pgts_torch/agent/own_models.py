@@ -15,7 +15,7 @@ from torch import Tensor
 from pgts_torch.agent.components import image_shape, num_combinations, with_legal, with_mask
 from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.world import ModelWorld, TabularWorld, VectorStates, World
-from pgts_torch.errors import MissingModel, PgtsError, failure
+from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.counts import CountsModel
 from pgts_torch.models.ensemble import EnsembleModel
@@ -24,8 +24,9 @@ from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options.environment import Observed
-from pgts_torch.options.models import Counts, Ensemble, Latent, OwnModel
-from pgts_torch.trust import import_named
+from pgts_torch.options.models import Counts, Ensemble, Latent
+from pgts_torch.options.own import OwnModel
+from pgts_torch.trust import made_by
 
 _MOST_STATES = 2**20
 """Combinations of several numbers are counted up to so many."""
@@ -133,11 +134,7 @@ def own_model(options: OwnModel) -> Model:
         PgtsError: its module cannot be imported, or has no such name, or what it makes is no model.
     """
     assert options.make is not None
-    module, _, name = options.make.partition(":")
-    try:
-        made = getattr(import_named(module), name)(**options.arguments)
-    except BaseException as error:
-        raise failure(f"model.make is {options.make}, which cannot be made", error) from error
+    made = made_by("model.make is", options.make, **options.arguments)
     if not isinstance(made, Model):
         raise PgtsError(f"model.make is {options.make}, which made {made!r}; it must be a pgts_torch.models.Model")
     return made

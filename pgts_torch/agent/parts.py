@@ -34,7 +34,8 @@ from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.rewards import RewardRange
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.arguments import read
-from pgts_torch.options.models import LEARNED, OwnModel
+from pgts_torch.options.models import LEARNED
+from pgts_torch.options.own import OwnModel
 from pgts_torch.options.replay import UniformReplay
 from pgts_torch.options.rollouts import SampledAdvantages, StepsHorizon, check_processes
 from pgts_torch.options.training import Training

@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pgts_torch.agent import saved, saving
-from pgts_torch.agent.build import Description, make_device, plain
+from pgts_torch.agent.build import Description, MakesModule, make_device, plain
 from pgts_torch.agent.components import row_shape
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.draws import Draws
@@ -61,7 +61,8 @@ class PGTS:
         search: the search for the lookahead: "auto", MCTS(simulations=32), {"type": "sampled", "samples": 8}, ...
         estimator: "lookahead", or SampledAdvantages() of actions taken, which needs depth 0, a network and no model.
         policy, critic, update: options of these parts (`pgts_torch.options`), their names, or the parts themselves.
-            Default: tables where observations are numbered states, else networks.
+            Default: tables where observations are numbered states, else networks. policy and critic also: a class of
+            torch.nn.Module, or its "module:name" (`options.OwnModule`).
         model: what the lookahead queries. "auto": that of the environment, as above; "ensemble" (observations are
             vectors), "latent" (images) or "counts" (numbered states): one that is learned from the steps; or a `Model`
             whose states are the observations, or the "module:name" of what makes one.
@@ -103,8 +104,8 @@ class PGTS:
         stop_at: float | None = None,
         search: Description = "auto",
         estimator: Description = "lookahead",
-        policy: Description | Policy | None = None,
-        critic: Description | Critic | None = None,
+        policy: Description | Policy | MakesModule | None = None,
+        critic: Description | Critic | MakesModule | None = None,
         update: Description | Update | None = None,
         model: Description | Model = "auto",
         replay: Description = "auto",
@@ -370,8 +371,8 @@ class PGTS:
         Args:
             env: the environment, if it was given to the saved model as an object; default: the saved id.
             device: where to load it; default: the device it was saved from.
-            trust_imports: whether the module that the id of its environment may name, as in "module:Id-v0", is
-                imported. Nothing else in a file is executed.
+            trust_imports: whether modules that it names are imported, as that of the environment "module:Id-v0" or of
+                the policy "module:Net". Nothing else in a file is executed.
 
         Raises:
             PgtsError: no such file, damaged, or no saved model; it names a module that is not trusted; env is missing,

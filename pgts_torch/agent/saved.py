@@ -162,7 +162,8 @@ def load_training(
             else f"env is {env!r}; {path} has its own, {saved_env}"
         )
     if not trust_imports:
-        check_imports(path, saved_env, arguments.get("env_kwargs"), arguments.get("model"))
+        parts = {name: arguments.get(name) for name in ("model", "policy", "critic")}
+        check_imports(path, saved_env, arguments.get("env_kwargs"), **parts)
     arguments |= {"env": saved_env if env is None else env} | ({} if device is None else {"device": str(device)})
     arguments |= {"num_envs": None} if isinstance(env, VectorEnv) else {}
     try:

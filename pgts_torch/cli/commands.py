@@ -82,8 +82,9 @@ def train(arguments: Arguments) -> None:
     if fixed.resume is not None and not fixed.trust_imports:
         typed = {override.removeprefix("--").partition("=")[0] for override in overrides}
         saved_id = None if typed & {"env", "env.id"} else config.env.id
-        saved_model = None if typed & {"model", "model.make"} else config.model.plain()
-        check_imports(fixed.resume / "config.yaml", saved_id, config.env.kwargs, saved_model)
+        makes = {"model": "model.make", "policy": "policy.make", "critic": "critic.network.make"}
+        saved = {name: getattr(config, name).plain() for name, key in makes.items() if not typed & {name, key}}
+        check_imports(fixed.resume / "config.yaml", saved_id, config.env.kwargs, **saved)
     if fixed.processes is not None:
         from pgts_torch.experiment.launch import check_launch, launch
 

@@ -25,7 +25,7 @@ from pgts_torch.experiment.ownership import (
     read_mark,
 )
 from pgts_torch.experiment.tracking import GrowingDigest, versions
-from pgts_torch.options.models import OwnModel
+from pgts_torch.options.own import Own
 
 FREE_SECTIONS = ("run", "log")
 FREE_KEYS = ("name", "eval.every", "eval.episodes", "eval.keep_best")
@@ -118,7 +118,8 @@ def find(
 
 def names_modules(config: Config) -> bool:
     """Whether a configuration names modules that are imported."""
-    return ":" in config.env.id or isinstance(config.model, OwnModel)
+    parts = config.model, config.policy, getattr(config.critic, "network", None)
+    return ":" in config.env.id or any(isinstance(part, Own) for part in parts)
 
 
 def resuming(run: str | Path, world_size: int, *, imports: bool) -> str:

@@ -17,7 +17,8 @@ from pgts_torch.options.critics import (
     TabularValues,
     TDLambda,
 )
-from pgts_torch.options.models import AutoModel, Counts, Ensemble, GivenModel, Latent, OwnModel
+from pgts_torch.options.models import AutoModel, Counts, Ensemble, GivenModel, Latent
+from pgts_torch.options.own import OwnModel, OwnModule
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, NatureCNN, Random, Simplex, Softmax, Uniform
 from pgts_torch.options.replay import AutoReplay, NoReplay, UniformReplay
@@ -63,6 +64,7 @@ __all__ = [
     "NetworkValues",
     "NoReplay",
     "OwnModel",
+    "OwnModule",
     "OwnNetwork",
     "Part",
     "Projected",

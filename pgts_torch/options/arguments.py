@@ -38,7 +38,7 @@ def read(arguments: Mapping[str, Any]) -> Training:
     data: dict[str, Any] = {
         section: {name: arguments[name] for name in names if name in arguments} for section, names in _FLAT.items()
     }
-    parts = {name: getattr(arguments.get(name), "options", arguments.get(name)) for name in _PARTS}
+    parts = {name: _options_of(arguments.get(name)) for name in _PARTS}
     data |= {name: _with_never(value) for name, value in parts.items() if value is not None}
     search = arguments["search"]
     search = search.plain() if isinstance(search, Part) else search if isinstance(search, Mapping) else {"kind": search}
@@ -99,6 +99,11 @@ def _changed(part: Part) -> dict[str, Any]:
         if name not in ("type", "kind") and value is not None and value != field.default:
             changed[field.alias or name] = _short(value) if isinstance(value, Part) else value
     return changed
+
+
+def _options_of(part: Any) -> Any:
+    """The options of an object that was made from some; a class of the caller's own, and all else, as it is."""
+    return part if isinstance(part, type) else getattr(part, "options", part)
 
 
 def _with_never(value: Any) -> Any:

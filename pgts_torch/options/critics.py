@@ -1,10 +1,12 @@
 """Options of the critic, which gives the values at the leaves of the lookahead."""
 
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
 from pgts_torch.options.fields import Clip, Count, Share, UnitInterval, conflict
+from pgts_torch.options.own import OwnModule, by_name
 from pgts_torch.options.part import Part, null
 from pgts_torch.options.policies import CNN, MLP, NatureCNN
 from pgts_torch.options.rollouts import GeometricHorizon, Horizon
@@ -106,7 +108,11 @@ class NetworkValues(Values):
 
     type: Literal["network"] = "network"
 
-    network: OwnNetwork | SharedNetwork | MLP | CNN | NatureCNN = Field(default=OwnNetwork(), discriminator="type")
+    network: Annotated[
+        OwnNetwork | SharedNetwork | MLP | CNN | NatureCNN | OwnModule,
+        Field(discriminator="type"),
+        BeforeValidator(partial(by_name, kind=OwnModule)),
+    ] = OwnNetwork()
     """The network."""
 
     method: Annotated[MonteCarlo | NetworkTDLambda, Field(discriminator="type"), BeforeValidator(_of_networks)] = (

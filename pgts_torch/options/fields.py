@@ -2,6 +2,7 @@
 
 import math
 import re
+import sys
 from collections.abc import Iterator
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -86,6 +87,10 @@ def _plain_values(value: Any) -> Iterator[Any]:
         yield value
 
 
+KEY = "{key}"
+"""In a `conflict`: the dotted key of the value that is refused, where it is not known, as one part is in several."""
+
+
 def conflict(reason: str, *keys: str) -> PydanticCustomError:
     """An error whose message is a whole sentence.
 
@@ -97,7 +102,24 @@ def conflict(reason: str, *keys: str) -> PydanticCustomError:
 
 
 Kwargs = Annotated[dict[str, Any], AfterValidator(_check_kwargs)]
-Arguments = Annotated[dict[str, Any], AfterValidator(partial(_check_arguments, "model.arguments"))]
+Arguments = Annotated[dict[str, Any], AfterValidator(partial(_check_arguments, KEY))]
+
+
+def _by_name(value: Any) -> Any:
+    """MODULE:NAME of a class or a function; everything else stays what it is."""
+    if not callable(value):
+        return value
+    module, name = (str(getattr(value, each, "")) for each in ("__module__", "__qualname__"))
+    if not name or getattr(sys.modules.get(module), name, None) is not value:
+        raise conflict(
+            f"{KEY} is {name or f'an object of the class {type(value).__name__}'}; it must be a class, or a function "
+            "that makes one, at the top level of a module, so that it is found there by its name",
+            KEY,
+        )
+    return f"{module}:{name}"
+
+
+Make = Annotated[Entry | None, BeforeValidator(_by_name)]
 
 
 def _check_ascending(pair: list[float]) -> list[float]:

@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from pgts_torch.options.fields import INT64_MAX
+from pgts_torch.options.fields import INT64_MAX, KEY
 from pgts_torch.options.schema import KeyPath, Node, Schema, is_text, requirement, schema_of, tag_of
 
 
@@ -44,8 +44,9 @@ def explain(
 def _mistake(schema: Schema, error: ErrorDetails, written: Callable[[KeyPath], str | None]) -> Mistake:
     path, node, section = schema.locate(error["loc"])
     if error["type"] == "conflict":
-        keys = tuple(tuple(key.split(".")) for key in error["ctx"]["keys"])
-        return Mistake(error["ctx"]["reason"], keys or (path,))
+        dotted = ".".join(path)
+        keys = tuple(tuple(key.replace(KEY, dotted).split(".")) for key in error["ctx"]["keys"])
+        return Mistake(error["ctx"]["reason"].replace(KEY, dotted), keys or (path,))
     if node is None:
         return Mistake(_unknown(schema, path, section), (path,))
     value, must = error["input"], what(node)

@@ -5,17 +5,16 @@ from typing import Any, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from pgts_torch.options.fields import (
-    Arguments,
     Ascending,
     Between,
     Count,
-    Entry,
     NonNegative,
     Positive,
     Share,
     Sizes,
     conflict,
 )
+from pgts_torch.options.own import OwnModel
 from pgts_torch.options.part import Part, null
 from pgts_torch.options.policies import CNN, NatureCNN
 
@@ -148,27 +147,6 @@ class Latent(Part):
 
     first_updates: Count = 500
     """Gradient steps after the first rollouts."""
-
-
-class OwnModel(Part):
-    """A model of your own, whose states are observations."""
-
-    type: Literal["own"] = "own"
-
-    make: Entry | None = None
-    """A class or a function that makes it, MODULE:NAME; its module is imported. model: MODULE:NAME is short for it."""
-
-    arguments: Arguments = Field(default={})
-    """Arguments of that class or function, for instance --model.arguments.size 7."""
-
-    @field_validator("make")
-    @classmethod
-    def _is_given(cls, value: Any) -> Any:
-        if value is None:
-            raise conflict(
-                "model.type is own, which needs model.make, MODULE:NAME of what makes the model", "model.make"
-            )
-        return value
 
 
 Model = AutoModel | GivenModel | Counts | Ensemble | Latent | OwnModel

@@ -5,6 +5,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from pgts_torch.options.fields import Natural, PerLayer, Positive, Share, Sizes, conflict
+from pgts_torch.options.own import OwnModule
 from pgts_torch.options.part import Part
 
 
@@ -157,7 +158,7 @@ class NatureCNN(CNN):
 
 
 Table = Softmax | Simplex
-Network = MLP | CNN | NatureCNN
+Network = MLP | CNN | NatureCNN | OwnModule
 
-TABLES, NETWORKS = ("softmax", "simplex"), ("mlp", "cnn", "nature_cnn")
+TABLES, NETWORKS = ("softmax", "simplex"), ("mlp", "cnn", "nature_cnn", "module")
 """The types of tables and of networks; auto, which the environment decides, is in neither."""

@@ -167,9 +167,9 @@ def requirement(node: Node) -> str:
     if "anyOf" in node:
         return " or ".join(requirement(each) for each in node["anyOf"])
     if "oneOf" in node:
-        return _either(list(node["discriminator"]["mapping"]))
+        return either(list(node["discriminator"]["mapping"]))
     if "const" in node or "enum" in node:
-        return _either(node.get("enum") or [node["const"]])
+        return either(node.get("enum") or [node["const"]])
     match node.get("type"):
         case None:
             return "a plain value"
@@ -213,7 +213,7 @@ def _bounds(node: Node) -> str:
     return f" in {'[' if above is None else '('}{low if above is None else above:g}, {high:g}]"
 
 
-def _either(values: list[str]) -> str:
+def either(values: list[str]) -> str:
     *others, last = values
     return f"{', '.join(others)} or {last}" if others else last
 

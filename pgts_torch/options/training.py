@@ -8,7 +8,8 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues, TabularValues
 from pgts_torch.options.environment import Env
 from pgts_torch.options.fields import conflict
-from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Latent, Model, OwnModel
+from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Latent, Model
+from pgts_torch.options.own import Own, OwnModel, OwnModule, by_name
 from pgts_torch.options.part import Part
 from pgts_torch.options.policies import CNN, MLP, NETWORKS, TABLES, AutoPolicy, Biased, Network, Simplex, Softmax, Table
 from pgts_torch.options.replay import AutoReplay, NoReplay, Replay, UniformReplay
@@ -22,6 +23,7 @@ from pgts_torch.options.rollouts import (
     SampledAdvantages,
     StepsHorizon,
 )
+from pgts_torch.options.schema import either
 from pgts_torch.options.search import AutoSection, ExpectimaxSection, SearchSection
 from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient, Update
 
@@ -87,6 +89,11 @@ class Training(Part):
             raise conflict(
                 f"critic.network.type is shared; policy.type {policy.type} is a table, which has no network to share"
             )
+        if network == "shared" and isinstance(policy, OwnModule) and not policy.head:
+            raise conflict(
+                f"critic.network.type is shared; policy.make {policy.make} returns logits, which no critic can share: "
+                "set policy.head to true, where it returns features, or give the critic a network of its own"
+            )
         if isinstance(critic.network, CNN) and isinstance(policy, Table):
             raise conflict(
                 f"critic.network.type is {network}, which takes images; policy.type is {policy.type}, a table of "
@@ -108,7 +115,7 @@ class Training(Part):
                 )
         if isinstance(policy, Table):
             raise conflict(
-                f"estimator.type is sampled, which needs policy.type mlp or cnn; policy.type is {policy.type}"
+                f"estimator.type is sampled, which needs policy.type mlp, cnn or module; policy.type is {policy.type}"
             )
         if isinstance(critic, Critic) and (critic.type in ("exact", "rollout") or critic.target == "q"):
             raise conflict(
@@ -125,7 +132,7 @@ class Training(Part):
         if policy is None or isinstance(update, AutoUpdate):
             return update
         if not isinstance(policy, (AutoPolicy, *MOVES[type(update)])):
-            needed = " or ".join(kind().type for kind in MOVES[type(update)])
+            needed = either([kind.model_fields["type"].default for kind in MOVES[type(update)]])
             raise conflict(
                 f"update.type is {update.type}, which needs policy.type {needed}; policy.type is {policy.type}"
             )
@@ -229,10 +236,10 @@ class Training(Part):
 MOVES: dict[type[Part], tuple[type[Table | Network], ...]] = {
     Projected: (Simplex,),
     SoftmaxGradient: (Softmax,),
-    Mirror: (Softmax, Simplex, MLP, CNN),
-    Gradient: (MLP, CNN),
-    PPO: (MLP, CNN),
-    CMPO: (MLP, CNN),
+    Mirror: (Softmax, Simplex, MLP, CNN, OwnModule),
+    Gradient: (MLP, CNN, OwnModule),
+    PPO: (MLP, CNN, OwnModule),
+    CMPO: (MLP, CNN, OwnModule),
 }
 """The policies that each update can move."""
 
@@ -257,17 +264,17 @@ def _with_types(data: dict[str, Any]) -> dict[str, Any]:
 
     It is the first type that goes with the other values and has all these keys; if none has, the first that goes.
     """
-    model = data.get("model")
-    model = {"type": model} if isinstance(model, str) else model
-    if isinstance(model, dict) and isinstance(name := model.get("type"), str) and ":" in name:
-        data = data | {"model": model | {"type": "own", "make": name}}  # a name of the caller's own, MODULE:NAME
+    kinds: dict[str, type[Own]] = {"model": OwnModel, "policy": OwnModule, "critic": OwnModule}
+    data = data | {name: by_name(data[name], kind) for name, kind in kinds.items() if name in data}
+    if _type(data, "critic") == "module":
+        data |= {"critic": {"type": "network", "network": data["critic"]}}
     data = _with_type(_with_type(data, "model", [Ensemble, Counts, Latent, OwnModel]), "replay", [UniformReplay])
     replayed = _type(data, "replay") == "uniform" or _type(data, "model") in ("ensemble", "counts", "latent")
     sampled = _type(data, "estimator") == "sampled"
     horizons: list[type[Part]] = [FixedHorizon, GeometricHorizon, *[StepsHorizon] * sampled]
     if isinstance(rollout := data.get("rollout"), dict):
         data = data | {"rollout": _with_type(rollout, "horizon", [StepsHorizon] * replayed + horizons)}
-    data = _with_type(data, "policy", [Softmax, MLP, CNN])
+    data = _with_type(data, "policy", [Softmax, MLP, CNN, OwnModule])
     policy = _type(data, "policy")
     tables, networks = policy not in NETWORKS, policy not in TABLES
     for_tables: list[type[Part]] = [Projected if policy == "simplex" else Mirror]

@@ -16,10 +16,11 @@ from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate
 from pgts_torch.agent.policies import SimplexPolicy
 from pgts_torch.errors import PgtsError
-from pgts_torch.options import CNN, MLP, FixedHorizon, NetworkValues, TDLambda
+from pgts_torch.options import CNN, MLP, FixedHorizon, NetworkValues, OwnModule, TDLambda
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact, random_mdp
 from tests.agent.helpers import by_hand, experience, following
+from tests.agent.modules import Plain, deep, linear
 from tests.support import random_policy
 
 VECTORS = spaces.Box(-math.inf, math.inf, (3,))
@@ -96,8 +97,10 @@ def test_a_policy_survives_the_round_trip_through_a_file(tmp_path):
 
 
 @pytest.mark.usefixtures("unchecked_shapes")
-@pytest.mark.parametrize("target", ["v", "q"])
-def test_fresh_targets_bring_the_values_of_a_policy_in_two_fits_and_stale_ones_do_not(target):
+@pytest.mark.parametrize(
+    ("target", "network"), [("v", MLP(hidden=())), ("q", MLP(hidden=())), ("v", OwnModule(make=linear))]
+)
+def test_fresh_targets_bring_the_values_of_a_policy_in_two_fits_and_stale_ones_do_not(target, network):
     # Of what is missing each stale fit leaves gamma (1 - lambda) / (1 - gamma lambda) = 0.905: 0.82 after two.
     mdp = random_mdp(6, 2, gamma=0.95, start=None)
     pi_SA = random_policy(mdp, seed=1)
@@ -105,9 +108,7 @@ def test_fresh_targets_bring_the_values_of_a_policy_in_two_fits_and_stale_ones_d
     missing = {}
     for fresh in (False, True):
         options = {"target": target, "method": TDLambda(lambda_=0.5), "learning_rate": 0.03, "fresh_targets": fresh}
-        critic = NetworkCritic(
-            STATES, 2, NetworkValues(network=MLP(hidden=()), num_epochs=40, minibatch_size=1000, **options)
-        )
+        critic = NetworkCritic(STATES, 2, NetworkValues(network=network, num_epochs=40, minibatch_size=1000, **options))
         for each in made:
             critic.fit(following(pi_SA), each, generator=stream(0, "critic"))
         v_S = exact.evaluate(mdp, pi_SA).v_S
@@ -159,10 +160,11 @@ def test_values_are_in_reward_units_whatever_the_unit_is(unit):
     assert values[0][1] > 1
 
 
-def test_a_new_scale_of_the_targets_leaves_learned_values_where_they_were():
-    learned = NetworkCritic(VECTORS, 2, NetworkValues(target_period=3), seed=1)
+@pytest.mark.parametrize("options", [{}, {"network": OwnModule(make=deep)}])
+def test_a_new_scale_of_the_targets_leaves_learned_values_where_they_were(options):
+    learned = NetworkCritic(VECTORS, 2, NetworkValues(target_period=3, **options), seed=1)
     learned.fit(following(torch.ones(4, 2) / 2), by_hand(shows=POINTS_SD), generator=stream(0, "c"))
-    critic = NetworkCritic(VECTORS, 2, NetworkValues(target_period=3, learning_rate=1e-12))
+    critic = NetworkCritic(VECTORS, 2, NetworkValues(target_period=3, learning_rate=1e-12, **options))
     critic.load_state_dict(learned.state_dict())
     critic.fit(following(torch.ones(4, 2) / 2), by_hand(1000.0, shows=POINTS_SD), generator=stream(0, "c"))
     assert critic.state_dict()["scale"] > 100 * learned.state_dict()["scale"]
@@ -240,9 +242,16 @@ def test_a_policy_and_a_critic_can_share_a_trunk():
     assert torch.equal(alone.v(images_S), before_S)
 
 
-@pytest.mark.parametrize(("target", "polyak"), [("v", 1.0), ("q", 0.5)])
-def test_a_saved_critic_goes_on_bit_for_bit(target, polyak, tmp_path):
-    options = {"network": MLP(hidden=(8,), normalize=True), "target": target, "polyak": polyak}
+@pytest.mark.parametrize(
+    ("target", "polyak", "network"),
+    [
+        ("v", 1.0, MLP(hidden=(8,), normalize=True)),
+        ("q", 0.5, MLP(hidden=(8,), normalize=True)),
+        ("q", 0.5, OwnModule(make=Plain, normalize=True)),
+    ],
+)
+def test_a_saved_critic_goes_on_bit_for_bit(target, polyak, network, tmp_path):
+    options = {"network": network, "target": target, "polyak": polyak}
     critics = [NetworkCritic(VECTORS, 2, NetworkValues(**options), seed=seed) for seed in (1, 2)]
     made, policy = by_hand(shows=POINTS_SD), NetworkPolicy(VECTORS, 2)
     critics[0].fit(policy, made, generator=stream(0, "critic"))

@@ -298,7 +298,10 @@ def test_arguments_that_do_not_fit_are_refused(kwargs, message):
     ("options", "message"),
     [
         ({"update": "mirror"}, "^update.type is mirror"),
-        ({"policy": "softmax", "update": "mirror"}, "^estimator.type is sampled, which needs policy.type mlp or cnn"),
+        (
+            {"policy": "softmax", "update": "mirror"},
+            "^estimator.type is sampled, which needs policy.type mlp",
+        ),
         ({"depth": 1}, "^depth is 1"),
         ({"critic": "exact"}, "^critic.type is exact"),
         ({"critic": "rollout"}, "^critic.type is rollout"),

@@ -26,6 +26,7 @@ from pgts_torch.models.ensemble import EnsembleModel
 from pgts_torch.options import Ensemble
 from pgts_torch.ranks import ALONE, Ranks, checksum, joined_ranks, present_ranks
 from pgts_torch.seeding import stream
+from tests.agent.modules import Plain
 from tests.forks import launched, on_ranks
 from tests.models.corridors import Corridor
 
@@ -57,6 +58,9 @@ KINDS: dict[str, Callable[..., PGTS]] = {
     "table, few roots": partial(PGTS, "pgts/Grid-v0", depth=2, max_roots=9),
     "network, few roots": partial(PGTS, "CartPole-v1", depth=1, update=GRADIENT, max_roots=20, **SMALL),
     "network, simulator": partial(PGTS, Counted, depth=1, update=GRADIENT, **SMALL),
+    "network of the caller's own": partial(
+        PGTS, "CartPole-v1", depth=1, update=GRADIENT, **SMALL | {"policy": {"make": Plain, "normalize": True}}
+    ),
     "network, learned model": partial(
         PGTS,
         "CartPole-v1",

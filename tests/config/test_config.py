@@ -210,6 +210,7 @@ UPDATES = {
     "mlp": ["auto", "gradient", "ppo", "mirror", "cmpo"],
     "cnn": ["auto", "gradient", "ppo", "mirror", "cmpo"],
     "nature_cnn": ["auto", "gradient", "ppo", "mirror", "cmpo"],
+    "module": ["auto", "gradient", "ppo", "mirror", "cmpo"],
 }
 """What can move a policy of each type."""
 
@@ -248,8 +249,9 @@ def configurations(draw: st.DrawFn) -> Config:
     if given["search.kind"] == "mcts":
         given |= {"search.exploration": None} if given["search.rule"] == "gumbel" else {"search.prior": "uniform"}
         given |= {"search.merge": False} if given["search.backup"] == "mean" else {}
-    if types["model.type"] == "own":
-        given["model.make"] = "models_of_mine:model"
+    given |= {key: "mine:made" for key in given if key.endswith(".make")}
+    if policy == "module" and types["critic.network.type"] == "shared":
+        given["policy.head"] = True
     if types["model.type"] == "counts" and given["model.optimism"] == "none":
         given["model.strength"] = None
     if types["model.type"] == "counts" and given["model.value_range"] is None:
@@ -340,6 +342,7 @@ PICTURED = SimpleNamespace(
 )
 """The world of a numbered environment, and as much of one with images as parts ask for."""
 
+CRITIC = ["--critic.network.make", "tests.agent.modules:Plain", "--critic.network.arguments.width", "3"]
 PARTS = [
     [],
     ["--policy.type", "simplex", "--update.type", "projected"],
@@ -361,6 +364,7 @@ PARTS = [
         *("--policy", "{type: nature_cnn, kernel_size: 2, stride: 1, hidden: [8]}"),
         *("--critic.network", "{type: nature_cnn, kernel_size: [3, 2, 2], stride: 1, hidden: [8]}"),
     ],
+    ["--policy", "tests.agent.modules:Plain", "--critic.network.type", "module", *CRITIC],
     ["--policy.type", "mlp", "--search.depth", "0", "--estimator.type", "sampled", "--estimator.lambda", "0.9"],
     ["--rollout.horizon.type", "fixed", "--model.type", "given", "--replay.type", "none"],
     ["--rollout.horizon", "{length: 5, max_length: 9}", "--search.depth=0", "--estimator=sampled", "--policy=mlp"],

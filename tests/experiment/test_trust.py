@@ -159,7 +159,7 @@ def test_a_model_of_the_callers_own_takes_arguments(here, tmp_path):
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (None, r"needs model\.make"),
+        (None, r"model\.make is missing"),
         ("models_of_mine:nothing", r"made None; it must be a pgts_torch\.models\.Model"),
         ("models_of_mine:missing", "cannot be made"),
         ("no_such_module:model", "cannot be made"),
