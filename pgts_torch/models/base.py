@@ -133,11 +133,13 @@ class EnumeratingModel(Model):
 
     num_outcomes: K; None: it is not known before the first query.
     samples_outcomes: whether it samples the outcomes that it enumerates, and remembers them.
+    answers_singly: whether what it answers is the same, bit for bit, however states are split into queries.
     table: the outcomes of all states, for good, where it keeps such a table; searches then read it without a copy.
     """
 
     num_outcomes: int | None = None
     samples_outcomes: bool = False
+    answers_singly: bool = False
     table: Outcomes | None = None
 
     @abstractmethod

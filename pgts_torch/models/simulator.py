@@ -64,7 +64,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             1, or above 1 beside a highest value or action masks.
     """
 
-    kind, is_cheap, num_outcomes = "simulator", False, 1
+    kind, is_cheap, num_outcomes, answers_singly = "simulator", False, 1, True
 
     def __init__(
         self,

@@ -87,8 +87,7 @@ class OutcomeTable(Table):
         # The states are distinct, so that none is queried, or gets a row, twice.
         missing = self.missing(state_N)
         if missing.shape[0] and self.meter is not None:
-            # Numbers that a learned model answers may depend on how many states it is asked for.
-            known, divides = self.num_queried, self.model.exact
+            known, divides = self.num_queried, self.model.answers_singly
             self.meter.query(missing, self._ask, self._children, known=known, divides=divides)
         elif missing.shape[0]:
             self._ask(missing)

@@ -34,10 +34,24 @@ class Counted(Corridor):
         return super().step(action + 5)
 
 
+class Far(Counted):
+    """Its corridor does not end, and no two of its states are the same."""
+
+    def step(self, action: int):
+        self.fuel -= 1 / (3 + action)
+        return self.look(), self.fuel, self.fuel <= 10, False, {}
+
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        self.fuel += float(self.np_random.random())
+        return self.look(), {}
+
+
 CASES: dict[str, dict[str, Any]] = {
     "paths that never meet": CARTPOLE | {"depth": 5},
     "paths that never meet, few levels": CARTPOLE | {"depth": 1, "num_envs": 8},
     "paths that meet, in a simulator": NETWORK | {"env": Counted, "depth": 6, "num_envs": 8},
+    "many roots in a simulator": NETWORK | {"env": Far, "depth": 2, "num_envs": 4},
     "a tree search": CARTPOLE | {"depth": 6, "search": {"type": "mcts", "simulations": 20}},
     "sampled outcomes": CARTPOLE | {"depth": 2, "search": {"type": "sampled", "samples": 2}},
     "few calls": CARTPOLE | {"depth": 6, "search": {"type": "auto", "max_calls": 1200}},
@@ -78,6 +92,7 @@ def test_the_calls_of_an_iteration_are_foreseen_before_they_are_made(case, monke
     model = PGTS(**CASES[case])
     first = PGTS(**CASES[case]).iterate().look  # how many there are is known by now
     assert first is not None
+    capsys.readouterr()
     said, queried = ticking(model, monkeypatch, patience=2e-4 * first.model_calls)
     iteration = model.iterate()
     told = model.pricing.price
@@ -90,6 +105,30 @@ def test_the_calls_of_an_iteration_are_foreseen_before_they_are_made(case, monke
     assert re.match(
         r"note: an iteration takes (about|up to) [\d,]+ model calls and [\d.,]+ s\n$", capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize("case", ["paths that never meet", "many roots in a simulator", "a tree search"])
+def test_what_is_measured_is_learned_from_with_the_same_bits(case, monkeypatch):
+    """A training that is resumed, or runs on a slower machine, is measured in other iterations."""
+    plain, measured = PGTS(**CASES[case], seed=1), PGTS(**CASES[case], seed=1)
+    monkeypatch.setattr(plain.pricing, "begin", lambda: None)
+    monkeypatch.setattr(price, "Meter", functools.partial(Meter, patience=0.0))
+    for _ in range(2):
+        one, other = plain.iterate(), measured.iterate()
+        assert one.advantage_NA.equal(other.advantage_NA)
+        assert one.model_calls == other.model_calls
+        assert one.losses == other.losses
+    assert measured.pricing.price is not None
+
+
+def test_a_few_of_many_roots_are_queried_first_where_a_model_answers_singly():
+    model = PGTS(**CASES["many roots in a simulator"])
+    sizes = list[int]()
+    answered = model.world.model.outcomes
+    model.world.model.outcomes = lambda state_N: sizes.append(len(state_N)) or answered(state_N)
+    roots = len(model.iterate().state_N)
+    assert roots > 80
+    assert sizes[:3] == [8, 32, roots - 40]
 
 
 def test_a_price_that_follows_the_roots_alone_would_be_wrong():
@@ -154,7 +193,8 @@ def _described(search: Any) -> dict[str, Any]:
     return {"type": search} if isinstance(search, str) else search
 
 
-def test_a_cheap_iteration_is_priced_by_the_second_one_and_said_to_who_wants_to_see_progress(capsys):
+def test_a_cheap_iteration_is_priced_by_the_second_one_and_said_to_who_wants_to_see_progress(capsys, monkeypatch):
+    monkeypatch.setattr(price, "Meter", functools.partial(Meter, clock=lambda: 0.0))
     model = PGTS("pgts/Ladder-v0")
     model.iterate()
     assert model.pricing.price is None
