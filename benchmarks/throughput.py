@@ -2,10 +2,10 @@
 
     python benchmarks/throughput.py [--json FILE] [--quick] [--only training|lookahead] [--device DEVICE]
 
-Training: PPO and A2C at m = 0 with sampled advantages on CartPole against those of stable-baselines3, with the same
-networks, environments, transitions an update, passes, minibatches and optimiser. Lookahead: seconds and model calls of
-an iteration by depth, in tables, in torch dynamics and in simulators. The policy hardly moves there (its steps are 1e-9
-long), so every depth looks from the same states.
+Training: PPO and A2C at m = 0 with sampled advantages on CartPole against those of stable-baselines3 and against a loop
+that does nothing else (`minimal_loop.py`), with the same networks, environments, transitions an update, passes,
+minibatches and optimiser. Lookahead: seconds and model calls of an iteration by depth, in tables, in torch dynamics and
+in simulators. The policy hardly moves there (its steps are 1e-9 long), so every depth looks from the same states.
 
 One thread of one core. The peer needs stable-baselines3, DoorKey needs MiniGrid; without them they are left out.
 """
@@ -21,11 +21,13 @@ from typing import Any
 
 import common
 import gymnasium
+import minimal_loop
 import torch
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 
 import pgts_torch.agent.visit as visit_module
 from pgts_torch import PGTS
+from pgts_torch.agent.ongoing import OngoingEpisodes
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.config import load
 from pgts_torch.experiment.run import build
@@ -46,20 +48,27 @@ SHORT = ["--rollout.horizon.length", "50"]
 class Case:
     """What both sides train.
 
-    length: the most steps of an episode of ours, and the steps of each copy between two updates of the peer; None: our
-        episodes are whole, and the peer has as many transitions an update as ours had in the mean.
+    length: the steps of each environment between two updates, across which episodes go on; None: our episodes are
+        whole, and the peers have as many transitions an update as ours had in the mean.
+    steps: transitions of a training.
     """
 
     kind: str
     num_envs: int
     length: int | None
+    steps: int
 
     def __str__(self) -> str:
         return f"{self.kind}, {self.num_envs} x " + ("episode" if self.length is None else str(self.length))
 
 
-# The pole cannot fall in so few steps, so that short episodes are of one length.
-CASES = (Case("PPO", 8, None), Case("PPO", 64, 8), Case("A2C", 8, None), Case("A2C", 8, 5))
+CASES = (
+    Case("PPO", 8, None, 12_000),
+    Case("PPO", 8, 128, 12_000),
+    Case("PPO", 64, 8, 12_000),
+    Case("A2C", 8, None, 20_000),
+    Case("A2C", 8, 5, 40_000),
+)
 
 
 def our_training(case: Case, steps: int, seed: int) -> dict[str, float]:
@@ -81,13 +90,14 @@ def our_training(case: Case, steps: int, seed: int) -> dict[str, float]:
             **rate,
         },
         update={"type": "gradient", **rate} if a2c else {"type": "ppo", **passes, **rate},
-        horizon={"type": "fixed", "length": case.length or WHOLE},
+        horizon={"type": "fixed", "length": WHOLE} if case.length is None else {"type": "steps", "length": case.length},
         num_envs=case.num_envs,
         gamma=GAMMA,
         seed=seed,
     )
     queries: list[int] = []
-    with common.timed(visit_module, "rollout") as collecting:
+    collector = (visit_module, "rollout") if case.length is None else (OngoingEpisodes, "collect")
+    with common.timed(*collector) as collecting:
         begin = time.process_time()
         model.learn(steps, callback=lambda _, iteration: queries.append(iteration.experience.alive_TB.numel()))
         seconds = time.process_time() - begin
@@ -103,7 +113,7 @@ def peer_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, 
     import stable_baselines3
     from stable_baselines3.common.vec_env import DummyVecEnv
 
-    n_steps = case.length or max(1, round(batch / MINIBATCH)) * MINIBATCH // case.num_envs
+    n_steps = length_of(case, batch)
     options: dict[str, Any] = {"n_steps": n_steps, "learning_rate": RATE, "gamma": GAMMA, "gae_lambda": LAMBDA}
     options |= {"max_grad_norm": CLIP, "ent_coef": 0.0, "seed": seed, "device": "cpu"}
     options |= {"n_epochs": EPOCHS, "batch_size": MINIBATCH} if case.kind == "PPO" else {"use_rms_prop": False}
@@ -117,6 +127,19 @@ def peer_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, 
     return _figures(model.num_timesteps, len(collecting), model.num_timesteps, seconds, sum(collecting))
 
 
+def length_of(case: Case, batch: float) -> int:
+    """The steps of each environment between two updates of a peer."""
+    return case.length or max(1, round(batch / MINIBATCH)) * MINIBATCH // case.num_envs
+
+
+def loop_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, float]:
+    """The same by a minimal loop."""
+    settings: dict[str, Any] = {"hidden": HIDDEN, "rate": RATE, "gamma": GAMMA, "lambda_": LAMBDA, "clip": CLIP}
+    settings |= {"epochs": EPOCHS, "minibatch": MINIBATCH}
+    made = minimal_loop.train(case.kind, case.num_envs, length_of(case, batch), steps, seed, **settings)
+    return _figures(int(made["steps"]), int(made["updates"]), int(made["steps"]), made["seconds"], made["collecting"])
+
+
 def _figures(steps: int, updates: int, queries: int, seconds: float, collecting: float) -> dict[str, float]:
     """Transitions an update, how often the policy was queried for each, and transitions a CPU second by part."""
     return {
@@ -128,18 +151,22 @@ def _figures(steps: int, updates: int, queries: int, seconds: float, collecting:
     }
 
 
-def training(case: Case, steps: int, repeats: int) -> dict[str, Any]:
-    """Both sides in turns, each repeat with a seed of its own; a first short one, in which caches fill, is not kept."""
-    sides: dict[str, list[dict[str, float]]] = {"ours": [], "SB3": []}
-    for seed in range(-1, repeats):
-        length = WARM_STEPS if seed < 0 else steps
-        ours = our_training(case, length, max(seed, 0))
-        peer = peer_training(case, length, max(seed, 0), ours["batch"])
+def training(case: Case, quick: bool) -> dict[str, Any]:
+    """All sides in turns, each repeat with a seed of its own; a first short one, in which caches fill, is not kept."""
+    sides: dict[str, list[dict[str, float]]] = {"ours": [], "SB3": [], "loop": []}
+    for seed in range(-1, 3 if quick else 5):
+        length = WARM_STEPS if seed < 0 else case.steps // 2 if quick else case.steps
+        made = {"ours": our_training(case, length, max(seed, 0))}
+        made["SB3"] = peer_training(case, length, max(seed, 0), made["ours"]["batch"])
+        made["loop"] = loop_training(case, length, max(seed, 0), made["ours"]["batch"])
         if seed >= 0:
-            sides["ours"].append(ours)
-            sides["SB3"].append(peer)
+            for side, figures in made.items():
+                sides[side].append(figures)
     parts = {part: {side: [run[part] for run in runs] for side, runs in sides.items()} for part in sides["ours"][0]}
-    ratios = {part: common.median_ratio(of["ours"], of["SB3"]) for part, of in parts.items()}
+    ratios = {
+        part: {peer: common.median_ratio(of["ours"], of[peer]) for peer in ("SB3", "loop")}
+        for part, of in parts.items()
+    }
     return {"case": str(case), "figures": parts, "ratios": ratios}
 
 
@@ -150,7 +177,9 @@ def training_line(row: dict[str, Any]) -> str:
     batch = middle["batch"]
     line = f"{row['case']:17}{batch['ours']:7.0f}{batch['SB3']:6.0f}{middle['queries']['ours']:9.2f}"
     for part in ("whole", "learning", "collecting"):
-        line += f"{middle[part]['ours']:9,.0f}{middle[part]['SB3']:8,.0f}{row['ratios'][part]:7.2f}"
+        line += f"{middle[part]['ours']:9,.0f}" + "".join(
+            f"{row['ratios'][part][peer]:6.2f}" for peer in ("SB3", "loop")
+        )
     return line
 
 
@@ -216,11 +245,11 @@ def main(arguments: list[str] | None = None) -> None:
     if args.only != "lookahead":
         if importlib.util.find_spec("stable_baselines3"):
             print("CartPole-v1, m = 0, sampled advantages; transitions a CPU second, medians")
-            print(f"{'':17}{'batch':>13}{'queries':>9}{'whole training':>24}{'learning':>24}{'collecting':>24}")
-            print(f"{'':17}{'ours':>7}{'SB3':>6}{'ours':>9}" + f"{'ours':>9}{'SB3':>8}{'ratio':>7}" * 3)
+            print(f"{'':17}{'batch':>13}{'queries':>9}{'whole training':>21}{'learning':>21}{'collecting':>21}")
+            print(f"{'':17}{'ours':>7}{'SB3':>6}{'ours':>9}" + f"{'ours':>9}{'/SB3':>6}{'/loop':>6}" * 3)
             report["training"] = []
             for case in CASES:
-                report["training"].append(training(case, *((2_000, 3) if args.quick else (8_000, 5))))
+                report["training"].append(training(case, args.quick))
                 print(training_line(report["training"][-1]), flush=True)
             print(TRAINING_NOTE)
         else:
@@ -246,8 +275,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 TRAINING_NOTE = """batch: transitions an update. queries: of our policy, for each transition; an environment whose
 episode is over rests until the longest one ends, and what the policy returns for it is not kept. learning: all but
-collecting, which in SB3 includes values and GAE. 8 x episode: whole episodes of 8 environments; 64 x 8: 64
-environments, 8 steps each.
+collecting, which in SB3 and the loop includes values and GAE. 8 x episode: whole episodes of 8 environments; 64 x 8: 64
+environments, 8 steps each, and episodes go on in the next update. /SB3, /loop: our speed divided by theirs.
 """
 
 LOOKAHEAD_NOTE = """first: nothing is known of the model yet; later: median of the next iterations.

@@ -206,7 +206,7 @@ class Network(nn.Module):
 
     def encode(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
         """Return the inputs that `forward` takes, without gradient."""
-        return self.trunk.encoder(observation_N)
+        return self.trunk.encoder.forward(observation_N)
 
     def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
         for function in self.functions:

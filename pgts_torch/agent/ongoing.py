@@ -148,9 +148,9 @@ class OngoingEpisodes:
 
     def _step(self, action_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         reward_B, discount_B, truncated_B = self._episodes.step(action_B, np.ones(len(action_B), dtype=bool))
-        for b, action in enumerate(action_B.tolist()):
+        for b, (action, reward) in enumerate(zip(action_B.tolist(), reward_B.tolist(), strict=True)):
             self._actions_B[b].append(action)
-            self._return_B[b] += float(reward_B[b])
+            self._return_B[b] += reward
         return reward_B, discount_B, truncated_B
 
     def _begin(self, over_B: np.ndarray) -> None:
@@ -186,6 +186,8 @@ class OngoingEpisodes:
         def both(before: str, after: str) -> Tensor:
             """Columns of these two fields as [T + 1, P]: `before` each step, then `after` the last, also in padding."""
             before_TB, after_TB = (torch.stack([getattr(row, name) for row in rows]) for name in (before, after))
+            if len(parts) == over_TB.shape[1]:  # no episode ends before the last step
+                return torch.cat([before_TB, after_TB[-1:]])
             last_P = after_TB[step_TP[-1], env_P]
             after_UP = torch.cat([before_TB[step_TP, env_P], last_P[None]])
             padded = torch.from_numpy(~alive_TP)
