@@ -2,10 +2,12 @@
 
 import importlib.metadata
 import json
+import multiprocessing
 import os
 import platform
 import statistics
 import sys
+import tempfile
 import time
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterator
@@ -108,6 +110,28 @@ def timed(owner: Any, name: str, clock: Callable[[], float] = time.process_time)
         yield seconds
     finally:
         setattr(owner, name, plain)
+
+
+def on_ranks(size: int, work: Callable[[], Any]) -> list[Any]:
+    """What `work` gives in each of so many processes that train together, in the order of ranks. They are forked."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+
+        def join(rank: int) -> None:
+            torch.distributed.init_process_group("gloo", f"file://{folder}/meeting", world_size=size, rank=rank)
+            torch.distributed.barrier()
+            Path(folder, f"{rank}.json").write_text(json.dumps(work()))
+            torch.distributed.barrier()
+            torch.distributed.destroy_process_group()
+
+        processes = [multiprocessing.get_context("fork").Process(target=join, args=(rank,)) for rank in range(size)]
+        for process in processes:
+            process.start()
+        for process in processes:
+            process.join()
+        if any(process.exitcode for process in processes):
+            raise SystemExit("a process has failed")
+        return [json.loads(Path(folder, f"{rank}.json").read_text()) for rank in range(size)]
 
 
 def median_ratio(above: list[float], below: list[float]) -> float:
