@@ -27,6 +27,7 @@ from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 
 import pgts_torch.agent.visit as visit_module
 from pgts_torch import PGTS
+from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.ongoing import OngoingEpisodes
 from pgts_torch.agent.policy_lookahead import PolicyLookahead
 from pgts_torch.config import load
@@ -99,7 +100,7 @@ def our_training(case: Case, steps: int, seed: int) -> dict[str, float]:
     collector = (visit_module, "rollout") if case.length is None else (OngoingEpisodes, "collect")
     with common.timed(*collector) as collecting:
         begin = time.process_time()
-        model.learn(steps, callback=lambda _, iteration: queries.append(iteration.experience.alive_TB.numel()))
+        model.learn(steps, callback=lambda _, iteration: queries.append(queried(case, iteration)))
         seconds = time.process_time() - begin
     return _figures(model.num_env_steps, len(queries), sum(queries), seconds, sum(collecting))
 
@@ -125,6 +126,11 @@ def peer_training(case: Case, steps: int, seed: int, batch: float) -> dict[str, 
         model.learn(steps)
         seconds = time.process_time() - begin
     return _figures(model.num_timesteps, len(collecting), model.num_timesteps, seconds, sum(collecting))
+
+
+def queried(case: Case, iteration: Iteration) -> int:
+    """How many observations the policy was asked about in the episodes of an iteration."""
+    return iteration.experience.alive_TB.numel() if case.length is None else iteration.num_steps
 
 
 def length_of(case: Case, batch: float) -> int:

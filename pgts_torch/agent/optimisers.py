@@ -18,7 +18,7 @@ from pgts_torch.readings import Readings
 _BETAS = 0.9, 0.999
 _EPSILON = 1e-8
 
-_SHORT, _MANY = 2**15, 500
+_SHORT, _MANY = 2**15, 200
 """Steps of up to so many numbers are compiled, because calls of torch take longer than these; and only from so many
 steps on, because a training that takes fewer is over before compiled loops are loaded."""
 
