@@ -12,6 +12,7 @@ transforms actions is looked through.
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Self, final
 
 import gymnasium
@@ -27,6 +28,8 @@ from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.wrappers import hook_of, wrappers_of
 
 METHOD, KEY = "action_masks", "action_mask"
+
+_BYTES = np.dtype(np.int8), np.dtype(np.uint8)
 
 
 class Masked(NamedTuple):
@@ -123,14 +126,25 @@ class ActionMasks:
                 f"there is no {self.what}, which was there before: an environment that masks actions does so in each "
                 "reset and step; or set action_masks to 'off'"
             )
-        legal_A = self._entries(given)[self.index_AJ].all(-1)
+        legal_A = self._entries(given)
+        if not self._as_given:
+            legal_A = legal_A[self.index_AJ].all(-1)
         if not legal_A.any():
             raise PgtsError(
                 f"no action is legal by {self.what}, and the episode is not over: end it there, or allow one"
             )
         return legal_A
 
+    @cached_property
+    def _as_given(self) -> bool:
+        """Whether entry a is that of action a."""
+        return np.array_equal(self.index_AJ, np.arange(self.num_entries)[:, None])
+
     def _entries(self, given: Any) -> Bool[np.ndarray, "E"]:
+        # The common forms are told in few calls: in a mask of int8 each byte is 0 or 1.
+        is_plain = type(given) is np.ndarray and given.shape == (self.num_entries,)
+        if is_plain and (given.dtype == np.bool_ or (given.dtype in _BYTES and max(given.tobytes()) <= 1)):
+            return given.view(np.bool_)
         try:
             array = np.concatenate([np.ravel(part) for part in given]) if type(given) is tuple else np.asarray(given)
         except ValueError:
@@ -198,7 +212,7 @@ def has_method(env: gymnasium.Env | VectorEnv) -> bool:
 
 
 def masks_of(env: VectorEnv, make: Callable[[], gymnasium.Env] | None) -> ActionMasks | None:
-    """How the masks of environments that step together are read; None: they have none.
+    """How the masks of environments that step together are read; None: they have none, or continuous actions.
 
     Args:
         make: makes another one of them, which is reset to see what `info` has; None: they are reset.
@@ -206,10 +220,10 @@ def masks_of(env: VectorEnv, make: Callable[[], gymnasium.Env] | None) -> Action
     Raises:
         PgtsError: as `ActionMasks.of_env`.
     """
-    base, by_method, space = env.unwrapped, has_method(env), env.single_action_space
-    assert isinstance(space, spaces.Discrete)
-    if isinstance(base, TabularVectorEnv | CartPoles):
+    base, space = env.unwrapped, env.single_action_space
+    if isinstance(base, TabularVectorEnv | CartPoles) or not isinstance(space, spaces.Discrete):
         return None
+    by_method = has_method(env)
     if not by_method and KEY not in (env if make is None else make()).reset(seed=0)[1]:
         return None
     if isinstance(base, SyncVectorEnv):

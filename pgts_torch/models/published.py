@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -127,12 +127,15 @@ def _from_rows(env: gymnasium.Env, gamma: float, transforms: Transforms, generat
         if not (transforms.actions or transforms.rewards):
             return mdp
         positions = [_position(base, action) for action in base_actions(env)]
+        listed = (base.P[s] for s in range(len(base.P)))
+        rows = [row if isinstance(row, Mapping) else dict(enumerate(row)) for row in listed]
         P: Any = {
-            s: [
-                [(p, child, number_of("reward", transforms.reward(r)), end) for p, child, r, end in base.P[s][a]]
-                for a in positions
-            ]
-            for s in range(len(base.P))
+            s: {
+                k: [(p, child, number_of("reward", transforms.reward(r)), end) for p, child, r, end in row[a]]
+                for k, a in enumerate(positions)
+                if a in row
+            }
+            for s, row in enumerate(rows)
         }
         return TabularMDP.from_transitions(P, gamma, start=start, shape=mdp.shape)
     except MissingModel:

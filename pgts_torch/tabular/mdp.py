@@ -118,7 +118,7 @@ class TabularMDP:
         `from_dense`.
 
         Args:
-            P: transitions for states 0..S-1 and actions 0..A-1.
+            P: transitions for states 0..S-1 and actions 0..A-1; a mapping P[s] may lack actions that are not allowed.
             gamma: discount of the transitions that do not terminate.
         """
         check_gamma(gamma)

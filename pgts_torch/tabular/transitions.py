@@ -1,6 +1,8 @@
 """Lists of transitions, as in the P tables of Gymnasium's toy-text environments, as one table of outcomes."""
 
+import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +20,7 @@ Transition = tuple[float, int, float, bool]
 """(probability, next state, reward, terminated)"""
 
 Transitions = Mapping[int, Mapping[int, Sequence[Transition]]] | Sequence[Sequence[Sequence[Transition]]]
-"""P[s][a]: what may follow state s and action a."""
+"""P[s][a]: what may follow state s and action a. Where a mapping P[s] lacks an action, it is not allowed there."""
 
 _Row = tuple[float, dict[tuple[int, bool, float], float]]
 """Expected reward of (s, a), and the probability of each (next state, terminated, reward) that it may lead to."""
@@ -29,7 +31,7 @@ def outcomes_of(
 ) -> tuple[Outcomes, Float[Tensor, "S"], Float[Tensor, "S A K"] | None]:
     """The outcomes, the start distribution, and the reward of each outcome where those of one (s, a) differ."""
     S = len(P)
-    A = len(P[0]) if S else 0
+    A = max((_num_actions(P[s]) for s in range(S)), default=0)
     if A == 0:
         raise PgtsError("P is empty; it must hold at least one state and one action")
     start_S = start_distribution(start, S)
@@ -50,10 +52,18 @@ def outcomes_of(
     return outcomes, start_S, torch.from_numpy(reward) if (reward != mean[:, :, None]).any() else None
 
 
+def _num_actions(row: Any) -> int:
+    return 1 + max(row, default=-1) if isinstance(row, Mapping) else len(row)
+
+
 def _merged(P: Transitions, s: int, a: int, S: int, A: int) -> _Row:
     """P[s][a] with equal transitions added up and impossible ones left out."""
-    if len(P[s]) != A:
-        raise PgtsError(f"P[{s}] has {len(P[s])} actions; P[0] has {A}")
+    if isinstance(P[s], Mapping):
+        if a not in P[s]:
+            return -math.inf, {(s, True, -math.inf): 1.0}
+    elif len(P[s]) != A:
+        most = next(t for t in range(S) if _num_actions(P[t]) == A)
+        raise PgtsError(f"P[{s}] has {len(P[s])} actions; P[{most}] has {A}")
     successors = dict[tuple[int, bool, float], float]()
     # Counted from the first reward, so that equal rewards have exactly this mean.
     expected_reward = first_reward = float(P[s][a][0][2]) if len(P[s][a]) else 0.0
@@ -83,7 +93,9 @@ def _terminal_states(rows: list[list[_Row]], start_S: Tensor) -> set[int]:
     frontier = torch.nonzero(start_S).flatten().tolist()
     alive, ended = set(frontier), set[int]()
     while frontier:
-        for _, successors in rows[frontier.pop()]:
+        for expected_reward, successors in rows[frontier.pop()]:
+            if expected_reward == -math.inf:
+                continue
             for next_state, terminated, _ in successors:
                 if terminated:
                     ended.add(next_state)

@@ -6,8 +6,10 @@ Here each of the states forbids one of three actions, so that the MDP without th
 import math
 from dataclasses import replace
 
+import gymnasium
 import pytest
 import torch
+from gymnasium.wrappers import TimeLimit, TransformReward
 from torch import Tensor
 
 from pgts_torch import PGTS
@@ -16,6 +18,7 @@ from pgts_torch.bellman import Outcomes
 from pgts_torch.envs.tabular import TabularEnv
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import PgtsError
+from pgts_torch.models import TabularModel
 from pgts_torch.tabular import TabularMDP, exact, random_mdp, stationary
 from pgts_torch.tabular.ascent import ascend, mirror_step, projected_step, softmax_step
 from pgts_torch.tabular.stationary_sets import enumerate_sets, escape_depth
@@ -117,6 +120,58 @@ def test_an_npz_file_and_arrays_keep_what_is_allowed(tmp_path):
     mdp.save_npz(tmp_path / "mdp.npz")
     loaded = TabularMDP.load_npz(tmp_path / "mdp.npz")
     assert same_values(vars(exact.optimal(loaded)), vars(exact.optimal(mdp)))
+
+
+def as_lists(mdp: TabularMDP) -> dict[int, dict[int, list[tuple[float, int, float, bool]]]]:
+    """Its table P, without the actions that are not allowed."""
+    out, rows = mdp.outcomes, {}
+    for s in range(mdp.num_states):
+        rows[s] = {
+            a: [
+                (p, child, float(out.reward_NA[s, a]), False)
+                for p, child in zip(out.prob_NAK[s, a].tolist(), out.child_NAK[s, a].tolist(), strict=True)
+            ]
+            for a in range(mdp.num_actions)
+            if out.reward_NA[s, a] > -math.inf
+        }
+    return rows
+
+
+def test_lists_of_transitions_may_lack_actions():
+    mdp, gamma = masked(), float(TWO.outcomes.discount_NAK.max())
+    found = TabularMDP.from_transitions(as_lists(mdp), gamma, start=TWO.start_S.numpy())
+    assert torch.equal(found.outcomes.legal_NA, LEGAL_SA)
+    torch.testing.assert_close(exact.optimal(found).q_SA, exact.optimal(mdp).q_SA)
+    with pytest.raises(PgtsError, match=r"P\[1\] has 1 actions; P\[0\] has 2"):
+        TabularMDP.from_transitions([[[(1.0, 0, 0.0, False)]] * 2, [[(1.0, 0, 0.0, False)]]], 0.9)
+
+
+class Listed(gymnasium.Env):
+    """Publishes the table; an action that is not in it is an error."""
+
+    observation_space, action_space = gymnasium.spaces.Discrete(S), gymnasium.spaces.Discrete(3)
+
+    def __init__(self):
+        self.P, self.initial_state_distrib = as_lists(masked()), TWO.start_S.numpy()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = int(self.np_random.choice(S, p=self.initial_state_distrib))
+        return self.s, {}
+
+    def step(self, action):
+        p, child, reward, _ = zip(*self.P[self.s][int(action)], strict=True)
+        self.s = int(self.np_random.choice(child, p=p))
+        return self.s, reward[0], False, False, {}
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: TransformReward(env, lambda reward: 2 * reward)])
+def test_an_environment_whose_table_lacks_actions_is_trained_in_without_them(wrap):
+    model = PGTS(lambda: wrap(TimeLimit(Listed(), 9)), depth=2, num_envs=2, horizon={"type": "fixed", "length": 9})
+    model.learn(60)
+    evaluate(model, episodes=2, deterministic=False)
+    assert isinstance(model.world.model, TabularModel)
+    assert (model.policy_table()[~LEGAL_SA] == 0).all()
 
 
 # Training in it
