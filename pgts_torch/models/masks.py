@@ -6,7 +6,7 @@
 A mask has an entry for each action, 1 (or True) where it is legal. Of MultiDiscrete actions it has an entry for each
 value of each number, those of one number after those of another, or is a tuple with an array for each number; an action
 is legal where all its values are. Masks are those of the layer that gives them: a wrapper outside of it which only
-transforms actions is looked through.
+transforms actions is looked through; one that does so in a `step` of its own gives masks of its own.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -71,6 +71,13 @@ class ActionMasks:
             if gives:
                 break
             outside.append(layer)
+        inside = layers[len(outside) + 1 :]
+        if not by_method and any(hook_of(layer) == "action" for layer in inside[:-1]):
+            around = type(layers[len(outside)]).__name__
+            raise PgtsError(
+                f"{env_name(env)} has info[{KEY!r}], and a wrapper that changes actions within {around}, which may "
+                f"change the mask: say what is legal by a method {METHOD}()"
+            )
         space = layers[len(outside)].action_space
         for layer in outside:
             if hook_of(layer) == "action":
@@ -154,7 +161,7 @@ class ActionMasks:
             shown = f"an array of the shape {array.shape}" if array.size > 20 else repr(given)
             raise PgtsError(
                 f"{self.what} is {shown}; it must be a vector of {self.num_entries} booleans, or of 0 and 1, one for "
-                "each action"
+                "each action; if it means something else, set action_masks to 'off'"
             )
         return array.astype(bool)
 

@@ -15,7 +15,7 @@ from pgts_torch.envs.tabular import TabularEnv
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.diagnostics import Truth
 from pgts_torch.models.fidelity import check_model
-from tests.agent.masked import MAKERS
+from tests.agent.masked import MAKERS, Turned
 from tests.tabular.test_illegal_actions import masked
 
 LINES = [(0, 1, 2), (3, 4, 5), (6, 7, 8), (0, 3, 6), (1, 4, 7), (2, 5, 8), (0, 4, 8), (2, 4, 6)]
@@ -103,6 +103,12 @@ def test_a_game_is_searched_and_evaluated_without_an_illegal_move(name):
     training.iterate()
     assert math.isfinite(evaluate(training, episodes=2, deterministic=False).episodic_return.mean)
     assert TicTacToe.steps > before
+
+
+def test_a_mask_in_info_of_which_it_is_not_known_whose_actions_it_numbers_is_refused():
+    with pytest.raises(PgtsError, match=r"a wrapper that changes actions within Bonus, which may change the mask: say"):
+        PGTS(lambda: Bonus(Turned(MAKERS["info"]())), **SHORT, **SAMPLED)
+    PGTS(lambda: Turned(Bonus(MAKERS["info"]())), **SHORT, **SAMPLED).iterate()
 
 
 def test_masks_beside_images_and_normalised_vectors_are_no_inputs():
