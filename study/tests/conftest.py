@@ -3,7 +3,7 @@
 import jaxtyping
 import pytest
 
-from tests.conftest import unchecked_shapes
+from tests.conftest import pytest_runtest_setup, unchecked_shapes
 
 # Not all of `study`: the hook would take study.tests from pytest, which rewrites assertions to explain them.
 jaxtyping.install_import_hook(
@@ -12,7 +12,7 @@ jaxtyping.install_import_hook(
 
 from study import table1  # noqa: E402
 
-__all__ = ["unchecked_shapes"]
+__all__ = ["pytest_runtest_setup", "unchecked_shapes"]
 
 
 @pytest.fixture(scope="session")

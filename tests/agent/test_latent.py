@@ -25,7 +25,7 @@ from tests.forks import on_ranks
 
 GAMMA = 0.9
 SMALL = Latent(
-    network=CNN(channels=[8], hidden=[32]), size=16, hidden=[32], first_updates=800, learning_rate=3e-3, unroll=3
+    network=CNN(channels=[8], hidden=[32]), size=16, hidden=[32], first_updates=400, learning_rate=6e-3, unroll=3
 )
 TRAINING = {
     "depth": 1,
@@ -157,7 +157,7 @@ def test_an_end_is_sampled_with_its_probability():
     steps = Experience(
         image_N, torch.zeros(count).long(), ended_N.double(), GAMMA * (~ended_N).double(), image_N, ~ended_N
     )
-    model = untrained(with_updates(300))
+    model = untrained(with_updates(150))
     model.learn(steps, generator=stream(0, "learn"))
     reward_1, discount_1, _ = model.step(model.represent(image_N[:1]), torch.zeros(1).long())
     p = 1 - float(discount_1) / GAMMA
@@ -239,7 +239,8 @@ def test_images_are_kept_as_bytes():
 
 
 def test_a_policy_that_catches_the_ball_is_learned_from_images():
-    training = PGTS(small_catch, **TRAINING)
+    longer = SMALL.model_copy(update={"first_updates": 800, "learning_rate": 3e-3})
+    training = PGTS(small_catch, **TRAINING | {"model": longer})
     before = evaluate(training, episodes=20).episodic_return.mean
     training.learn(700)
     assert evaluate(training, episodes=20).episodic_return.mean > 0.9 > before
@@ -300,7 +301,7 @@ def test_a_latent_training_of_two_processes_is_used_by_one_but_does_not_go_on_th
 
 def test_a_saved_training_goes_on_bit_for_bit(tmp_path):
     brief = TRAINING | {"model": with_updates(20)}
-    training = PGTS(small_catch, **brief).learn(250)
+    training = PGTS(small_catch, **brief).learn(220)
     training.save(tmp_path / "model.pt")
     loaded = PGTS.load(tmp_path / "model.pt", env=small_catch)
     for _ in range(2):

@@ -90,7 +90,7 @@ class Corridor(gymnasium.Env):
 
 def test_a_row_in_which_an_episode_goes_on_is_no_start():
     for critic in ("tabular", "exact"):
-        PGTS("pgts/Ladder-v0", critic=critic, **ONGOING).learn(300)  # would contradict the starts of the table
+        PGTS("pgts/Ladder-v0", critic=critic, **ONGOING).learn(100)  # would contradict the starts of the table
     training = PGTS(Drift, **ENSEMBLE)
     rollouts = [training.iterate().experience for _ in range(4)]
     begun = sum(int(rollout.begins_B.sum()) for rollout in rollouts)
@@ -177,7 +177,10 @@ def test_a_capacity_that_no_memory_holds_is_refused():
 def test_a_capacity_of_which_all_may_be_held_out_is_refused(capacity):
     with pytest.raises(PgtsError, match=f"capacity is {capacity}; .* more than 32 steps"):
         PGTS("CartPole-v1", model="ensemble", replay=UniformReplay(capacity=capacity))
-    PGTS("CartPole-v1", **ENSEMBLE | {"replay": REPLAY.model_copy(update={"capacity": 33})}).learn(400)
+
+
+def test_a_capacity_of_one_block_and_a_step_is_enough():
+    PGTS("CartPole-v1", **ENSEMBLE | {"replay": REPLAY.model_copy(update={"capacity": 33})}).learn(150)
 
 
 @pytest.mark.parametrize("wrapper", [gymnasium.wrappers.NormalizeObservation, gymnasium.wrappers.NormalizeReward])
@@ -193,14 +196,14 @@ def test_the_discount_is_that_of_the_environment():
 
 
 def test_states_may_be_counted_from_any_number():
-    training = PGTS(Corridor, depth=4, model="counts", replay=REPLAY, horizon=StepsHorizon(length=30)).learn(600)
+    training = PGTS(Corridor, depth=4, model="counts", replay=REPLAY, horizon=StepsHorizon(length=30)).learn(100)
     assert training.policy_table().shape == (5, 2)
     assert training.policy_table()[:4].argmax(-1).tolist() == [1] * 4
     assert training.predict(3) == 1
     with pytest.raises(PgtsError, match="state 8 does not exist; states are 3 to 7"):
         training.predict(8)
     inside = PGTS(lambda: Corridor("cell"), depth=4, model="counts", replay=REPLAY, horizon=StepsHorizon(length=30))
-    assert torch.equal(inside.learn(600).policy_table(), training.policy_table())
+    assert torch.equal(inside.learn(100).policy_table(), training.policy_table())
     PGTS(lambda: Corridor("cell"), **ONGOING, model="counts", policy="mlp", observation_keys=["cell"]).learn(100)
 
 

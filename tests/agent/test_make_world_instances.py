@@ -128,7 +128,7 @@ class Chained(Walk):
 
     def __init__(self, last: int = 0) -> None:
         self.chain: Any = [last]
-        for _ in range(5_000):
+        for _ in range(1_500):
             self.chain = {"next": self.chain, "other": set}
 
 

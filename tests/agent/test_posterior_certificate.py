@@ -74,7 +74,7 @@ def test_a_saved_training_goes_on_to_the_same_certificate(tmp_path):
         loaded.load_state_dict(state)
 
 
-FROZEN = ["--env.id", "FrozenLake-v1", "--total_steps", "60", "--search.depth", "4", "--eval.episodes", "2"]
+FROZEN = ["--env.id", "FrozenLake-v1", "--total_steps", "40", "--search.depth", "3", "--eval.episodes", "2"]
 
 
 def test_a_run_says_what_its_certificate_is_and_says_nothing_of_one_that_it_has_not(tmp_path):
@@ -97,7 +97,7 @@ def test_a_run_says_what_its_certificate_is_and_says_nothing_of_one_that_it_has_
     assert any(value is not None for value in logged)
     assert summary.certificate >= summary.J_optimal - summary.J if summary.J_optimal is not None else True
     summary, text, logged = run("ended", "--model", asked, "--search.stop_at", "1.0")
-    assert (summary.ended_by, summary.env_steps < 60) == ("certificate", True)
+    assert (summary.ended_by, summary.env_steps < 40) == ("certificate", True)
     assert "an estimated certificate" in text
     summary, text, logged = run("silent", "--model", "counts")
     assert (summary.certificate, summary.certificate_trust, summary.certificate_confidence) == (None, None, None)

@@ -203,10 +203,10 @@ def test_a_lookahead_from_some_visits_weighs_states_like_one_from_all():
     ids=["ensemble", "dynamics", "counts", "table"],
 )
 def test_a_training_with_replay_goes_on_bit_for_bit(env, arguments, tmp_path):
-    whole = PGTS(env, seed=3, **arguments).learn(200)
-    half = PGTS(env, seed=3, **arguments).learn(100)
+    whole = PGTS(env, seed=3, **arguments).learn(120)
+    half = PGTS(env, seed=3, **arguments).learn(60)
     half.save(tmp_path / "half.pt")
-    rest = PGTS.load(tmp_path / "half.pt").learn(200)
+    rest = PGTS.load(tmp_path / "half.pt").learn(120)
     assert rest.num_env_steps == whole.num_env_steps
     assert rest.num_model_calls == whole.num_model_calls
     for part in ("policy", "critic", "dyna"):
@@ -223,24 +223,23 @@ def equal(one, other) -> bool:
 
 @pytest.mark.parametrize("model", ["auto", Counts()], ids=["given", "learned"])
 def test_a_table_learns_from_replay(model):
-    training = PGTS("pgts/Ladder-v0", depth=8, model=model, replay="uniform", seed=0).learn(1500)
-    mdp = zoo("ladder")
-    probs = training.policy.probs(torch.arange(mdp.num_states))
-    J = exact.evaluate(mdp, probs).J
-    assert J > 0.9 * exact.optimal(mdp).J
+    training, mdp = PGTS("pgts/Ladder-v0", depth=8, model=model, replay="uniform", seed=0), zoo("ladder")
+    before = exact.evaluate(mdp, training.policy_table()).J
+    J = exact.evaluate(mdp, training.learn(200).policy_table()).J
+    assert J > 0.9 * exact.optimal(mdp).J > 5 * before
 
 
 def test_a_policy_explores_beside_the_one_that_is_trained():
-    """On the deep sea random actions find the treasure once in 2^9 episodes; and half of what is left leads nowhere."""
-    arguments = {"env_kwargs": {"n": 10, "start": 0}, "model": "counts", "depth": 16, "seed": 0}
-    training, mdp = PGTS("pgts/DeepSea-v0", **arguments).learn(100), deep_sea(10, start=0)
+    """On the deep sea random actions find the treasure once in 2^7 episodes; and half of what is left leads nowhere."""
+    arguments = {"env_kwargs": {"n": 8, "start": 0}, "model": "counts", "depth": 16, "seed": 0}
+    training, mdp = PGTS("pgts/DeepSea-v0", **arguments).learn(50), deep_sea(8, start=0)
     state_S, explorer = torch.arange(mdp.num_states), training.dyna.explorer
     assert explorer is not None
     assert training.policy_table().equal(training.policy.probs(state_S))
     assert not torch.equal(explorer.policy.probs(state_S), training.policy.probs(state_S))
-    training.learn(600)
+    training.learn(250)
     assert exact.evaluate(mdp, Greedy(training.policy).probs(state_S)).J == pytest.approx(exact.optimal(mdp).J)
-    without = PGTS("pgts/DeepSea-v0", **arguments | {"model": Counts(optimism="none")}).learn(600)
+    without = PGTS("pgts/DeepSea-v0", **arguments | {"model": Counts(optimism="none")}).learn(250)
     assert without.dyna.explorer is None
     assert exact.evaluate(mdp, Greedy(without.policy).probs(state_S)).J <= 0
 

@@ -1,7 +1,10 @@
 """Defaults of tables: no policy depends on the unit of the rewards, nor on a constant in all of them."""
 
 import functools
+import itertools
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -44,10 +47,18 @@ def plainly_trained(name: str, depth: int | str) -> list[torch.Tensor]:
     return trained(MDPS[name](), depth=depth)
 
 
+def scales() -> Iterator[Any]:
+    """Each MDP with each depth and a power of two, of which each comes with every MDP and every depth; the other powers
+    in the long form."""
+    powers = -20, -3, 20
+    for number, (name, depth) in enumerate(itertools.product(MDPS, [0, 4, 16, "adaptive"])):
+        for power in powers:
+            short = power == powers[number % 3]
+            yield pytest.param(name, depth, power, marks=[] if short else pytest.mark.long)
+
+
 @pytest.mark.fault("rewards in another unit, tables")
-@pytest.mark.parametrize("power", [-20, -3, 20])
-@pytest.mark.parametrize("depth", [0, 4, 16, "adaptive"])
-@pytest.mark.parametrize("name", MDPS)
+@pytest.mark.parametrize(("name", "depth", "power"), [*scales()])
 def test_a_power_of_two_on_all_rewards_leaves_every_policy_bit_for_bit(name, depth, power):
     scaled = trained(rewarded(MDPS[name](), factor=math.ldexp(1.0, power)), depth=depth)
     assert all(torch.equal(one, other) for one, other in zip(plainly_trained(name, depth), scaled, strict=True))

@@ -78,14 +78,16 @@ def test_the_sweep_says_what_to_use_in_place_of_processes(tmp_path, capsys):
     )
 
 
-@pytest.mark.parametrize("code", [0, 1, 2, 143])
+@pytest.mark.parametrize("code", [0, 2, *(pytest.param(code, marks=pytest.mark.long) for code in (1, 143))])
 def test_the_exit_code_is_that_of_a_training_and_what_it_reports_is_not_tried_again(code, tmp_path, capfd):
     assert pretended(tmp_path, str(code), str(code), restarts=3) == code
     assert starts(tmp_path, 0) == starts(tmp_path, 1) == 1
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize(("given", "used"), [(None, max(1, len(os.sched_getaffinity(0)) // 2)), ("3", 3)])
+@pytest.mark.parametrize(
+    ("given", "used"), [(None, max(1, len(os.sched_getaffinity(0)) // 2)), pytest.param("3", 3, marks=pytest.mark.long)]
+)
 def test_the_processes_share_the_cores_unless_it_is_said_otherwise(given, used, tmp_path, monkeypatch):
     if given is not None:
         monkeypatch.setenv("OMP_NUM_THREADS", given)
@@ -98,9 +100,9 @@ def test_the_processes_share_the_cores_unless_it_is_said_otherwise(given, used, 
     ("what", "loss"),
     [
         (("lost", "kill"), "rank 1 of 2 was killed by SIGKILL"),
-        (("hang", "lost"), "rank 0 of 2 hangs"),
-        (("lost", "crash"), "rank 1 of 2 has ended with exit code 1"),
-        (("lost", "lost"), "rank 0 has lost another one"),
+        pytest.param(("hang", "lost"), "rank 0 of 2 hangs", marks=pytest.mark.long),
+        pytest.param(("lost", "crash"), "rank 1 of 2 has ended with exit code 1", marks=pytest.mark.long),
+        pytest.param(("lost", "lost"), "rank 0 has lost another one", marks=pytest.mark.long),
     ],
 )
 def test_lost_processes_begin_again_as_often_as_they_may_and_the_cause_is_one_line(what, loss, tmp_path, capfd):
@@ -120,7 +122,9 @@ def test_without_restarts_a_loss_that_has_been_said_is_not_said_again(tmp_path, 
 
 
 @pytest.mark.fault("SIGTERM", "Ctrl-C")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.long)]
+)
 def test_a_signal_reaches_each_process_and_is_no_loss(number, code, tmp_path):
     def work() -> int:
         threading.Thread(target=signal_once_all_wait, daemon=True).start()
@@ -171,6 +175,7 @@ FATAL = ["--env.id=tests.experiment.fatal:Fatal-v0", "--search.depth=0", "--esti
 PLAIN = {"RANK": "0", "OMP_NUM_THREADS": "1"}
 
 
+@pytest.mark.long
 def test_a_killed_process_starts_again_and_the_run_ends_with_the_bits_of_one_that_was_not(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(ROOT))

@@ -76,7 +76,7 @@ def whole(tmp_path_factory) -> tuple[dict[str, Any], int]:
 
 
 @pytest.mark.fault("kill at any moment")
-@pytest.mark.parametrize("kills", [3, pytest.param(25, marks=pytest.mark.long)])
+@pytest.mark.parametrize("kills", [2, pytest.param(25, marks=pytest.mark.long)])
 def test_after_kills_at_random_moments_every_byte_is_that_of_an_uninterrupted_run(kills, whole, tmp_path):
     expected, calls = whole
     random = np.random.default_rng(kills)
@@ -95,7 +95,7 @@ def test_after_kills_at_random_moments_every_byte_is_that_of_an_uninterrupted_ru
 
 
 @pytest.mark.fault("kill at any moment")
-@pytest.mark.parametrize("learned", LEARNED.values(), ids=LEARNED)
+@pytest.mark.parametrize("learned", [LEARNED["cartpole"], pytest.param(LEARNED["catch"], marks=pytest.mark.long)])
 def test_after_a_kill_a_learned_model_its_replay_and_its_episodes_are_those_of_an_uninterrupted_run(learned, tmp_path):
     assert training(tmp_path / "whole", *learned) == 0
     folder = tmp_path / "killed"
@@ -192,7 +192,7 @@ def test_a_file_that_cannot_grow_is_one_line_and_with_more_room_the_run_goes_on(
         return main(ladder)
 
     assert in_child(short_of_room) == 2
-    complaint = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("step ")]
+    complaint = [line for line in capfd.readouterr().err.splitlines() if not line.startswith(("step ", "note: "))]
     assert len(complaint) == 2  # one of them says that there was no --config
     assert complaint[1].startswith(f"error: {folder}/")
     assert complaint[1].endswith(named)

@@ -61,8 +61,10 @@ def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(name, tmp_pat
     config = SHIPPED[name]
     monkeypatch.setattr(pictures, "policy_picture", policy_picture)
     monkeypatch.setattr(EnvSource, "time_limit", 15)
-    learns = isinstance(load(config).model, LEARNED)
-    less = LESS_REPLAY if learns else FEW_ROOTS if load(config).search.max_roots is not None else []
+    model, roots = load(config).model, load(config).search.max_roots
+    learns, fits = isinstance(model, LEARNED), hasattr(model, "first_updates")
+    less = LESS_REPLAY if learns else FEW_ROOTS if roots is not None else []
+    less = [*less, *(["--model.first_updates", "5"] if fits else [])]
     summary = run.train(few_iterations(tmp_path, *less, config=config))
     folder = tmp_path / "run"
     lines = read_metrics(folder)

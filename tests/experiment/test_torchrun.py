@@ -64,7 +64,7 @@ def test_one_process_makes_other_episodes(whole, tmp_path):
 
 
 @pytest.mark.fault("lost rank")
-@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize("rank", [pytest.param(0, marks=pytest.mark.long), 1])
 def test_a_lost_rank_ends_all_and_the_same_command_goes_on_bit_for_bit(rank, whole, tmp_path, capfd):
     folder = tmp_path / "run"
     codes = signalled(folder, signal.SIGKILL, rank=rank)
@@ -78,7 +78,7 @@ def test_a_lost_rank_ends_all_and_the_same_command_goes_on_bit_for_bit(rank, who
     assert left(folder) == whole
 
 
-@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize("rank", [pytest.param(0, marks=pytest.mark.long), 1])
 def test_a_signal_to_one_process_stops_all_after_the_iteration(rank, whole, tmp_path, capfd):
     folder = tmp_path / "run"
     assert signalled(folder, signal.SIGTERM, rank=rank) == [143, 143]
@@ -144,6 +144,7 @@ def test_torchrun_trains(tmp_path):
     assert json.loads(made.stdout)["env_steps"] == read_metrics(folder)[-1]["step"]
 
 
+@pytest.mark.long
 def test_two_agents_that_meet_by_a_rendezvous_train_as_one_with_two_processes(whole, tmp_path):
     """As on two machines: each agent has one process, and knows only where they meet."""
     folder = tmp_path / "run"
