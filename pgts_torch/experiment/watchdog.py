@@ -64,6 +64,7 @@ class Watchdog:
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
 
     def __enter__(self) -> Self:
+        self._postpone()  # so that a call before the first look is ended too
         self._thread.start()
         return self
 
@@ -78,11 +79,15 @@ class Watchdog:
                 if self._parent is not None and os.getppid() != self._parent:
                     self._parent = None
                     os.kill(os.getpid(), signal.SIGTERM)
-                faulthandler.dump_traceback_later(self._seconds + self._period, exit=True, file=2)
+                self._postpone()
                 if self._looks_in_one_call() * self._period >= self._seconds:
                     self._end()
         finally:
             faulthandler.cancel_dump_traceback_later()
+
+    def _postpone(self) -> None:
+        """Have the process ended by `faulthandler` unless this is called again in time."""
+        faulthandler.dump_traceback_later(self._seconds + self._period, exit=True, file=2)
 
     def _looks_in_one_call(self) -> int:
         """Look at the training: for how many looks it has been in the same call; 0 where it waits for others.
