@@ -17,7 +17,7 @@ from pgts_torch.errors import MissingModel
 from pgts_torch.models.adapters_extra import Ale, Mujoco
 from pgts_torch.models.adapters_minigrid import MiniGrid
 from pgts_torch.models.provenance import overridden
-from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name, of_key
 
 
 @final
@@ -78,8 +78,7 @@ class ToyText(SnapshotAdapter):
     restored = frozenset({"s", "lastaction", "fickle_step", "taxi_orientation"})
 
     def get_state(self, env: Any) -> Snapshot:
-        key = struct.pack("<q?", env.s, vars(env).get("fickle_step", False))
-        return Snapshot(key, key)
+        return of_key(struct.pack("<q?", env.s, vars(env).get("fickle_step", False)))
 
     def set_state(self, env: Any, data: Any) -> None:
         env.s, fickle = struct.unpack("<q?", data)
@@ -109,8 +108,7 @@ class Blackjack(SnapshotAdapter):
     restored = frozenset({"player", "dealer", "dealer_top_card_suit", "dealer_top_card_value_str"})
 
     def get_state(self, env: Any) -> Snapshot:
-        key = bytes(env.player) + b"|" + bytes(env.dealer)
-        return Snapshot(key, key)
+        return of_key(bytes(env.player) + b"|" + bytes(env.dealer))
 
     def set_state(self, env: Any, data: Any) -> None:
         player, dealer = data.split(b"|")
@@ -120,8 +118,9 @@ class Blackjack(SnapshotAdapter):
         return type(env) is type(own) and (env.natural, env.sab) == (own.natural, own.sab)
 
 
-_FLOAT64, _HEAD = np.dtype(np.float64), b"dNone:"
-"""Most states are vectors of this dtype, and not after an end: how their keys begin, which are their data too."""
+_FLOAT64, _HEAD = np.dtype(np.float64), b"dNone:  "
+"""Most states are vectors of this dtype, and not after an end: how their keys begin, which are their data too. As long
+as a number, so that those behind it are aligned."""
 
 
 @final
@@ -132,19 +131,21 @@ class ClassicControl(SnapshotAdapter):
     restored = frozenset({"state", "steps_beyond_terminated", "last_u", "screen", "clock", "isopen", "surf"})
 
     def get_state(self, env: Any) -> Snapshot:
-        held, beyond = env.state, vars(env).get("steps_beyond_terminated")
+        held, beyond = env.state, env.__dict__.get("steps_beyond_terminated")
         if beyond is None and type(held) is np.ndarray and held.dtype is _FLOAT64 and held.ndim == 1:
-            key = _HEAD + held.tobytes()
-            return Snapshot(key, key)
+            return of_key(_HEAD + held.tobytes())
         state = np.array(held)
         return Snapshot(f"{state.dtype.char}{beyond}:".encode() + state.tobytes(), (state, beyond))
 
     def set_state(self, env: Any, data: Any) -> None:
         # An array of its own, because the environment may write into its state.
-        is_key = type(data) is bytes
-        env.state = np.frombuffer(bytearray(data[len(_HEAD) :])) if is_key else data[0].copy()
-        if "steps_beyond_terminated" in vars(env):
-            env.steps_beyond_terminated = None if is_key else data[1]
+        if type(data) is bytes:
+            state, beyond = np.frombuffer(bytearray(data), _FLOAT64, -1, len(_HEAD)), None
+        else:
+            state, beyond = data[0].copy(), data[1]
+        env.state = state
+        if "steps_beyond_terminated" in env.__dict__:
+            env.steps_beyond_terminated = beyond
 
     def same_world(self, env: Any, own: Any) -> bool:
         return type(env) is type(own) and _constants(env) == _constants(own)

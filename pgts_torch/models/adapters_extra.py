@@ -4,7 +4,7 @@ from typing import Any, final
 
 import numpy as np
 
-from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, of_key
 
 
 @final
@@ -19,8 +19,7 @@ class Ale(SnapshotAdapter):
     restored = frozenset({"ale"})
 
     def get_state(self, env: Any) -> Snapshot:
-        key = env.ale.cloneState(include_rng=False).serialize()
-        return Snapshot(key, key)
+        return of_key(env.ale.cloneState(include_rng=False).serialize())
 
     def set_state(self, env: Any, data: Any) -> None:
         from ale_py import ALEState
@@ -59,25 +58,36 @@ class Mujoco(SnapshotAdapter):
     name = "MuJoCo"
     restored = frozenset({"data", "mujoco_renderer", "goal", "goal_pos", "cylinder_pos", "init_qpos"})
 
+    def __init__(self) -> None:
+        # The data whose arrays were last looked up, which takes longer than a step of a small system; and these.
+        self._of: Any = None
+        self._arrays: list[np.ndarray] = []
+
     def get_state(self, env: Any) -> Snapshot:
         import mujoco
 
-        integration = mujoco.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(mujoco.mj_stateSize(env.model, integration))
-        mujoco.mj_getState(env.model, env.data, state, integration)
-        key = np.concatenate([state, *[getattr(env.data, name).reshape(-1) for name in _LEFT_BEHIND.split()]]).tobytes()
-        return Snapshot(key, key)
+        state, *left_behind = self._flat(env)
+        mujoco.mj_getState(env.model, env.data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        return of_key(np.concatenate([state, *left_behind]).tobytes())
 
     def set_state(self, env: Any, data: Any) -> None:
         import mujoco
 
-        integration = mujoco.mjtState.mjSTATE_INTEGRATION
-        state, position = np.frombuffer(data), mujoco.mj_stateSize(env.model, integration)
-        mujoco.mj_setState(env.model, env.data, state[:position], integration)
-        for name in _LEFT_BEHIND.split():
-            array = getattr(env.data, name)
-            array[...] = state[position : position + array.size].reshape(array.shape)
-            position += array.size
+        (state, *left_behind), saved = self._flat(env), np.frombuffer(data)
+        position = len(state)
+        mujoco.mj_setState(env.model, env.data, saved[:position], mujoco.mjtState.mjSTATE_INTEGRATION)
+        for array in left_behind:
+            array[:] = saved[position : (position := position + len(array))]
+
+    def _flat(self, env: Any) -> list[np.ndarray]:
+        """Room for the integration state, and what the last step left behind, in the memory of the emulator."""
+        import mujoco
+
+        if self._of is not env.data:
+            size = mujoco.mj_stateSize(env.model, mujoco.mjtState.mjSTATE_INTEGRATION)
+            left_behind = [getattr(env.data, name).reshape(-1) for name in _LEFT_BEHIND.split()]
+            self._of, self._arrays = env.data, [np.empty(size), *[x for x in left_behind if len(x)]]
+        return self._arrays
 
     def same_world(self, env: Any, own: Any) -> bool:
         return type(env) is type(own) and env.fullpath == own.fullpath and env.frame_skip == own.frame_skip

@@ -96,9 +96,9 @@ class Answers:
             repeat: how often each action is taken.
             rewards: between which numbers the rewards must be.
         """
-        row = self._rows.get((self.name(at), repeat), _NOTHING)
         if self._at_count is None:
-            return row
+            return self._rows.get((at.key if at.clock is None else at.name, repeat), _NOTHING)
+        row = self._rows.get((at.key, repeat), _NOTHING)
         # What is true at one count only is remembered by the count, too.
         alone = self._rows.get((at.name, repeat), _NOTHING)
         return {**alone, **{action: self._now(step, at, rewards) for action, step in row.items()}}
@@ -112,8 +112,10 @@ class Answers:
 
     def remember(self, at: Snapshot, action: int, repeat: int, step: Step) -> None:
         """Keep a step beside which nothing else may follow."""
-        name = at.name if self._at_count and step.reading is None else self.name(at)
-        self._rows.setdefault((name, repeat), {})[action] = step
+        name = at.key if at.clock is None or (self._at_count and step.reading is not None) else at.name
+        if (row := self._rows.get((name, repeat))) is None:
+            row = self._rows[name, repeat] = {}
+        row[action] = step
         if step.reading is not None:
             first = self._first.setdefault(step.child.snapshot.key, step.child)
             step.child.like = None if first is step.child else first

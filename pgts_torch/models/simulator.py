@@ -225,7 +225,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             self._simulate(pairs)
             rows = [row if len(row) == count else self._known(n, repeat) for n, row in zip(states, rows, strict=True)]
         # The children get their numbers now, in this order, so that numbers do not depend on what is remembered.
-        return [self._entered(row[action]) for row in rows for action in range(count)]
+        return self._entered(row[action] for row in rows for action in range(count))
 
     def _unknown(self, states: Sequence[int], rows: Sequence[Mapping[int, Step]]) -> list[tuple[int, int]]:
         """The states and actions that rows lack; of states that differ in the clock alone the last one."""
@@ -242,10 +242,10 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         Raises:
             RandomOutcomes: something else may follow, too.
         """
-        steps = self._simulated(pairs)
+        steps, seen, remember, repeat = self._simulated(pairs), self._seen, self._answers.remember, self.action_repeat
         for (state, action), step in zip(pairs, steps, strict=True):
             if not step.random:
-                self._answers.remember(self._seen[state].snapshot, action, self.action_repeat, step)
+                remember(seen[state].snapshot, action, repeat, step)
         if (random := next((i for i, step in enumerate(steps) if step.random), None)) is not None:
             raise RandomOutcomes(
                 f"{self.name} is random in state {pairs[random][0]} under action {pairs[random][1]}: its outcomes "
@@ -273,7 +273,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             step = self._followed(state, action, key, repeat)
             if not step.random:
                 self._answers.remember(self._seen[state].snapshot, action, repeat, step)
-        return self._entered(step)
+        return self._entered([step])[0]
 
     def _followed(self, state: int, action: int, key: int, repeat: int) -> Step:
         """What follows an action, by the simulator."""

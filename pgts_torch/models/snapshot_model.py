@@ -115,12 +115,20 @@ class SnapshotModel(Model):
             known.legal = seen.legal
         return number
 
-    def _entered(self, step: Step) -> tuple[Step, int]:
-        """A step, and the number of the state reached."""
-        number = self._enter(step.child)
-        # The record by which the state is known, so that equal ones are kept in memory once.
-        step.child = self._seen[number]
-        return step, number
+    def _entered(self, steps: Iterable[Step]) -> list[tuple[Step, int]]:
+        """Steps, each with the number of the state reached."""
+        numbers, entered = self._number, list[tuple[Step, int]]()
+        for step in steps:
+            # Most states are new, in a search where states do not recur.
+            if (number := numbers.setdefault(step.child.snapshot.name, self.num_states)) == self.num_states:
+                self.num_states += 1
+                self._seen.append(step.child)
+            else:
+                self._enter(step.child)
+                # The record by which the state is known, so that equal ones are kept in memory once.
+                step.child = self._seen[number]
+            entered.append((step, number))
+        return entered
 
     def export(self, state_N: Int[Tensor, "N"]) -> list[tuple[Any, ...]]:
         """The snapshot of each state, what `observe` made of its observation, and its legal actions where these are

@@ -146,13 +146,16 @@ class Stepper:
                 found.append(self.follow(data, taken, None, repeat, rewards))
             return
         env, adapter, clock, gamma, shown = self.env, self.adapter, self.clock, self._gamma, self._show is None
-        set_state, get_state, is_random, step = adapter.set_state, adapter.get_state, adapter.is_random, env.step
+        masks = self._masks
+        set_state, get_state, step, add = adapter.set_state, adapter.get_state, env.step, found.append
+        tells = type(adapter).is_random is not SnapshotAdapter.is_random
         # Rewards and observations that are plain numbers are not looked into one by one.
         as_paid, rows = rewards is None and not self._pays, self._rows(len(requests))
         shape, dtype = (None, None) if rows is None else (rows.shape[1:], rows.dtype)
         for i, (data, taken) in enumerate(requests):
             set_state(env, data)
-            if random := is_random(env, taken):
+            random = adapter.is_random(env, taken) if tells else None
+            if random:
                 self.chance.seed(0)
             observation, reward, terminated, truncated, info = step(taken)
             self.steps += 1
@@ -171,9 +174,9 @@ class Stepper:
             if truncated and gamma and not terminated:
                 reached = reached._replace(cut=True)
             seen = Seen(reached, kept)
-            if self._masks is not None:
+            if masks is not None:
                 seen.legal = self._legal(info, terminated, truncated)
-            found.append(Step(reward, 0.0 if terminated else gamma, seen, random, reading))
+            add(Step(reward, 0.0 if terminated else gamma, seen, random, reading))
         if rows is not None and not np.isfinite(rows).all():
             first = int(np.flatnonzero(~np.isfinite(rows).reshape(len(rows), -1).all(1))[0])
             del found[first:]
