@@ -34,8 +34,9 @@ _SAMPLE_BITS = 4
 
 
 @functools.cache
-def _kernels() -> Any:
-    from pgts_torch.models import index_kernels  # numba is imported with it
+def index_loops() -> Any:
+    """The module, whose import takes long because numba is imported with it."""
+    from pgts_torch.models import index_kernels
 
     return index_kernels
 
@@ -47,7 +48,7 @@ def hash_rows(bits_ND: Int[Tensor, "N D"]) -> Int[Tensor, "N"]:
     """
     if can_compile(bits_ND.device):
         hash_N = torch.empty(bits_ND.shape[0], dtype=torch.int64)
-        _kernels().hash_rows(bits_ND.contiguous().numpy(), hash_N.numpy())
+        index_loops().hash_rows(bits_ND.contiguous().numpy(), hash_N.numpy())
         return hash_N
     # Odd factors, so that no bit of a number is lost modulo 2**64.
     odd_D = mix(torch.arange(bits_ND.shape[1], device=bits_ND.device), 0) | 1
@@ -156,7 +157,7 @@ class StateIndex:
         if can_compile(self.device):
             number_N = torch.empty(N, dtype=torch.int64)
             known, given = (self._bits_RD.numpy(), self._slots.numpy()), (hash_N.numpy(), number_N.numpy())
-            new, looked_up, entered = _kernels().number(*known, *given, first, sample_bits)
+            new, looked_up, entered = index_loops().number(*known, *given, first, sample_bits)
         else:
             number_N, new, looked_up, entered = self._numbered(first, hash_N, sample_bits)
         self._count, self._entered = first + new, self._entered + entered
@@ -212,7 +213,7 @@ class StateIndex:
         self._make_room(first + row_ND.shape[0])
         if can_compile(self.device):
             given_ND = self._bits(row_ND).contiguous().numpy()
-            off = _kernels().place(self._bits_RD.numpy(), given_ND, first, self._minus_zero, self._infinity)
+            off = index_loops().place(self._bits_RD.numpy(), given_ND, first, self._minus_zero, self._infinity)
         else:
             self._rows[first : first + row_ND.shape[0]] = row_ND + 0.0 if dtype.is_floating_point else row_ND
             # The sum is one cheap call.
@@ -245,7 +246,7 @@ class StateIndex:
         hash_L = hash_rows(self._bits_RD[number_L])
         if can_compile(self.device):
             given = self._bits_RD, self._slots, number_L, hash_L
-            self._entered = _kernels().enter(*(x.numpy() for x in given))
+            self._entered = index_loops().enter(*(x.numpy() for x in given))
         else:
             self._entered = int((self._look_up(number_L, hash_L)[0] == number_L).sum())
 

@@ -12,7 +12,7 @@ from pgts_torch.compiled import pays
 from pgts_torch.errors import NotFinite, PgtsError, check_count
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.exact_model import CONTRADICTED, Happened, step_text
-from pgts_torch.models.state_index import Merge, StateIndex
+from pgts_torch.models.state_index import Merge, StateIndex, index_loops
 
 _SURVEYED = {torch.float32, torch.float64, torch.int64}
 """Dtypes of what a compiled loop can look through."""
@@ -212,11 +212,10 @@ class TensorModel(EnumeratingModel, SamplingModel):
         if self.reward_range is not None:
             self.reward_range.check(reward_N.cpu())
         if {self.dtype, next_ND.dtype} <= _SURVEYED and pays(self.device, next_ND.numel()):
-            from pgts_torch.models import index_kernels
-
-            found = index_kernels.survey(*(x.detach().contiguous().numpy() for x in answer))
-            if found < index_kernels.OFF:
-                return *answer, found == index_kernels.ALL_COUNT
+            kernels = index_loops()
+            found = kernels.survey(*(x.detach().contiguous().numpy() for x in answer))
+            if found < kernels.OFF:
+                return *answer, found == kernels.ALL_COUNT
         self._check(state_ND, action_N, *answer)
         return *answer, bool(_counts(reward_N, discount_N).all())
 

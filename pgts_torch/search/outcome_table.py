@@ -1,7 +1,8 @@
 """What a model has answered so far, one row for each state, checked: the one copy of outcomes that searches read."""
 
+import functools
 import operator
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import torch
@@ -19,6 +20,13 @@ _TOLERANCE = 1e-4
 """By how much the probabilities of a model may miss 1: enough for many of them in float32."""
 
 _NOT_QUERIED, _NO_ROW = -1, -2
+
+
+@functools.cache
+def _kernels() -> Any:
+    from pgts_torch.search import table_kernels  # numba is imported with it
+
+    return table_kernels
 
 
 @final
@@ -64,10 +72,8 @@ class OutcomeTable(Table):
         """Those of the states that have no row."""
         self.row_S = with_room(self.row_S, self.model.num_states)
         if pays(self.device, state_N.shape[0]):
-            from pgts_torch.search import table_kernels
-
             found_N = torch.empty_like(state_N)
-            count = table_kernels.missing(state_N.numpy(), self.arrays[-1], found_N.numpy())
+            count = _kernels().missing(state_N.numpy(), self.arrays[-1], found_N.numpy())
             return found_N[:count]
         missing_N = self.row_S.index_select(0, state_N) < 0
         return state_N if bool(missing_N.all()) else state_N[missing_N]
@@ -144,14 +150,12 @@ class OutcomeTable(Table):
 
     def _write(self, state_N: Int[Tensor, "N"], answer: Outcomes) -> bool:
         """Write the answer for these states, checked in the same pass; False where something seems to be off."""
-        from pgts_torch.search import table_kernels
-
         first, last = self.count, self.count + answer.num_states
         if last > self.reward_RA.shape[0] or answer.num_outcomes > self.num_outcomes:
             self._reserve(answer.num_states, answer.num_outcomes)
         given = state_N, answer.reward_NA, answer.prob_NAK, answer.discount_NAK, answer.child_NAK
         arrays = [x.detach().contiguous().numpy() for x in given]
-        if not table_kernels.write(first, self.model.num_states, _TOLERANCE, *arrays, *self.arrays):
+        if not _kernels().write(first, self.model.num_states, _TOLERANCE, *arrays, *self.arrays):
             return False
         self.count = last
         return True
