@@ -10,12 +10,14 @@ from gymnasium import spaces, wrappers
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv, MountainCarEnv, PendulumEnv
 from torch import Tensor
 
+from pgts_torch.compiled import torch_only
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import TensorModel
 from pgts_torch.models.actions import with_torques
 from pgts_torch.models.classic import CLASSIC, Acrobot, CartPole, MountainCar, Pendulum, dynamics_of
-from pgts_torch.search import expectimax
-from pgts_torch.seeding import numpy_stream
+from pgts_torch.search import Topology, expectimax
+from pgts_torch.seeding import numpy_stream, stream
+from tests.counting import Counting
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 KINDS = {"CartPole-v1": CartPole, "Acrobot-v1": Acrobot, "MountainCar-v0": MountainCar, "Pendulum-v1": Pendulum}
@@ -134,6 +136,24 @@ def test_steps_of_cartpole_in_a_compiled_loop_have_the_bits_of_those_by_numpy(va
     plain = model._step(state, action)
     assert all(torch.equal(x.view(torch.int64), y.view(torch.int64)) for x, y in zip(looped, plain, strict=True))
     assert not torch.equal(looped[2], model._step(state, 1 - action)[2])
+
+
+def test_a_query_of_cartpole_takes_few_operations_of_torch_however_many_states_it_is_for():
+    pytest.importorskip("numba")
+    model, counted = CartPole(make("CartPole-v1"), gamma=GAMMA), []
+    for count in (300, 3_000):
+        state_N = model.number(
+            (torch.rand(count, 4, generator=stream(count, "states"), dtype=torch.float64) - 0.5) / 10
+        )
+        for counts in (Counting(), Counting()):
+            topology = Topology(model)
+            with counts:
+                topology.query(state_N)
+        counted.append(counts.num_operations)
+        with torch_only(), counts:
+            Topology(model).query(state_N)
+        assert counts.num_operations > 2 * counted[-1]
+    assert max(counted) <= 20, counted
 
 
 OTHER = {

@@ -140,6 +140,24 @@ def test_memory_at_most_doubles_and_is_given_back():
     assert ours.number(real_rows(3, 7)).tolist() == [0, 1, 2]
 
 
+@pytest.mark.usefixtures("either_way")
+def test_after_clear_the_memory_of_as_many_rows_is_taken_at_once(monkeypatch):
+    ours = StateIndex(2, dtype=torch.float64, merge=True)
+    taken = []
+    monkeypatch.setattr(ours, "_enter", lambda *given, enter=ours._enter: taken.append(given[1]) or enter(*given))
+    grown = []
+    for _ in range(2):
+        taken.clear()
+        capacities = set()
+        for seed in range(20):
+            ours.number(real_rows(500, seed))
+            capacities.add(ours.capacity)
+        grown.append((len(taken), len(capacities)))
+        ours.clear()
+    assert grown[0] > (3, 3)
+    assert grown[1] == (1, 1)
+
+
 def test_a_call_hashes_its_own_rows_and_not_the_whole_table_except_when_that_doubles(set_hash):
     hashed = []
 
