@@ -86,7 +86,7 @@ def wrong_imports(tree: ast.Module, module: str, is_package: bool = False) -> li
 
 def test_every_file_of_the_package_is_in_a_known_room():
     found = {path.stem if path.is_file() else path.name for path in PACKAGE.iterdir()}
-    found = {name for name in found if name not in ("__init__", "__pycache__", "__main__", "py.typed")}
+    found = {name for name in found if name not in ("__init__", "__pycache__", "__main__", "py")}
     assert found <= set(ROOMS) - {"pgts_torch"}
 
 
