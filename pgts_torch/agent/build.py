@@ -7,6 +7,8 @@ import torch
 from torch import nn
 
 from pgts_torch.agent.critics import Critic, ExactCritic, RolloutCritic, TabularCritic
+from pgts_torch.agent.gaussian import GaussianPolicy
+from pgts_torch.agent.gaussian_updates import GaussianGradientUpdate, GaussianPPOUpdate, MPOUpdate
 from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.networks import default_network
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
@@ -30,12 +32,12 @@ from pgts_torch.options.critics import (
     TabularValues,
 )
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import AutoPolicy, Network, Simplex, Softmax
+from pgts_torch.options.policies import AutoLayers, AutoPolicy, Gaussian, Network, Simplex, Softmax
 from pgts_torch.options.replay import UniformReplay
 from pgts_torch.options.rollouts import Estimator, LookaheadAdvantages, SampledAdvantages
 from pgts_torch.options.search import MCTS, Auto, Expectimax, Kind, Sampled
 from pgts_torch.options.training import Training
-from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient
+from pgts_torch.options.updates import CMPO, MPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient
 from pgts_torch.search.auto import AutoSearch
 from pgts_torch.search.engine import ExpectimaxSearch, MCTSSearch, SampledSearch, Search
 
@@ -56,12 +58,14 @@ _UPDATES: _Choices = {
     PPO: PPOUpdate,
     CMPO: CMPOUpdate,
 }
+_OF_GAUSSIANS: _Choices = {MPO: MPOUpdate, Gradient: GaussianGradientUpdate, PPO: GaussianPPOUpdate}
 
 _PASSES: dict[str, Any] = {"minibatch_size": 256, "max_grad_norm": 1.0}
 _FITS = NetworkValues(
     **_PASSES, num_epochs=4, learning_rate=2e-3, fresh_targets=False, method=NetworkTDLambda(lambda_=1.0)
 )
 _STEPS = CMPO(**_PASSES, num_epochs=1, temperature=1.0, clip=1.0)
+_REGRESSIONS = MPO(**_PASSES, num_epochs=1)
 """The critic and the update of networks that suit long imagined episodes: returns that are bootstrapped only where an
 episode was cut off, and one pass of short steps of the policy. Where fewer visits are searched minibatches are as much
 smaller, so that the steps are as many."""
@@ -89,36 +93,44 @@ def chosen(options: Training, world: World) -> Training:
     if isinstance(policy, AutoPolicy):
         network = default_network(world.perceived_space, normalize=replayed and not latent)
         policy = Softmax() if numbered else network
+    if isinstance(policy, Gaussian) and isinstance(policy.network, AutoLayers):
+        network = default_network(world.perceived_space, normalize=replayed)
+        policy = policy.model_copy(update={"network": network})
+    layers = policy.network if isinstance(policy, Gaussian) else policy
     if isinstance(critic, AutoCritic):
         fits = _FITS if replayed else NetworkValues()
-        critic = fits if isinstance(policy, Network) else TabularValues()
-    if isinstance(critic, NetworkValues) and isinstance(critic.network, OwnNetwork) and isinstance(policy, Network):
-        critic = critic.model_copy(update={"network": policy})
+        critic = fits if isinstance(layers, Network) else TabularValues()
+    if isinstance(critic, NetworkValues) and isinstance(critic.network, OwnNetwork) and isinstance(layers, Network):
+        critic = critic.model_copy(update={"network": layers})
     if isinstance(replay, UniformReplay):
         if replay.starts == "all" and not numbered:
             raise PgtsError("replay.starts is 'all', which is for tables; observations here are no numbered states")
         replay = replay.filled("tables" if numbered else "images" if latent else "vectors")
     if isinstance(update, AutoUpdate):
-        lookahead = CMPO()
+        lookahead: Any = MPO() if isinstance(policy, Gaussian) else CMPO()
         if isinstance(replay, UniformReplay):
             assert replay.search_every is not None
             size = max(_STEPS.minibatch_size // replay.search_every, 1)
-            lookahead = _STEPS.model_copy(update={"minibatch_size": size})
+            steps = _REGRESSIONS if isinstance(policy, Gaussian) else _STEPS
+            lookahead = steps.model_copy(update={"minibatch_size": size})
         neural = PPO() if isinstance(options.estimator, SampledAdvantages) else lookahead
         mirror = Mirror(step_size=20.0) if replayed else Mirror()
-        update = neural if isinstance(policy, Network) else Projected() if isinstance(policy, Simplex) else mirror
+        update = neural if isinstance(layers, Network) else Projected() if isinstance(policy, Simplex) else mirror
     return checked(dict(options) | {"policy": policy, "critic": critic, "update": update, "replay": replay})
 
 
-def make_search(options: Kind, world: World) -> Search:
-    """Make a search in the world's model; MissingModel where there is none."""
-    if world.model is None:
+def make_search(options: Kind, model: Model | None) -> Search:
+    """Make a search in a model; MissingModel where there is none."""
+    if model is None:
         raise MissingModel("the environment has no model that a lookahead could query")
-    return _made(_SEARCHES, options)(world.model, options)
+    return _made(_SEARCHES, options)(model, options)
 
 
 def make_policy(options: Any, world: World, *, seed: int) -> Policy:
-    """Make a policy, a table or a network."""
+    """Make a policy: a table, or of networks."""
+    if isinstance(options, Gaussian):
+        assert world.action_size is not None
+        return GaussianPolicy(world.perceived_space, world.action_size, options, seed=seed, device=world.device)
     if isinstance(options, Network):
         return NetworkPolicy(world.perceived_space, world.num_actions, options, seed=seed, device=world.device)
     tabular = _tabular(world, f"the policy {options.type!r}")
@@ -130,6 +142,8 @@ def make_update(options: Part, policy: Policy) -> Update:
     """Make an update for this policy."""
     if isinstance(options, Mirror) and isinstance(policy, NetworkPolicy):
         return NetworkMirrorUpdate(options)
+    if isinstance(policy, GaussianPolicy):
+        return _made(_OF_GAUSSIANS, options)(options)
     return _made(_UPDATES, options)(options)
 
 
@@ -145,7 +159,7 @@ def make_critic(
     if isinstance(options, NetworkValues):
         trunk = None
         if isinstance(options.network, SharedNetwork):
-            if not isinstance(policy, NetworkPolicy):
+            if not isinstance(policy, NetworkPolicy | GaussianPolicy):
                 raise PgtsError(f"critic.network is 'shared'; a {type(policy).__name__} has no network to share")
             trunk = policy.network.trunk
         return NetworkCritic(

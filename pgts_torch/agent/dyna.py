@@ -8,6 +8,7 @@ import torch
 
 from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.explorer import Explorer
+from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.imagine import imagine
 from pgts_torch.agent.model_check import ModelCheck
 from pgts_torch.agent.neural import NetworkPolicy
@@ -53,7 +54,7 @@ class Dyna:
         self._world, self._trained, self.options, self._model_check = world, trained, options, model_check
         self.explorer, self._model = explorer, world.model if explorer is None else explorer.world.model
         self.policy = trained
-        if isinstance(trained, NetworkPolicy) and options.polyak < 1:
+        if isinstance(trained, NetworkPolicy | GaussianPolicy) and options.polyak < 1:
             self.policy = copy.deepcopy(trained)
         model = self._model
         own = model.replay if isinstance(model, LearningModel) else None
@@ -123,8 +124,8 @@ class Dyna:
             if self.explorer is not None:
                 self.explorer.improve(start_B, self.options.length, own)
             if self.policy is not self._trained:
-                assert isinstance(self.policy, NetworkPolicy)
-                assert isinstance(self._trained, NetworkPolicy)
+                assert isinstance(self.policy, NetworkPolicy | GaussianPolicy)
+                assert isinstance(self._trained, NetworkPolicy | GaussianPolicy)
                 self.policy.network.follow(self._trained.network, self.options.polyak)
 
     def _sampled(self, draws: Draws, kept_R: list[float] | None) -> Any:

@@ -12,11 +12,13 @@ from pgts_torch.agent.components import legal_in
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.depth import DepthChoice
 from pgts_torch.agent.draws import Draws
+from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.iteration import PolicyBatch
 from pgts_torch.agent.policies import Policy, TabularPolicy
 from pgts_torch.agent.rollout import Rollout, StateWeight
 from pgts_torch.agent.roots import Roots, roots_of
 from pgts_torch.errors import ModelMismatch
+from pgts_torch.models.drawn_actions import Drawn
 from pgts_torch.tabular.ascent import centred
 
 _ROUNDINGS = 16
@@ -58,9 +60,10 @@ class LookaheadEstimator(Estimator):
         return critic.fit(self._look.policy, experience, generator=generator)
 
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:
-        self._look.restart()
+        self._look.restart(draws.search())
         roots, ranks = roots_of(experience, self._look.world, self._weight, self._max_roots, draws), experience.ranks
-        pi_NA = self._look.policy.probs(roots.observation_N)
+        drawn = self._look.drawn(roots.state_N)
+        pi_NA = self._look.policy.probs(roots.observation_N) if drawn is None else drawn.prob_NK
         chosen = self._choose(experience, roots, pi_NA, draws)
         self._check_legal(roots, chosen.look.q_BA)
         q_NA, count = chosen.look.q_BA, chosen.look.q_BA.numel()
@@ -78,6 +81,7 @@ class LookaheadEstimator(Estimator):
             noise,
             self._look.policy,
             ranks,
+            drawn=drawn,
             state_N=roots.state_N,
             pi_NA=pi_NA,
             **chosen._asdict(),
@@ -125,14 +129,22 @@ class SampledEstimator(Estimator):
 
     def _before_fit(self, experience: Rollout) -> PolicyBatch:
         observation_N = experience.observation_V
-        pi_NA = self._policy.probs(observation_N)
         advantage_TB = gae(experience, *self._critic.values(experience), self._lambda)
+        action_N, advantage_N = experience.of_visits(experience.action_TB), experience.of_visits(advantage_TB)
+        drawn = None
+        if isinstance(self._policy, GaussianPolicy):  # of K = 1 action, the one taken
+            pi_NA = torch.ones_like(advantage_N)[:, None]
+            drawn, estimate_NA = Drawn(action_N[:, None], pi_NA.float()), advantage_N[:, None]
+        else:
+            pi_NA = self._policy.probs(observation_N)
+            estimate_NA = score_function(action_N, advantage_N, pi_NA)
         weight_N = experience.visit_weight(self._weight)
         return PolicyBatch(
             observation_N,
-            score_function(experience.of_visits(experience.action_TB), experience.of_visits(advantage_TB), pi_NA),
+            estimate_NA,
             weight_N,
             ranks=experience.ranks,
+            drawn=drawn,
             state_N=None,
             pi_NA=pi_NA,
             depth=0,

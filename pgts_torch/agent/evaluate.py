@@ -10,6 +10,7 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Float
 from torch import Tensor
 
+from pgts_torch.agent.gaussian import GaussianPolicy, Mean
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import FixedHorizon, rollout
@@ -81,7 +82,7 @@ class Evaluator:
         """The scores of new episodes. Training is not affected.
 
         Args:
-            deterministic: take the most probable action; else sample from pi.
+            deterministic: take the most probable action, of a gaussian policy the mean; else sample from pi.
             seed: of these episodes alone.
 
         Raises:
@@ -92,7 +93,7 @@ class Evaluator:
         env, limit = self._environments(algorithm.source, seed)
         made = rollout(
             algorithm.world.of(env),
-            Greedy(algorithm.policy) if deterministic else algorithm.policy,
+            greedy(algorithm.policy) if deterministic else algorithm.policy,
             FixedHorizon(length=limit or UNLIMITED_LENGTH),
             seed=seed,
             names=names,
@@ -126,6 +127,11 @@ def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed
     """One evaluation by an `Evaluator`, which says what is raised."""
     with Evaluator(episodes) as evaluator:
         return evaluator(algorithm, deterministic=deterministic, seed=seed)
+
+
+def greedy(policy: Policy) -> Policy:
+    """The policy that takes the most probable action of this one."""
+    return Mean(policy) if isinstance(policy, GaussianPolicy) else Greedy(policy)
 
 
 @final

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
+from pgts_torch.models.drawn_actions import Drawn
 from pgts_torch.ranks import ALONE, Ranks
 from pgts_torch.search.lookahead import Lookahead
 
@@ -25,6 +26,7 @@ class Batch:
     ranks: the processes that have the other rows: an update is that from the rows of all.
     legal_NA: the legal actions of each row, by which updates of networks leave the others out; None: all are legal.
         They find it in the observations.
+    drawn: the A actions of each row, and pi over them, where these are drawn vectors; None: they are numbered.
     """
 
     observation_N: Shaped[Tensor, "N ..."]
@@ -34,6 +36,7 @@ class Batch:
     policy: Policy | None = None
     ranks: Ranks = ALONE
     legal_NA: Bool[Tensor, "N A"] | None = None
+    drawn: Drawn | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Literal
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -26,7 +26,7 @@ from pgts_torch.agent.observations import Observations
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError
-from pgts_torch.models.actions import all_actions, base_actions
+from pgts_torch.models.actions import all_actions
 from pgts_torch.models.adapters import known_adapter, not_restored
 from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside
 from pgts_torch.models.attributes import attributes, own_to_each, unlike
@@ -37,7 +37,9 @@ from pgts_torch.models.published import publishes_table, table_of
 from pgts_torch.models.restoring import Setup, check_resets, check_snapshots
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import SnapshotAdapter, each_of, env_name
+from pgts_torch.models.squash import squash_of
 from pgts_torch.models.trial import compare, environment_code
+from pgts_torch.models.vector_simulator import VectorSimulator
 from pgts_torch.models.wrapper_trial import check_transforms
 from pgts_torch.models.wrappers import Transforms, transforms_of, wrappers_of
 from pgts_torch.options.environment import Observed
@@ -48,6 +50,8 @@ _WAYS_OUT = (
     "; a model can be learned from its steps: model 'ensemble' where observations are vectors, 'latent' where they are "
     "images, 'counts' where they are numbers; or take depth 0 and the estimator 'sampled', which need no model"
 )
+
+_TRIED_VECTORS = 64
 
 DEFAULT_GAMMA = 0.99
 """Discount where neither the caller nor the environment names one."""
@@ -186,7 +190,8 @@ def _first_model(request: _Request, *, plain: bool) -> tuple[ModelWorld | None, 
     except MissingModel as missing:
         # Neither tables nor dynamics know of what a wrapper does; a simulator may contain it.
         reasons.append(str(missing))
-    candidates: list[Callable[[_Request], ModelWorld | None]] = [] if reasons else [_table]
+    vectors = squash_of(env.envs[0]) is not None
+    candidates: list[Callable[[_Request], ModelWorld | None]] = [] if reasons or vectors else [_table]
     if not plain:
         candidates += [*([] if reasons else [_dynamics]), partial(_simulator, reasons=reasons, layered=bool(reasons))]
     for candidate in candidates:
@@ -213,8 +218,7 @@ def _check_wrappers(request: _Request) -> None:
     """MissingModel unless the wrappers change nothing but single observations and rewards, without a memory."""
     if transforms_of(request.envs.envs[0]) != Transforms():
         with suppress(Failed):  # what an environment raises in a trial is reported, with step and seed, in training
-            actions = range(request.env.single_action_space.n)  # type: ignore[attr-defined]  # checked before
-            check_transforms(request.fresh(), actions, request.random)
+            check_transforms(request.fresh(), _tried_actions(request), request.random)
 
 
 def _check_alike(request: _Request) -> None:
@@ -271,7 +275,8 @@ def _dynamics(request: _Request) -> DynamicsWorld | None:
     env = request.fresh()
     tried = kind(env, gamma=request.gamma)
     try:
-        compare(tried, env, request.random, lambda _: int(tried.roots([env])), gamma=request.gamma)
+        actions = _tried_actions(request)
+        compare(tried, env, request.random, lambda _: int(tried.roots([env])), gamma=request.gamma, actions=actions)
     except ModelMismatch as off:
         raise MissingModel(f"{unused}: {off}") from off
     model = kind(env, gamma=request.gamma, action_repeat=request.action_repeat, device=request.device)
@@ -298,7 +303,9 @@ def _simulator(request: _Request, *, reasons: Sequence[str], layered: bool) -> S
         adapter = Layered(adapter)
     numbers, alike = itertools.count(), not request.own_to_each
     make: Callable[[], gymnasium.Env] = lambda: inside(request.fresh(next(numbers)), adapter)  # noqa: E731
-    actions = [*all_actions(env.action_space)] if layered else base_actions(env)
+    squash, tried = squash_of(env), _tried_actions(request)
+    own = None if layered else transforms_of(env).action
+    actions = [*tried] if own is None else [own(action) for action in tried]
     masks = inner = request.masks if isinstance(request.masks, ActionMasks) else None
     if inner is not None:
         inner = ActionMasks.of_env(make(), actions, by_method=inner.by_method)
@@ -322,16 +329,27 @@ def _simulator(request: _Request, *, reasons: Sequence[str], layered: bool) -> S
             raise MissingModel(f"{request.name} cannot serve as a model: {error}") from error
         # an error of the environment is reported when it stops a training
     seen = Observations(request.env, request.observed, request.device)
-    model = SimulatorModel(
-        request.fresh,
-        gamma=request.gamma,
-        action_repeat=request.action_repeat,
-        adapter=adapter,
-        observe=None if seen.as_given else seen.rows,
-        masks=masks,
-        device=request.device,
-    )
+    options: dict[str, Any] = {
+        "gamma": request.gamma,
+        "action_repeat": request.action_repeat,
+        "adapter": adapter,
+        "observe": None if seen.as_given else seen.rows,
+        "device": request.device,
+    }
+    model: SimulatorModel | VectorSimulator
+    if squash is None:
+        model = SimulatorModel(request.fresh, masks=masks, **options)
+    else:
+        model = VectorSimulator(request.fresh, size=squash.size, **options)
     return SimulatedWorld(request.envs, model, observed=request.observed, masks=request.masks, device=request.device)
+
+
+def _tried_actions(request: _Request) -> Sequence[Any]:
+    """The actions of trials, as the outermost wrapper takes them: all, or of vectors some random ones."""
+    env = request.envs.envs[0]
+    if (squash := squash_of(env)) is None:
+        return [*all_actions(env.action_space)]
+    return [*numpy_stream(0, "actions").normal(size=(_TRIED_VECTORS, squash.size)).astype(np.float32)]
 
 
 def _own(request: _Request, names: Iterable[str]) -> str:

@@ -272,7 +272,7 @@ class _Result:
 def _steps(experience: Rollout, *, follows: str) -> Happened:
     """The steps of all episodes, without padding; `follows` names the column that says whether the episode went on."""
     alive_V = experience.alive_TB.cpu().numpy().reshape(-1)
-    columns = [getattr(experience, name).cpu().numpy().reshape(-1) for name in (*_COLUMNS, follows)]
+    columns = [getattr(experience, name).flatten(0, 1).cpu().numpy() for name in (*_COLUMNS, follows)]
     at = np.flatnonzero(alive_V)
     return Happened(*(columns if len(at) == len(alive_V) else [column_V[at] for column_V in columns]))
 

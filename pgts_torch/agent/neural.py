@@ -5,7 +5,7 @@ from typing import Any, final
 
 import torch
 from gymnasium.spaces import Space
-from jaxtyping import Float, Int
+from jaxtyping import Float, Num
 from torch import Tensor, nn
 
 from pgts_torch.agent.advantages import critic_targets
@@ -171,6 +171,8 @@ class NetworkCritic(Critic):
     ) -> None:
         """Fit the network to these targets, and to those that it makes itself then, as often as the options say."""
         observation_V, action_V = rollout.observation_V, rollout.of_visits(rollout.action_TB)
+        if self.target == "v":  # which has no use for them, whatever they are
+            action_V = torch.zeros(len(action_V), dtype=torch.int64, device=action_V.device)
         encoder = self.network.trunk.encoder
         if encoder.fresh or not _shares_trunk(self._policy, self.network):
             encoder.absorb(observation_V, rollout.ranks)
@@ -281,7 +283,7 @@ class NetworkCritic(Critic):
             raise PgtsError("the critic has no values yet; call fit or iterate before querying it")
         return policy_mean(self._policy.probs(observation_N), self._values(network, observation_N))
 
-    def _taken(self, value_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+    def _taken(self, value_ND: Float[Tensor, "N D"], action_N: Num[Tensor, "N ..."]) -> Float[Tensor, "N"]:
         """v, or Q of the actions taken."""
         return value_ND.squeeze(-1) if self.target == "v" else value_ND.gather(-1, action_N[:, None]).squeeze(-1)
 
@@ -332,4 +334,5 @@ def mean_and_variance(what: str, x_V: Float[Tensor, "V"], ranks: Ranks) -> tuple
 
 
 def _shares_trunk(policy: Policy | None, network: Network) -> bool:
-    return isinstance(policy, NetworkPolicy) and policy.network.trunk is network.trunk
+    own = getattr(policy, "network", None)
+    return isinstance(own, Network) and own.trunk is network.trunk

@@ -82,7 +82,7 @@ class NetworkUpdate(Update):
         with self._optimiser.attempt(network.tensors) as readings:
             if (legal_NA := encoder.legal(batch.observation_N)) is not None:
                 batch = replace(batch, advantage_NA=legal_only(batch.advantage_NA, legal_NA, 0.0), legal_NA=legal_NA)
-            _check_numbers(batch, readings)
+            check_numbers(batch, readings)
             if fresh := encoder.fresh:
                 encoder.absorb(batch.observation_N, ranks)
             weight_N = batch.weight_N.float()
@@ -340,7 +340,8 @@ def _scale(
     return share.ranks.sum("advantages", mean(weight_N, size_N.square(), share.total)).sqrt() + 1e-8
 
 
-def _check_numbers(batch: Batch, readings: Readings) -> None:
+def check_numbers(batch: Batch, readings: Readings) -> None:
+    """Advantages and weights: NotFinite unless they are finite, PgtsError unless a weight is positive, when read."""
     advantage_NA, weight_N = batch.advantage_NA, batch.weight_N
     total = batch.ranks.sum("weights of rows", weight_N.sum())
     is_weight = (total > 0) & (weight_N >= 0).all()

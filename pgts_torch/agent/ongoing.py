@@ -66,7 +66,7 @@ class OngoingEpisodes:
     def _begin_all(self) -> None:
         """Let the present episode of each environment begin in the next rollout."""
         B = self._world.env.num_envs
-        self._actions_B: list[list[int]] = [[] for _ in range(B)]
+        self._actions_B: list[list[Any]] = [[] for _ in range(B)]
         self._return_B = [0.0] * B
         self._episodes = self._new_episodes()
         self._has_begun = False
@@ -205,7 +205,8 @@ class OngoingEpisodes:
         """Return, for each environment, the number of its episode, the actions and the return since the reset, and the
         latest observation."""
         observed_B = self._observe()[0].cpu() if self._has_begun else None
-        actions = [torch.tensor(actions, dtype=torch.int64) for actions in self._actions_B]
+        dtype = torch.int64 if self._world.action_size is None else torch.float32
+        actions = [torch.tensor(actions, dtype=dtype) for actions in self._actions_B]
         return {
             "number": list(self._number_B),
             "actions": actions,
@@ -240,7 +241,8 @@ class OngoingEpisodes:
                 if t and due_B.any():
                     self._episodes.restart(due_B, self._seeds())
                 begun_B = np.array([len(actions) >= longest - t for actions in recorded])
-                padded = [[0] * (longest - len(actions)) + actions for actions in recorded]
+                none = 0 if self._world.action_size is None else [0.0] * self._world.action_size
+                padded = [[none] * (longest - len(actions)) + actions for actions in recorded]
                 taken = [actions[t] for actions in padded]
                 reward_B = self._episodes.step(np.array(taken), begun_B)[0]
                 return_B = [

@@ -113,7 +113,7 @@ def learned_world(
     if isinstance(options, Latent):
         model: TensorModel = LatentModel(space, world.num_actions, **given)
     else:
-        model = EnsembleModel(space.shape[0], world.num_actions, **given)
+        model = EnsembleModel(space.shape[0], world.num_actions, action_size=world.action_size or 0, **given)
     return VectorWorld(env, model, **shared)
 
 

@@ -16,6 +16,7 @@ from pgts_torch.agent.depth import DepthChoice
 from pgts_torch.agent.dyna import Dyna
 from pgts_torch.agent.estimators import Estimator, LookaheadEstimator, SampledEstimator
 from pgts_torch.agent.explorer import Explorer
+from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.model_check import ModelCheck
@@ -27,8 +28,9 @@ from pgts_torch.agent.posterior_certificate import PosteriorCertificate
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.models.base import LearningModel, Model
+from pgts_torch.models.base import FollowingModel, LearningModel, Model
 from pgts_torch.models.counts import CountsModel
+from pgts_torch.models.drawn_actions import DrawnActions
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.rewards import RewardRange
@@ -36,6 +38,7 @@ from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.arguments import read
 from pgts_torch.options.models import LEARNED
 from pgts_torch.options.own import OwnModel
+from pgts_torch.options.policies import Gaussian
 from pgts_torch.options.replay import UniformReplay
 from pgts_torch.options.rollouts import SampledAdvantages, StepsHorizon, check_processes
 from pgts_torch.options.training import Training
@@ -149,7 +152,12 @@ def _lookahead(
     world: ModelWorld, policy: Policy, critic: Critic, options: Training, ranks: Ranks, *, samples_starts: bool
 ) -> tuple[Search, Certificates, DepthChoice]:
     """Return the search for a policy, its certificates, and the choice of its depth."""
-    search = make_search(options.search, world)
+    model: Model = world.model
+    if isinstance(policy, GaussianPolicy):
+        if not isinstance(model, FollowingModel) or model.num_actions:
+            raise MissingModel(f"{type(model).__name__} does not take vectors as actions, as a gaussian policy needs")
+        model = DrawnActions(model, options.search.filled("gaussian").actions)
+    search = make_search(options.search, model)
     depths, stop_at = options.search.depths, options.search.stop_at
     certificates = Certificates(
         world, search, critic, num_depths=len(depths), ranks=ranks, samples_starts=samples_starts
@@ -163,7 +171,7 @@ def _lookahead(
         certificates.check(f"stop_at is {stop_at}")
     if options.search.depth == "adaptive":
         certificates.check("depth is adaptive")
-    look = PolicyLookahead(world, policy, critic, search)
+    look = PolicyLookahead(world, policy, critic, search, scale=options.search.filled("gaussian").proposal_scale)
     tolerance = options.search.filled("adaptive").tolerance
     return search, certificates, DepthChoice(look, certificates, depths=depths, tolerance=tolerance, stop_at=stop_at)
 
@@ -203,7 +211,10 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
         other = partial(_with_learned, options, shared, arguments["seed"])
     with SharedGenerators(arguments["seed"], "construction"):
         source = EnvSource.of(
-            arguments["env"], kwargs=arguments["env_kwargs"], **{name: arguments[name] for name in given}
+            arguments["env"],
+            kwargs=arguments["env_kwargs"],
+            vectors=isinstance(options.policy, Gaussian),
+            **{name: arguments[name] for name in given},
         )
         if source.given is None:
             check_processes(ranks.size, num_envs)

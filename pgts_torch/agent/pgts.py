@@ -18,6 +18,7 @@ from pgts_torch.agent.build import Description, MakesModule, make_device, plain
 from pgts_torch.agent.components import row_shape
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.draws import Draws
+from pgts_torch.agent.gaussian import GaussianPolicy, Mean
 from pgts_torch.agent.iteration import Iteration, PolicyBatch
 from pgts_torch.agent.model_check import Mode
 from pgts_torch.agent.parts import make_parts
@@ -76,6 +77,8 @@ class PGTS:
         max_roots: the most visits that the lookahead of an update starts from, drawn where more states were visited.
         action_repeat, model_check: how often the model repeats each action, and whether it is checked against steps of
             the environment: see there too.
+        actions, proposal_scale: how many actions a lookahead draws in each state, and how widely, where the policy is
+            gaussian, for continuous actions: see there.
         observation_keys, image_channels: the entries of dictionary observations that are seen (default: all), and where
             images have their channels ("first", "last"; default: as their shape tells).
         action_masks: whether actions that are not legal, by `action_masks()` of the environment or
@@ -114,6 +117,8 @@ class PGTS:
         actions_per_dimension: int | None = None,
         max_roots: int | None = None,
         action_repeat: int = 1,
+        actions: int | None = None,
+        proposal_scale: float | None = None,
         model_check: Mode = "error",
         observation_keys: Sequence[str] | None = None,
         image_channels: Literal["first", "last"] | None = None,
@@ -147,7 +152,7 @@ class PGTS:
             self.options, self.search, self.dyna, levels=levels, calls=lambda: parts.model_calls, ranks=self.ranks
         )
         self._arguments = arguments | {"env": self.source.description, "device": str(self.device)}
-        self._own_actions = self.source.own_actions(self.world.env)
+        self._own_actions, self._squash = self.source.own_actions(self.world.env), self.source.squash(self.world.env)
         self._generator = stream(seed, "predict", device=self.device)
 
     @torch.inference_mode(False)
@@ -258,8 +263,10 @@ class PGTS:
         if self.depth_choice is None:
             raise PgtsError("with sampled advantages there is no lookahead")
         depth = self.depth_choice.depths[-1] if depth is None else depth
-        generator = Draws.of(self.ranks, self.seed, self.num_iterations, self.device).search()
-        return self.depth_choice.look(state_N, depth=depth, generator=generator)
+        draws = Draws.of(self.ranks, self.seed, self.num_iterations, self.device)
+        if isinstance(self.policy, GaussianPolicy):
+            self.depth_choice.look.restart(draws.search())
+        return self.depth_choice.look(state_N, depth=depth, generator=draws.search())
 
     def learn(
         self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool | None = None
@@ -305,7 +312,7 @@ class PGTS:
             observation: an observation of the environment, or an array of them.
             action_mask: which actions are legal there, as the environment says it: a vector, or a row for each of an
                 array of observations. It is needed where the environment has action masks.
-            deterministic: take the most probable action; else sample from pi.
+            deterministic: take the most probable action, of a gaussian policy the mean; else sample from pi.
             generator: for sampling; default: one with this model's seed, which continues from call to call.
 
         Raises:
@@ -314,10 +321,16 @@ class PGTS:
         observation_N = self.world.encode(self._masked(observation, action_mask))
         shape = observation_N.shape[: observation_N.ndim - len(row_shape(self.world.observation_space))]
         observation_N = self.world.perceive(observation_N.reshape(-1, *observation_N.shape[len(shape) :]))
+        generator = generator or self._generator
+        if isinstance(self.policy, GaussianPolicy):
+            policy: Policy = Mean(self.policy) if deterministic else self.policy
+            vector_NX = policy.sample(observation_N, generator=generator).cpu().numpy()
+            assert self._squash is not None
+            return self._squash.actions(vector_NX.reshape(*shape, -1))
         if deterministic:
             action_N = self.policy.probs(observation_N).argmax(-1)
         else:
-            action_N = self.policy.sample(observation_N, generator=generator or self._generator)
+            action_N = self.policy.sample(observation_N, generator=generator)
         action = action_N.cpu().numpy().reshape(shape)
         return action[()] if self._own_actions is None else self._own_actions[action]
 

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from typing import Any, final
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Num
 from torch import Tensor
 
 from pgts_torch.agent.components import legal_only
@@ -75,7 +75,7 @@ class Policy(ABC):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load parameters of the same shape; PgtsError if they do not fit."""
 
-    def sample(self, observation_N: Tensor, *, generator: torch.Generator) -> Int[Tensor, "N"]:
+    def sample(self, observation_N: Tensor, *, generator: torch.Generator) -> Num[Tensor, "N ..."]:
         """Sample one action for each observation.
 
         It is the action with the largest pi(a|o) / E_a for exponentially distributed E_a, as in `torch.multinomial`,

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Num, Shaped
 from torch import Tensor
 
 from pgts_torch.agent.episodes import Episodes
@@ -80,7 +80,7 @@ class Rollout:
     """
 
     observation_UB: Shaped[Tensor, "U B ..."]
-    action_TB: Int[Tensor, "T B"]
+    action_TB: Num[Tensor, "T B ..."]
     reward_TB: Float[Tensor, "T B"]
     discount_TB: Float[Tensor, "T B"]
     alive_TB: Bool[Tensor, "T B"]

@@ -3,6 +3,7 @@
 Searches take states, which are integers; policies and critics take observations. A `ModelWorld` translates.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
@@ -10,6 +11,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from gymnasium.spaces import Space
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import iterate
@@ -29,6 +31,7 @@ from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import each_of
 from pgts_torch.models.tabular import TabularModel
 from pgts_torch.models.tensor import TensorModel
+from pgts_torch.models.vector_simulator import VectorSimulator
 from pgts_torch.options.environment import Observed
 from pgts_torch.tabular.mdp import TabularMDP
 
@@ -40,7 +43,7 @@ def _as_it_is(encoded_N: Tensor) -> Tensor:
 class World:
     """Environments and their observations as tensors: all that is needed for rollouts without a lookahead.
 
-    num_actions: A.
+    num_actions: A; 0 where actions are vectors.   action_size: X, the size of these; None where actions are numbers.
     observation_space: of what `encode` returns.
     perceive: makes what policies and critics take of what `encode` returns, in `perceived_space`: the same, unless a
         model represents observations as vectors.
@@ -55,7 +58,7 @@ class World:
         there are none.
 
     Args:
-        env: the environments, with discrete actions.
+        env: the environments, with numbered actions, or vectors (`Squashed`).
         gamma: discount of a step that names none.
         observed: what is seen of observations.
         numbered: whether the combinations of several numbers are numbered, so that observations are Discrete.
@@ -83,7 +86,9 @@ class World:
         device: torch.device | str = "cpu",
     ) -> None:
         self.env, self.gamma, self.masks, self.device = env, gamma, masks, torch.device(device)
-        self.num_actions = int(env.single_action_space.n)  # type: ignore[attr-defined]  # checked before
+        space = env.single_action_space
+        self.num_actions = int(space.n) if isinstance(space, spaces.Discrete) else 0
+        self.action_size = None if self.num_actions else math.prod(space.shape or ())
         masked = self.num_actions if isinstance(masks, ActionMasks) and self.shows_masks else None
         self.observations = Observations(env, observed, self.device, numbered=numbered, masked=masked)
         self.observation_space = self.perceived_space = self.observations.space
@@ -255,9 +260,9 @@ class SimulatedWorld(ModelWorld):
         env, observed, numbered, masks, device: as in `World`.
     """
 
-    def __init__(self, env: SyncVectorEnv, model: SimulatorModel, **options: Any) -> None:
+    def __init__(self, env: SyncVectorEnv, model: SimulatorModel | VectorSimulator, **options: Any) -> None:
         super().__init__(env, gamma=model.gamma, **options)
-        self.model: SimulatorModel = model
+        self.model: SimulatorModel | VectorSimulator = model
         self._envs = env.envs
 
     def read(self, observation: Any, encoded_B: Tensor) -> Int[Tensor, "B"]:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgts_torch.agent.evaluate import Evaluation
+from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy, TabularPolicy
@@ -62,9 +63,11 @@ class Movement:
     def measure(self, algorithm: PGTS, iteration: Iteration) -> None:
         """Update, at the states of the latest iteration and with their weights in the update:
 
-        moved = mean of 1/2 sum_a |pi - pi_first|, in [0, 1];   gap_share = mean g_m / mean (max_a q - min_a q)
+        moved = mean of 1/2 sum_a |pi - pi_first|, in [0, 1]; None where pi is a density.
+        gap_share = mean g_m / mean (max_a q - min_a q)
         """
-        self.moved = _distance(algorithm, iteration, self.first.probs(iteration.observation_N))
+        if not isinstance(algorithm.policy, GaussianPolicy):
+            self.moved = _distance(algorithm, iteration, self.first.probs(iteration.observation_N))
         self.gap_share = None
         if iteration.look is not None:
             span, gap = _mean(iteration, span_of(iteration.look.q_BA)), _mean(iteration, iteration.gap_N)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Num, Shaped
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
@@ -42,7 +42,7 @@ class Experience(NamedTuple):
     """
 
     observation_N: Shaped[Tensor, "N ..."]
-    action_N: Int[Tensor, "N"]
+    action_N: Num[Tensor, "N ..."]
     reward_N: Float[Tensor, "N"]
     discount_N: Float[Tensor, "N"]
     next_observation_N: Shaped[Tensor, "N ..."]
@@ -95,7 +95,7 @@ class LearningModel(Model):
     replay: ReplayBuffer | None = None
     learns_after_episodes: bool = False
 
-    def is_news(self, observation_B: Shaped[Tensor, "B ..."], action_B: Int[Tensor, "B"]) -> bool:
+    def is_news(self, observation_B: Shaped[Tensor, "B ..."], action_B: Num[Tensor, "B ..."]) -> bool:
         """Whether learning from these steps, which are to be learned later, would change much: then they are learned at
         once, also in the middle of an episode."""
         return False
@@ -151,9 +151,20 @@ class SamplingModel(Model):
     """A model that samples one outcome of a state and an action."""
 
     @abstractmethod
-    def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
+    def sample(
+        self, state_N: Int[Tensor, "N"], action_N: Num[Tensor, "N ..."], *, key_N: Int[Tensor, "N"]
+    ) -> Transitions:
         """One outcome of each (state, action): a function of state, action and key (`seeding.mix`) and of nothing else.
 
         So the randomness is that of the search, which cannot foresee what an environment will do, and finds the same
         outcome however its batch is split or ordered.
         """
+
+
+class FollowingModel(SamplingModel):
+    """A model in which an action has one outcome. Actions may be vectors, [N, X], which are no numbers to enumerate:
+    its `num_actions` is 0 then."""
+
+    @abstractmethod
+    def follow(self, state_N: Int[Tensor, "N"], action_N: Num[Tensor, "N ..."]) -> Transitions:
+        """The one outcome of each (state, action)."""

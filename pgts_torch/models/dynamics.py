@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 from torch import Tensor
 
 from pgts_torch.compiled import pays
@@ -20,6 +20,7 @@ from pgts_torch.models.exact_model import ExactModel
 from pgts_torch.models.provenance import overridden
 from pgts_torch.models.rewards import value_range
 from pgts_torch.models.snapshots import env_name
+from pgts_torch.models.squash import squash_of
 from pgts_torch.models.state_index import Merge
 from pgts_torch.models.steps import number_of
 from pgts_torch.models.tensor import TensorModel
@@ -35,8 +36,9 @@ class DynamicsModel(TensorModel, ExactModel):
     The state is the vector `env.unwrapped.state`. States, rewards and values are float64 by default.
 
     Args:
-        env: an instance, wrapped or not; nothing of it changes. Its actions are discrete, by itself or by an action
-            wrapper (`with_torques`). Its wrappers' transforms of rewards are part of the outcomes (`transforms_of`).
+        env: an instance, wrapped or not; nothing of it changes. Its actions are discrete, by itself or by an
+            action wrapper (`with_torques`), or vectors (`Squashed`). Its wrappers' transforms of rewards are part of
+            the outcomes (`transforms_of`).
         gamma: discount in [0, 1] of a step that does not terminate.
         action_repeat, device, merge: as in `TensorModel`.
         dtype: of states, rewards and values.
@@ -51,6 +53,8 @@ class DynamicsModel(TensorModel, ExactModel):
     size: int
     constants: tuple[str, ...]
     """All attributes of the environment that a step reads, beside its state."""
+    takes_vectors: bool = False
+    """Whether actions may be vectors."""
     pays_ends_only: bool = True
     """Whether every reward is the lowest or the highest."""
 
@@ -69,7 +73,8 @@ class DynamicsModel(TensorModel, ExactModel):
         self.name, self.gamma = env_name(env), gamma
         if why := self.obstacle(env):
             raise PgtsError(f"{self.name} has no dynamics in torch: {why}")
-        actions, self.transforms = base_actions(env), transforms_of(env)
+        self._squash, self.transforms = squash_of(env), transforms_of(env)
+        actions = [] if self._squash else base_actions(env)
         options: dict[str, Any] = {"state_dtype": dtype, "dtype": dtype, "device": device, "merge": merge}
         super().__init__(self.size, len(actions), action_repeat=action_repeat, **options)
         # As numbers of Python, which leave arrays in their dtype.
@@ -91,7 +96,7 @@ class DynamicsModel(TensorModel, ExactModel):
             transforms_of(env)
         except MissingModel as missing:
             return str(missing)
-        if not isinstance(env.action_space, spaces.Discrete):
+        if not (isinstance(env.action_space, spaces.Discrete) or (cls.takes_vectors and _is_squashed(env))):
             return f"its actions are {env.action_space}; make them discrete, as with_torques does"
         return cls._unknown(env.unwrapped)
 
@@ -132,10 +137,10 @@ class DynamicsModel(TensorModel, ExactModel):
 
     @final
     def step(
-        self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
+        self, state_ND: Float[Tensor, "N D"], action_N: Num[Tensor, "N ..."]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
         """Reward, discount (0 where the episode terminates) and next state."""
-        loops = state_ND.dtype == torch.float64 and pays(self.device, state_ND.shape[0])
+        loops = self._squash is None and state_ND.dtype == torch.float64 and pays(self.device, state_ND.shape[0])
         answer = self._step_compiled(state_ND.contiguous().numpy(), action_N.numpy()) if loops else None
         reward_N, discount_N, next_ND = self._step(state_ND, action_N) if answer is None else answer
         if self.transforms.rewards:
@@ -147,7 +152,7 @@ class DynamicsModel(TensorModel, ExactModel):
     def _step(self, state_ND: Tensor, action_N: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As `step`, with the reward of the bare environment."""
         xp, state = self._columns(state_ND)
-        _, effect = self._columns(self._effect_AE.index_select(0, action_N))
+        _, effect = self._columns(self._effects(action_N))
         paid, ends, following = self._move(xp, state, effect)
         reward_N, terminated_N = map(torch.as_tensor, (paid, ends))
         discount_N = torch.full_like(reward_N, self.gamma).masked_fill_(terminated_N, 0.0)
@@ -172,9 +177,16 @@ class DynamicsModel(TensorModel, ExactModel):
     def observe(self, state_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N O"]:
         """The observations of the environment in these states, float32."""
 
+    def _effects(self, action_N: Num[Tensor, "N ..."]) -> Float[Tensor, "N E"]:
+        if self._squash is None:
+            return self._effect_AE.index_select(0, action_N)
+        columns = self._effect(self._squash.actions(action_N.cpu().numpy()))
+        return torch.from_numpy(np.stack(columns, -1)).to(self.device, self.dtype)
+
     @abstractmethod
-    def _effect(self, action: Any) -> tuple[float, ...]:
-        """What the dynamics need to know of an action of the environment."""
+    def _effect(self, action: Any) -> tuple[Any, ...]:
+        """What the dynamics need to know of an action of the environment: numbers, or, where it `takes_vectors`, of
+        rows of actions arrays."""
 
     @abstractmethod
     def _reward_range(self) -> tuple[float, float]:
@@ -194,3 +206,8 @@ class DynamicsModel(TensorModel, ExactModel):
             return -math.inf, math.inf
         ends = [number_of("reward", self.transforms.reward(end)) for end in self._reward_range()]
         return min(ends), max(ends)
+
+
+def _is_squashed(env: gymnasium.Env) -> bool:
+    """Whether actions are vectors, of which no other wrapper makes something else."""
+    return squash_of(env) is not None and len(transforms_of(env).actions) == 1

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, final
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor, nn
 
 from pgts_torch.errors import NotFinite, PgtsError, check_count
@@ -50,7 +50,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
 
     Args:
         state_size: D.
-        num_actions: A.
+        num_actions: A; 0 where actions are vectors.   action_size: X, of these.
         gamma: discount of a step after which the episode goes on.
         options: of networks and fits.
         capacity: the number of steps that are kept; PgtsError unless it is above 32, and memory has room.
@@ -69,6 +69,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         seed: int = 0,
         device: torch.device | str = "cpu",
         action_repeat: int = 1,
+        action_size: int = 0,
     ) -> None:
         super().__init__(
             state_size, num_actions, merge=False, dtype=torch.float64, device=device, action_repeat=action_repeat
@@ -82,9 +83,9 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         self.replay: ReplayBuffer = ReplayBuffer(capacity)
         none = torch.zeros(0)
         vectors, whole, flags = torch.zeros(0, state_size), none.long(), none.bool()
-        copies = torch.zeros(0, options.members)
+        copies, actions = torch.zeros(0, options.members), whole if num_actions else torch.zeros(0, action_size)
         self.replay.add(
-            state=vectors, action=whole, reward=none, end=none, next_state=vectors, follows=flags, copies=copies
+            state=vectors, action=actions, reward=none, end=none, next_state=vectors, follows=flags, copies=copies
         )
         self._warned, self._end_share = False, 0.0
         self._reward_limits: tuple[float, float] | None = None  # where others have seen rewards as well
@@ -95,6 +96,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
             options.hidden,
             generator=stream(seed, "model"),
             device=self.device,
+            action_size=action_size,
         )
         self._optimiser = torch.optim.Adam(
             self._networks.weights, lr=options.learning_rate, weight_decay=options.weight_decay, fused=True
@@ -223,7 +225,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         return loss.detach()
 
     @torch.no_grad()
-    def members(self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]) -> Prediction:
+    def members(self, state_ND: Float[Tensor, "N D"], action_N: Num[Tensor, "N ..."]) -> Prediction:
         """The predictions of all members."""
         said = self._networks.predict(state_ND, action_N, self._log_odds_added)
         return said._replace(end_EN=torch.where(said.end_EN < _SELDOM, 0.0, said.end_EN))
@@ -239,7 +241,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         return {name: deviation for name, (_, deviation) in self._networks.moments.items()}
 
     def step(
-        self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
+        self, state_ND: Float[Tensor, "N D"], action_N: Num[Tensor, "N ..."]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
         """The means over members; the discount is gamma (1 - p)."""
         return self._means(self.members(state_ND, action_N))
@@ -247,7 +249,9 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
     def _means(self, said: Prediction) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
         return said.reward_EN.mean(0).double(), self.gamma * (1 - said.end_EN.mean(0).double()), said.next_END.mean(0)
 
-    def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
+    def sample(
+        self, state_N: Int[Tensor, "N"], action_N: Num[Tensor, "N ..."], *, key_N: Int[Tensor, "N"]
+    ) -> Transitions:
         """The means over members; the episode ends with their mean probability, and the discount is then 0, else gamma.
         A step is trusted where `Prediction.disagreement` is at most `max_disagreement`. With repeated actions no end is
         sampled, the discount is the mean one, as that of `step`, and all steps are trusted."""

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Num
 from torch import Tensor, nn
 
 from pgts_torch.errors import NotFinite, PgtsError
@@ -18,7 +18,8 @@ _CLIP = 8.0
 
 @final
 class EnsembleNetworks:
-    """E networks of the same sizes, computed as one batched product. They take a state and a one-hot action, and return
+    """E networks of the same sizes, computed as one batched product. They take a state and an action,
+    one-hot or a vector that is squashed by tanh, and return
     the change of the state, the reward, both standardised, and the log odds of an end.
 
     weights: all parameters.
@@ -26,7 +27,7 @@ class EnsembleNetworks:
 
     Args:
         state_size: D.
-        num_actions: A.
+        num_actions: A; 0 where actions are vectors.   action_size: X, of these.
         members: E.
         hidden: the sizes of the hidden layers.
         generator: of the initial weights.
@@ -41,9 +42,10 @@ class EnsembleNetworks:
         *,
         generator: torch.Generator,
         device: torch.device,
+        action_size: int = 0,
     ) -> None:
         self.state_size, self.num_actions, self.members, self._device = state_size, num_actions, members, device
-        sizes = [state_size + num_actions, *hidden, state_size + 2]
+        sizes = [state_size + (num_actions or action_size), *hidden, state_size + 2]
         # the weight [E, inputs, outputs] and the bias [E, 1, outputs] of each layer
         self._layers = [
             (
@@ -114,16 +116,19 @@ class EnsembleNetworks:
         mean, deviation = self.moments[name]
         return torch.where(deviation > 0, (value - mean) / deviation, 0.0)
 
-    def inputs(self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]) -> Float[Tensor, "N I"]:
-        one_hot_NA = nn.functional.one_hot(action_N, self.num_actions).float()
-        return torch.cat([self.scaled("state", state_ND).clamp(-_CLIP, _CLIP), one_hot_NA], -1)
+    def inputs(self, state_ND: Float[Tensor, "N D"], action_N: Num[Tensor, "N ..."]) -> Float[Tensor, "N I"]:
+        if self.num_actions:
+            action_NI = nn.functional.one_hot(action_N, self.num_actions).float()
+        else:
+            action_NI = action_N.float().tanh()  # as far as they are squashed
+        return torch.cat([self.scaled("state", state_ND).clamp(-_CLIP, _CLIP), action_NI], -1)
 
     def outputs(self, x: Float[Tensor, "E N I"]) -> Float[Tensor, "E N O"]:
         for weight, bias in self._layers[:-1]:
             x = nn.functional.silu(torch.baddbmm(bias, x, weight))
         return torch.baddbmm(self._layers[-1][1], x, self._layers[-1][0])
 
-    def predict(self, state_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"], log_odds: float) -> Prediction:
+    def predict(self, state_ND: Float[Tensor, "N D"], action_N: Num[Tensor, "N ..."], log_odds: float) -> Prediction:
         """What all members predict; by `log_odds` the log odds of ends are too large."""
         output = self.outputs(self.inputs(state_ND, action_N).expand(self.members, -1, -1))
         (change_mean, change_scale), (reward_mean, reward_scale) = self.moments["change"], self.moments["reward"]

@@ -23,6 +23,7 @@ from pgts_torch.errors import PgtsError, check_count, failure
 from pgts_torch.models.actions import Numbered, is_numbered, numbered
 from pgts_torch.models.attributes import Unlike, own_to_each, unlike
 from pgts_torch.models.snapshots import each_of, env_name
+from pgts_torch.models.squash import Squash, Squashed, squash_of
 from pgts_torch.models.wrappers import wrappers_of
 from pgts_torch.seeding import numpy_stream
 from pgts_torch.trust import import_named
@@ -52,7 +53,7 @@ class EnvSource:
     given: environments that were given as a VectorEnv, to train in; None: some are made for that, too.
     make_together: makes `num_envs` that step together, of which none can be looked at by itself; None: `makers` do.
     has_table: whether a model needs no more than the table of `make_together`.
-    actions_per_dimension: as in `of`.
+    actions_per_dimension, vectors: as in `of`.
     """
 
     name: str
@@ -63,6 +64,7 @@ class EnvSource:
     make_together: Callable[[int], VectorEnv] | None = None
     has_table: bool = False
     actions_per_dimension: int | None = None
+    vectors: bool = False
     _known: weakref.WeakValueDictionary[int, gymnasium.Env] = field(default_factory=weakref.WeakValueDictionary)
 
     @classmethod
@@ -73,6 +75,7 @@ class EnvSource:
         kwargs: Mapping[str, Any] | None = None,
         gamma: float | None = None,
         actions_per_dimension: int | None = None,
+        vectors: bool = False,
     ) -> "EnvSource":
         """Read what a user gives.
 
@@ -84,11 +87,30 @@ class EnvSource:
             gamma: handed to environments that carry a discount of their own, pgts/*, by their id.
             actions_per_dimension: into how many evenly spaced values each dimension of continuous actions is divided;
                 None: actions are discrete.
+            vectors: whether actions are vectors of real numbers (`Squashed`).
 
         Raises:
             PgtsError: it is none of these, or takes none of these options; an instance is not what its spec makes; or
                 a VectorEnv does not take numbers as actions, or resets in another way.
         """
+        source = cls._of(env, kwargs, gamma, actions_per_dimension)
+        if vectors and source.given is not None:
+            raise PgtsError(
+                f"{source.name} was given as a VectorEnv, which takes its own actions; policy.type gaussian needs an "
+                "id or a function, of which it makes environments"
+            )
+        if vectors and actions_per_dimension is not None:
+            raise PgtsError(
+                f"actions_per_dimension is {actions_per_dimension}, which divides continuous actions; policy.type "
+                "gaussian takes them as they are: leave one of the two out"
+            )
+        source.vectors = vectors
+        return source
+
+    @classmethod
+    def _of(
+        cls, env: Given, kwargs: Mapping[str, Any] | None, gamma: float | None, actions_per_dimension: int | None
+    ) -> "EnvSource":
         if isinstance(env, str):
             return cls._of_id(env, dict(kwargs or {}), gamma, actions_per_dimension)
         if kwargs:
@@ -155,14 +177,15 @@ class EnvSource:
                 return self.make_together(num_envs)
             makers = [lambda k=k: self.like(k) for k in range(num_envs)]
             made = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
-        check_vector_env(made)
+        check_vector_env(made, vectors=self.vectors)
         if self.given is not None:
             self._check_like(each_of(self.given), made.envs)
         return made
 
     def like(self, k: int = 0) -> gymnasium.Env:
         """A new environment, as environment k of those that `make` gives."""
-        return numbered(self.make_one(k, max_episode_steps=-1), per_dimension=self.actions_per_dimension)
+        made = self.make_one(k, max_episode_steps=-1)
+        return Squashed(made) if self.vectors else numbered(made, per_dimension=self.actions_per_dimension)
 
     def make_one(self, k: int = 0, **options: Any) -> gymnasium.Env:
         """A new environment as it is registered or given, with its own actions and time limit; PgtsError as `make`. Of
@@ -186,6 +209,10 @@ class EnvSource:
         """What the numbers of actions stand for in environments of `make`, a row each; None: the numbers themselves."""
         outermost = each_of(envs)[0]
         return np.stack(outermost.actions) if isinstance(outermost, Numbered) and envs is not self.given else None
+
+    def squash(self, envs: VectorEnv) -> Squash | None:
+        """What squashes actions in environments of `make`; None where these are numbers."""
+        return squash_of(each_of(envs)[0]) if self.vectors else None
 
     @cached_property
     def time_limit(self) -> int | None:
@@ -217,15 +244,15 @@ class EnvSource:
             )
 
 
-def check_vector_env(env: VectorEnv) -> None:
-    """PgtsError unless rollouts can be made in these environments: discrete actions, reset by mask."""
+def check_vector_env(env: VectorEnv, *, vectors: bool = False) -> None:
+    """PgtsError unless rollouts can be made in these environments: discrete actions, or vectors, reset by mask."""
     space = env.single_action_space
-    if isinstance(space, spaces.Box):
+    if isinstance(space, spaces.Box) and not vectors:
         raise PgtsError(
-            f"the actions of {env_name(env)} are continuous, {space}: set actions_per_dimension, into how many values "
-            "each dimension of them is divided"
+            f"the actions of {env_name(env)} are continuous, {space}: take the policy 'gaussian', or set "
+            "actions_per_dimension, into how many values each dimension of them is divided"
         )
-    if not is_numbered(space):
+    if not vectors and not is_numbered(space):
         raise PgtsError(f"the actions of {env_name(env)} are {space}; they must be Discrete(n) counted from 0")
     mode = env.metadata.get("autoreset_mode")
     if mode != AutoresetMode.DISABLED:

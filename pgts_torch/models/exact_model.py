@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
 from pgts_torch.models.base import Model
 
@@ -24,7 +24,7 @@ class Happened:
     """
 
     state_N: Int[np.ndarray, "N"]
-    action_N: Int[np.ndarray, "N"]
+    action_N: Num[np.ndarray, "N ..."]
     reward_N: Float[np.ndarray, "N"]
     discount_N: Float[np.ndarray, "N"]
     next_state_N: Int[np.ndarray, "N"]
@@ -71,7 +71,9 @@ class ExactModel(Model):
 
     def contradiction(self, happened: Happened) -> str:
         """The first of some steps that are none of its outcomes, and what it has instead, in a message."""
-        state, action, reward, discount, next_state, follows = (column[0].item() for column in vars(happened).values())
+        state, action, reward, discount, next_state, follows = (
+            column[0].tolist() for column in vars(happened).values()
+        )
         gave = step_text(reward, discount, self.state_text(next_state))
         gave += ", and the episode went on" * (follows and not self.is_cheap)
         return (

@@ -2,8 +2,8 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, final
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import MissingModel, PgtsError, RandomOutcomes, check_count, failure
+from pgts_torch.errors import PgtsError, RandomOutcomes, check_count, failure
 from pgts_torch.models.adapters import methods_for
 from pgts_torch.models.answers import Answers, Step, without_collector
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
@@ -21,7 +21,7 @@ from pgts_torch.models.environments import Given
 from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, ExactModel, Happened, step_text
 from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.provenance import draws_its_own
-from pgts_torch.models.snapshot_model import SnapshotModel
+from pgts_torch.models.snapshot_model import SnapshotModel, watched
 from pgts_torch.models.snapshots import SnapshotAdapter
 from pgts_torch.models.stepper import Stepper
 from pgts_torch.seeding import SharedGenerators
@@ -152,20 +152,8 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             random.append(step.random or bool(shared.used))
         return torch.tensor(random, dtype=torch.bool, device=self.device)
 
-    @contextmanager
-    def _watched(self) -> Iterator[None]:
-        """MissingModel where a step in this context has drawn from a generator that the whole process shares."""
-        if self._draws_its_own:
-            yield
-            return
-        with SharedGenerators() as shared:
-            yield
-        if shared.used:
-            self._answers.clear()
-            raise MissingModel(
-                f"{self.name} cannot be a model: step draws from the global generator of {shared.used[0]}: draw from "
-                "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
-            )
+    def _watched(self) -> AbstractContextManager[None]:
+        return watched(self.name, draws_its_own=self._draws_its_own, forget=self._answers.clear)
 
     def _answer(self, steps: Sequence[tuple[Step, int]]) -> Transitions:
         return Transitions(

@@ -2,7 +2,8 @@
 
 import itertools
 from abc import abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -12,11 +13,34 @@ from gymnasium import spaces
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from pgts_torch.errors import ModelMismatch, PgtsError
+from pgts_torch.errors import MissingModel, ModelMismatch, PgtsError
 from pgts_torch.models.adapters_generic import Layered
 from pgts_torch.models.answers import Seen, Step, observed
 from pgts_torch.models.base import Model
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
+from pgts_torch.seeding import SharedGenerators
+
+
+@contextmanager
+def watched(name: str, *, draws_its_own: bool, forget: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """MissingModel where a step in this context has drawn from a generator that the whole process shares.
+
+    Args:
+        name: of the environment.
+        draws_its_own: whether it is known to do no such thing.
+        forget: called first: what such steps gave may have been remembered.
+    """
+    if draws_its_own:
+        yield
+        return
+    with SharedGenerators() as shared:
+        yield
+    if shared.used:
+        forget()
+        raise MissingModel(
+            f"{name} cannot be a model: step draws from the global generator of {shared.used[0]}: draw from "
+            "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
+        )
 
 
 class SnapshotModel(Model):

@@ -10,7 +10,7 @@ from torch import Tensor
 from pgts_torch.bellman import Outcomes
 from pgts_torch.compiled import pays
 from pgts_torch.errors import NotFinite, PgtsError, check_count
-from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
+from pgts_torch.models.base import EnumeratingModel, FollowingModel, Transitions
 from pgts_torch.models.exact_model import CONTRADICTED, Happened, step_text
 from pgts_torch.models.state_index import Merge, StateIndex, index_loops
 
@@ -21,7 +21,7 @@ _ROUNDING = 1e-12
 """By how much dynamics that do the same arithmetic in another order, or on another device, may be off."""
 
 
-class TensorModel(EnumeratingModel, SamplingModel):
+class TensorModel(EnumeratingModel, FollowingModel):
     """Deterministic dynamics over vectors of D numbers. A subclass defines `step`; this class gives states a number as
     it meets them, equal ones the same, so that a search merges them.
 
@@ -48,7 +48,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
 
     Args:
         state_size: D.
-        num_actions: A.
+        num_actions: A; 0: actions are vectors.
         state_dtype: of the vectors: floating, or int64.
         dtype: of rewards, discounts and values.
         device: where everything lies.
@@ -85,7 +85,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
 
     @abstractmethod
     def step(
-        self, state_ND: Num[Tensor, "N D"], action_N: Int[Tensor, "N"]
+        self, state_ND: Num[Tensor, "N D"], action_N: Num[Tensor, "N ..."]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Num[Tensor, "N D"]]:
         """Reward, discount and next state of each (state, action): a function of these and of nothing else.
 
@@ -141,8 +141,13 @@ class TensorModel(EnumeratingModel, SamplingModel):
             reward_N.view(-1, A), certain_NAK, discount_N.view(-1, A, 1), next_N.view(-1, A, 1), self.num_states
         )
 
-    def sample(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"], *, key_N: Int[Tensor, "N"]) -> Transitions:
+    def sample(
+        self, state_N: Int[Tensor, "N"], action_N: Num[Tensor, "N ..."], *, key_N: Int[Tensor, "N"]
+    ) -> Transitions:
         """The one outcome of each (state, action), whatever the key; raises as `outcomes` does."""
+        return self.follow(state_N, action_N)
+
+    def follow(self, state_N: Int[Tensor, "N"], action_N: Num[Tensor, "N ..."]) -> Transitions:
         return Transitions(*self._followed(state_N, action_N))
 
     @torch.no_grad()
@@ -198,7 +203,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
         self.simulator_steps += state_ND.shape[0]
         reward_N, discount_N, next_ND = answer = self.step(state_ND, action_N)
         given = reward_N.shape, discount_N.shape, next_ND.shape
-        expected = action_N.shape, action_N.shape, state_ND.shape
+        expected = action_N.shape[:1], action_N.shape[:1], state_ND.shape
         if given != expected:
             shapes, must_be = (tuple(map(tuple, each)) for each in (given, expected))
             raise PgtsError(
@@ -226,7 +231,7 @@ class TensorModel(EnumeratingModel, SamplingModel):
             n = int(torch.nonzero(~((discount_N >= 0) & (discount_N <= 1)))[0, 0])
             raise PgtsError(
                 f"step returned the discount {float(discount_N[n])} for state {state_ND[n].tolist()} and action "
-                f"{int(action_N[n])}; it must be in [0, 1]"
+                f"{action_N[n].tolist()}; it must be in [0, 1]"
             )
         # A sum is one cheap call; only where it is not a number single ones are looked at.
         if not bool(next_ND.sum().isnan()):
@@ -235,8 +240,8 @@ class TensorModel(EnumeratingModel, SamplingModel):
         if bool(bad_N.any()):
             n = int(torch.nonzero(bad_N)[0, 0])
             raise NotFinite(
-                f"step leads from state {state_ND[n].tolist()} by action {int(action_N[n])} to {next_ND[n].tolist()}; "
-                "what is not a number equals nothing",
+                f"step leads from state {state_ND[n].tolist()} by action {action_N[n].tolist()} to "
+                f"{next_ND[n].tolist()}; what is not a number equals nothing",
                 what="state",
             )
 

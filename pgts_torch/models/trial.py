@@ -154,6 +154,7 @@ def compare(
     state_of: Callable[[Taken], int],
     *,
     gamma: float,
+    actions: Sequence[Any] | None = None,
     seconds: float = SECONDS,
     any_action: bool = False,
 ) -> int:
@@ -165,6 +166,7 @@ def compare(
         state_of: the state of the model in which a step or a reset has left the environment; it may raise too.
         gamma: discount of a step that names none.
         any_action: as in `random_walk`.
+        actions: those of the walk. Default: all numbered ones.
 
     Returns:
         How many steps were compared. An error of the environment ends the walk: it is no contradiction, and reported
@@ -177,7 +179,7 @@ def compare(
     try:
         for taken in random_walk(
             env,
-            range(model.num_actions),
+            range(model.num_actions) if actions is None else actions,
             generator,
             steps=_COMPARED_STEPS,
             longest=_LONGEST_EPISODE,

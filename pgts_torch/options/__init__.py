@@ -20,7 +20,18 @@ from pgts_torch.options.critics import (
 from pgts_torch.options.models import AutoModel, Counts, Ensemble, GivenModel, Latent
 from pgts_torch.options.own import OwnModel, OwnModule
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, NatureCNN, Random, Simplex, Softmax, Uniform
+from pgts_torch.options.policies import (
+    CNN,
+    MLP,
+    AutoPolicy,
+    Biased,
+    Gaussian,
+    NatureCNN,
+    Random,
+    Simplex,
+    Softmax,
+    Uniform,
+)
 from pgts_torch.options.replay import AutoReplay, NoReplay, UniformReplay
 from pgts_torch.options.rollouts import (
     AutoHorizon,
@@ -31,13 +42,14 @@ from pgts_torch.options.rollouts import (
     StepsHorizon,
 )
 from pgts_torch.options.search import MCTS, Auto, Expectimax, Sampled
-from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient
+from pgts_torch.options.updates import CMPO, MPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient
 
 __all__ = [
     "CMPO",
     "CNN",
     "MCTS",
     "MLP",
+    "MPO",
     "PPO",
     "Auto",
     "AutoCritic",
@@ -52,6 +64,7 @@ __all__ = [
     "ExactValues",
     "Expectimax",
     "FixedHorizon",
+    "Gaussian",
     "GeometricHorizon",
     "GivenModel",
     "Gradient",

@@ -1,5 +1,6 @@
 """Options of policies: tables and networks."""
 
+import math
 from typing import Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
@@ -157,8 +158,36 @@ class NatureCNN(CNN):
     """Sizes of the fully connected layers."""
 
 
+class AutoLayers(Part):
+    """By the environment: cnn where there are images, else mlp."""
+
+    type: Literal["auto"] = "auto"
+
+
+class Gaussian(Part):
+    """A normal distribution over continuous actions, which are squashed into their bounds by tanh."""
+
+    type: Literal["gaussian"] = "gaussian"
+
+    network: AutoLayers | MLP | CNN | NatureCNN = Field(default=AutoLayers(), discriminator="type")
+    """The network that returns means and standard deviations."""
+
+    std: Positive = 1.0
+    """The standard deviation at first, before tanh."""
+
+    min_std: Positive = 0.05
+    """The smallest standard deviation; below std."""
+
+    @field_validator("min_std")
+    @classmethod
+    def _is_smaller(cls, value: Any, info: ValidationInfo) -> Any:
+        if value >= info.data.get("std", math.inf):
+            raise conflict(f"policy.min_std is {value}; it must be below policy.std, {info.data['std']}")
+        return value
+
+
 Table = Softmax | Simplex
 Network = MLP | CNN | NatureCNN | OwnModule
 
-TABLES, NETWORKS = ("softmax", "simplex"), ("mlp", "cnn", "nature_cnn", "module")
-"""The types of tables and of networks; auto, which the environment decides, is in neither."""
+TABLES, NETWORKS = ("softmax", "simplex"), ("mlp", "cnn", "nature_cnn", "module", "gaussian")
+"""The types of tables and of what is made of networks; auto, which the environment decides, is in neither."""

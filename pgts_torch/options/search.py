@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from pydantic import ValidationInfo, field_validator
 
-from pgts_torch.options.fields import Count, Natural, NonNegative, Samples, conflict
+from pgts_torch.options.fields import AtLeastOne, Count, Natural, NonNegative, Samples, conflict
 from pgts_torch.options.part import Part, null
 
 MAX_NODES = 10_000_000
@@ -164,6 +164,12 @@ class LookaheadOptions(Part):
     action_repeat: Count = 1
     """How often the lookahead repeats each action, so that it looks as many times further ahead. Not in environments
     with numbered states."""
+
+    actions: Count | None = null(gaussian=16)
+    """The number of actions that are drawn in each state of the lookahead where the policy is gaussian."""
+
+    proposal_scale: AtLeastOne | None = null(gaussian=2.0)
+    """The standard deviation of half of the drawn actions, in that of the policy, which draws the others."""
 
     model_check: Literal["error", "warn", "off"] = "error"
     """Whether each step of the environment is checked against its model. error: the first contradiction stops the

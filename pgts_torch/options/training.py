@@ -11,7 +11,19 @@ from pgts_torch.options.fields import conflict
 from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Latent, Model
 from pgts_torch.options.own import Own, OwnModel, OwnModule, by_name
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import CNN, MLP, NETWORKS, TABLES, AutoPolicy, Biased, Network, Simplex, Softmax, Table
+from pgts_torch.options.policies import (
+    CNN,
+    MLP,
+    NETWORKS,
+    TABLES,
+    AutoPolicy,
+    Biased,
+    Gaussian,
+    Network,
+    Simplex,
+    Softmax,
+    Table,
+)
 from pgts_torch.options.replay import AutoReplay, NoReplay, Replay, UniformReplay
 from pgts_torch.options.rollouts import (
     AutoHorizon,
@@ -24,16 +36,16 @@ from pgts_torch.options.rollouts import (
     StepsHorizon,
 )
 from pgts_torch.options.schema import either
-from pgts_torch.options.search import AutoSection, ExpectimaxSection, SearchSection
-from pgts_torch.options.updates import CMPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient, Update
+from pgts_torch.options.search import AutoSection, ExpectimaxSection, SampledSection, SearchSection
+from pgts_torch.options.updates import CMPO, MPO, PPO, AutoUpdate, Gradient, Mirror, Projected, SoftmaxGradient, Update
 
 
 class Training(Part):
     """The options of `PGTS` but for seed and device. The rules between parts do not apply to those that are auto."""
 
     env: Env = Env()
-    policy: AutoPolicy | Table | Network = Field(default=AutoPolicy(), discriminator="type")
-    """The policy that is trained: a table (softmax, simplex) or a network (mlp, cnn)."""
+    policy: AutoPolicy | Table | Network | Gaussian = Field(default=AutoPolicy(), discriminator="type")
+    """The policy that is trained: a table (softmax, simplex), a network (mlp, cnn), or gaussian, for vectors."""
 
     rollout: Rollouts = Rollouts()
     critic: AutoCritic | Critic = Field(default=AutoCritic(), discriminator="type")
@@ -78,12 +90,17 @@ class Training(Part):
         if policy is None or isinstance(critic, AutoCritic):
             return critic
         if not isinstance(critic, NetworkValues):
-            if isinstance(policy, CNN):
+            if isinstance(policy, CNN | Gaussian):
                 raise conflict(
                     f"critic.type is {critic.type}, which needs numbered states; with policy.type {policy.type} it "
                     "must be network"
                 )
             return critic
+        if policy.type == "gaussian" and critic.target == "q":
+            raise conflict(
+                "critic.target is q, which has a value for each numbered action; policy.type gaussian has none, it "
+                "must be v"
+            )
         network = critic.network.type
         if network == "shared" and isinstance(policy, Table):
             raise conflict(
@@ -115,7 +132,8 @@ class Training(Part):
                 )
         if isinstance(policy, Table):
             raise conflict(
-                f"estimator.type is sampled, which needs policy.type mlp, cnn or module; policy.type is {policy.type}"
+                "estimator.type is sampled, which needs policy.type mlp, cnn, module or gaussian; policy.type is "
+                f"{policy.type}"
             )
         if isinstance(critic, Critic) and (critic.type in ("exact", "rollout") or critic.target == "q"):
             raise conflict(
@@ -138,11 +156,39 @@ class Training(Part):
             )
         if isinstance(update, Mirror) and not isinstance(policy, AutoPolicy):
             _check_mirror(update, policy)
-        if isinstance(info.data.get("estimator"), SampledAdvantages) and isinstance(update, Mirror | CMPO):
+        if isinstance(info.data.get("estimator"), SampledAdvantages) and isinstance(update, Mirror | CMPO | MPO):
             raise conflict(
                 f"update.type is {update.type}, which needs the advantages of all actions; estimator.type is sampled"
             )
         return update
+
+    @field_validator("search")
+    @classmethod
+    def _draws_actions(cls, search: Any, info: ValidationInfo) -> Any:
+        policy = info.data.get("policy")
+        if not isinstance(policy, Gaussian):
+            for name in ("actions", "proposal_scale"):
+                if policy is not None and (value := getattr(search, name)) is not None:
+                    raise conflict(
+                        f"search.{name} is {value}, which only policy.type gaussian uses; policy.type is {policy.type}"
+                    )
+            return search
+        if search.depth == "adaptive" or search.stop_at is not None:
+            name = "depth" if search.depth == "adaptive" else "stop_at"
+            raise conflict(
+                f"search.{name} is {getattr(search, name)}, which needs a bound over all actions; with policy.type "
+                "gaussian a lookahead sees the drawn ones only: take a fixed depth without stop_at",
+                f"search.{name}",
+                "policy.type",
+            )
+        if isinstance(search, SampledSection) or getattr(search, "samples", None) is not None:
+            raise conflict(
+                "search.kind is sampled or has samples, which are of outcomes; with policy.type gaussian each drawn "
+                "action has one outcome: take auto, expectimax or mcts",
+                "search.kind",
+                "policy.type",
+            )
+        return search
 
     @field_validator("model", "replay")
     @classmethod
@@ -168,6 +214,16 @@ class Training(Part):
                 f"{model.type} is learned and proves none: {way_out}",
                 "search.stop_at",
                 "model.type",
+            )
+        return model
+
+    @field_validator("model")
+    @classmethod
+    def _takes_vectors(cls, model: Any, info: ValidationInfo) -> Any:
+        if isinstance(info.data.get("policy"), Gaussian) and isinstance(model, Counts | Latent):
+            raise conflict(
+                f"model.type is {model.type}, which learns what follows numbered actions; with policy.type gaussian it "
+                "must be auto, ensemble or a model of your own"
             )
         return model
 
@@ -233,13 +289,14 @@ class Training(Part):
         return replay
 
 
-MOVES: dict[type[Part], tuple[type[Table | Network], ...]] = {
+MOVES: dict[type[Part], tuple[type[Table | Network | Gaussian], ...]] = {
     Projected: (Simplex,),
     SoftmaxGradient: (Softmax,),
     Mirror: (Softmax, Simplex, MLP, CNN, OwnModule),
-    Gradient: (MLP, CNN, OwnModule),
-    PPO: (MLP, CNN, OwnModule),
+    Gradient: (MLP, CNN, OwnModule, Gaussian),
+    PPO: (MLP, CNN, OwnModule, Gaussian),
     CMPO: (MLP, CNN, OwnModule),
+    MPO: (Gaussian,),
 }
 """The policies that each update can move."""
 
@@ -274,11 +331,11 @@ def _with_types(data: dict[str, Any]) -> dict[str, Any]:
     horizons: list[type[Part]] = [FixedHorizon, GeometricHorizon, *[StepsHorizon] * sampled]
     if isinstance(rollout := data.get("rollout"), dict):
         data = data | {"rollout": _with_type(rollout, "horizon", [StepsHorizon] * replayed + horizons)}
-    data = _with_type(data, "policy", [Softmax, MLP, CNN, OwnModule])
+    data = _with_type(data, "policy", [Softmax, MLP, CNN, OwnModule, Gaussian])
     policy = _type(data, "policy")
     tables, networks = policy not in NETWORKS, policy not in TABLES
     for_tables: list[type[Part]] = [Projected if policy == "simplex" else Mirror]
-    for_networks: list[type[Part]] = [PPO] if sampled else [CMPO, PPO]
+    for_networks: list[type[Part]] = [PPO] if sampled else [MPO if policy == "gaussian" else CMPO, PPO]
     critic = data.get("critic") or {}
     if policy in NETWORKS and isinstance(critic, dict):  # also where states are numbered
         data = data | {"critic": {"type": "network"} | critic}

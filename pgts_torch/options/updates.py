@@ -10,7 +10,8 @@ StateWeight = Literal["occupancy", "visits", "uniform"]
 
 
 class AutoUpdate(Part):
-    """By the policy: mirror for softmax, projected for simplex, cmpo for networks; ppo with sampled advantages."""
+    """By the policy: mirror for softmax, projected for simplex, cmpo for networks, mpo for gaussian; ppo with sampled
+    advantages."""
 
     type: Literal["auto"] = "auto"
 
@@ -106,6 +107,26 @@ class CMPO(Epochs):
     """The largest change of log pi(a|s) in one iteration, before normalisation."""
 
 
+class MPO(Epochs):
+    """Weighted regression on drawn actions within a trust region (Abdolmaleki et al. 2018); needs policy.type gaussian
+    and a lookahead. Its steps do not depend on the scale of rewards."""
+
+    type: Literal["mpo"] = "mpo"
+
+    learning_rate: ScheduledPositive = 1e-3
+    """Step size of the optimizer."""
+
+    kl: Positive = 0.5
+    """By how much the improved policy over drawn actions may differ from the old one, in nats; it decides the
+    temperature."""
+
+    kl_mean: Positive = 0.1
+    """How far the mean may move in one iteration, in nats."""
+
+    kl_std: Positive = 0.01
+    """How far each standard deviation may move in one iteration, in nats."""
+
+
 class Mirror(Part):
     """Mirror ascent with the KL divergence; for all policies. The steps of tables do not depend on the scale of the
     rewards."""
@@ -144,4 +165,4 @@ class Mirror(Part):
     """States in each step."""
 
 
-Update = Projected | SoftmaxGradient | Mirror | Gradient | PPO | CMPO
+Update = Projected | SoftmaxGradient | Mirror | Gradient | PPO | CMPO | MPO

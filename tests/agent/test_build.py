@@ -132,7 +132,7 @@ def test_the_environment_chooses_what_is_left_out():
     assert chosen(given(policy="mlp", estimator="sampled", depth=0), WORLD).update == PPO()
     assert chosen(given(), WORLD).critic == TabularValues()
     with pytest.raises(
-        PgtsError, match=r"update.type is ppo, which needs policy.type mlp, cnn or module; policy.type is softmax"
+        PgtsError, match=r"update.type is ppo, which needs policy.type mlp, cnn, module or gaussian; policy.type is"
     ):
         chosen(given(update="ppo"), WORLD)
 

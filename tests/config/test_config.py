@@ -180,6 +180,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "the id of a Gymnasium environment": st.from_regex(r"[A-Za-z0-9_.:/-]{1,20}", fullmatch=True),
     "letters, digits, '.', '_', '-', at most 100": st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", fullmatch=True),
     "cpu, cuda or cuda:N": st.sampled_from(["cpu", "cuda", "cuda:3"]),
+    "a number >= 1 or null": st.none() | st.floats(1, allow_infinity=False),
     "a number > 0 or null": st.none() | st.floats(0, exclude_min=True, allow_infinity=False),
     "a number > 0 or never": st.just("never") | st.floats(0, exclude_min=True, allow_infinity=False),
     "a number > 0 or never or null": st.sampled_from([None, "never", 0.25]),
@@ -211,6 +212,7 @@ UPDATES = {
     "cnn": ["auto", "gradient", "ppo", "mirror", "cmpo"],
     "nature_cnn": ["auto", "gradient", "ppo", "mirror", "cmpo"],
     "module": ["auto", "gradient", "ppo", "mirror", "cmpo"],
+    "gaussian": ["auto", "gradient", "ppo", "mpo"],
 }
 """What can move a policy of each type."""
 
@@ -223,10 +225,13 @@ def configurations(draw: st.DrawFn) -> Config:
     policy = types["policy.type"]
     is_table = policy in ("softmax", "simplex")
     types["update.type"] = draw(st.sampled_from(UPDATES[policy]))
-    networks = ["own", "mlp"] if is_table else ["own", "shared"] + [policy] * (policy != "auto")
+    networks = ["own", "mlp"] if is_table else ["own", "shared"] + [policy] * (policy not in ("auto", "gaussian"))
     types["critic.network.type"] = draw(st.sampled_from(networks))
-    types["critic.type"] = "network" if policy.endswith("cnn") else types["critic.type"]
-    needs_all = is_table or types["update.type"] in ("mirror", "cmpo")
+    types["critic.type"] = "network" if policy.endswith("cnn") or policy == "gaussian" else types["critic.type"]
+    if policy == "gaussian":
+        types["search.kind"] = draw(st.sampled_from(["auto", "expectimax", "mcts"]))
+        types["model.type"] = draw(st.sampled_from(["auto", "ensemble", "own"]))
+    needs_all = is_table or types["update.type"] in ("mirror", "cmpo", "mpo")
     types["estimator.type"] = "lookahead" if needs_all else types["estimator.type"]
     if types["estimator.type"] == "sampled" and types["critic.type"] in ("exact", "rollout"):
         types["critic.type"] = "network"
@@ -242,6 +247,17 @@ def configurations(draw: st.DrawFn) -> Config:
         given |= dict.fromkeys(ignored)
     if given["eval.every"] is None:
         given |= {"eval.stop_at_return": None, "eval.keep_best": False}
+    if policy == "gaussian":
+        given |= {
+            "search.depth": 3,
+            "search.stop_at": None,
+            "critic.target": "v",
+            "policy.std": 0.5,
+            "policy.min_std": 0.25,
+        }
+        given |= {"search.samples": None} if types["search.kind"] == "mcts" else {}
+    else:
+        given |= {"search.actions": None, "search.proposal_scale": None}
     if given["search.depth"] != "adaptive":
         given["search.max_depth"] = given["search.tolerance"] = None
     if types["critic.type"] == "network" and (given["critic.polyak"] < 1 or given["critic.target_period"] > 1):
@@ -338,7 +354,11 @@ def _leaves(data: dict[str, Any], prefix: str = "") -> list[str]:
 
 NUMBERED = TabularWorld(EnvSource.of("pgts/Ladder-v0").make(1), ladder())
 PICTURED = SimpleNamespace(
-    perceived_space=spaces.Box(0, 255, (7, 7, 3), np.uint8), num_actions=2, device=torch.device("cpu"), model=None
+    perceived_space=spaces.Box(0, 255, (7, 7, 3), np.uint8),
+    num_actions=2,
+    action_size=2,
+    device=torch.device("cpu"),
+    model=None,
 )
 """The world of a numbered environment, and as much of one with images as parts ask for."""
 
@@ -374,6 +394,15 @@ PARTS = [
     ["--model.type", "latent", "--model.network.type", "cnn"],
     ["--model.type", "latent", "--model.network.type", "nature_cnn"],
     ["--model.members", "2", "--replay.length", "3"],
+    ["--policy.type", "gaussian", "--search.actions", "4"],
+    ["--policy.type", "gaussian", "--policy.network.type", "mlp", "--update.type", "mpo"],
+    ["--policy", "{type: gaussian, network: cnn, std: 0.5}", "--update", "{kl: 0.2}"],
+    [
+        "--policy",
+        "{type: gaussian, network: {type: nature_cnn, kernel_size: 2, stride: 1}}",
+        "--update.type",
+        "gradient",
+    ],
 ]
 """Command lines that together name every type there is."""
 
@@ -381,11 +410,11 @@ PARTS = [
 def made(arguments: list[str]) -> tuple[Policy, Critic, Update]:
     """What the library makes of a configuration."""
     config = load(None, arguments)
-    world: Any = PICTURED if config.policy.type.endswith("cnn") else NUMBERED
+    world: Any = PICTURED if config.policy.type.endswith("cnn") or config.policy.type == "gaussian" else NUMBERED
     options = build.chosen(read(config.arguments()), world)
     policy = build.make_policy(options.policy, world, seed=0)
     critic = build.make_critic(options.critic, world, policy, options.estimator, seed=0)
-    build.make_search(options.search, NUMBERED)
+    build.make_search(options.search, NUMBERED.model)
     return policy, critic, build.make_update(options.update, policy)
 
 
@@ -394,7 +423,8 @@ def test_the_library_builds_what_is_configured(arguments: list[str]) -> None:
     policy, critic, update = made(arguments)
     config = load(None, arguments)
     assert critic.target == getattr(config.critic, "target", "v")
-    assert policy.options == config.policy or config.policy.type == "auto"
+    network = getattr(config.policy, "network", config.policy)
+    assert policy.options == config.policy or network.type == "auto"
     update.check(policy)
 
 

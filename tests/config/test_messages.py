@@ -109,15 +109,15 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ("update: {step_size: 0}", f"update.step_size is 0; it must be a number > 0, {SCHEDULE} or null"),
         (
             "update: {type: adam}",
-            "update.type is 'adam'; it must be auto, cmpo, gradient, mirror, ppo, projected or softmax",
+            "update.type is 'adam'; it must be auto, cmpo, gradient, mirror, mpo, ppo, projected or softmax",
         ),
         (
             "policy: {type: resnet}",
-            "policy.type is 'resnet'; it must be auto, cnn, mlp, module, nature_cnn, simplex or softmax",
+            "policy.type is 'resnet'; it must be auto, cnn, gaussian, mlp, module, nature_cnn, simplex or softmax",
         ),
         (
             "policy: resnet",
-            "policy.type is 'resnet'; it must be auto, cnn, mlp, module, nature_cnn, simplex or softmax",
+            "policy.type is 'resnet'; it must be auto, cnn, gaussian, mlp, module, nature_cnn, simplex or softmax",
         ),
         ("policy: {type: mlp, hidden: 64}", f"policy.hidden is 64; it must be {SIZES}"),
         ("policy: {type: mlp, hidden: [64, 0]}", f"policy.hidden holds 0; it must be {SIZES}"),
@@ -187,7 +187,7 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ),
         (
             "{policy: {type: softmax}, search: {depth: 0}, estimator: {type: sampled}}",
-            "estimator.type is sampled, which needs policy.type mlp, cnn or module; policy.type is softmax",
+            "estimator.type is sampled, which needs policy.type mlp, cnn, module or gaussian; policy.type is softmax",
         ),
         (
             "{policy: {type: mlp}, search: {depth: 0}, estimator: {type: sampled}, update: {type: mirror}}",
@@ -195,7 +195,7 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ),
         (
             "{policy: {type: softmax}, update: {type: ppo}}",
-            "update.type is ppo, which needs policy.type mlp, cnn or module; policy.type is softmax",
+            "update.type is ppo, which needs policy.type mlp, cnn, module or gaussian; policy.type is softmax",
         ),
         (
             "{policy: {type: mlp}, search: {depth: 0}, estimator: {type: sampled}, critic: {target: q}}",
