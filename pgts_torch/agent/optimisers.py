@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Literal, final
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -259,7 +260,7 @@ def minibatches(
     if share.ranks.size > 1:
         order_N = order_N.cpu()
         own_N = (order_N >= share.first) & (order_N < share.first + len(columns[0]))
-        own_counts = [int(piece.sum()) for piece in own_N.split(size)]
+        own_counts = np.add.reduceat(own_N.numpy(), np.arange(0, share.total, size), dtype=np.int64).tolist()
         order_N = order_N[own_N] - share.first
     rows = zip(*(column[order_N.to(column.device)].split(own_counts) for column in columns), strict=True)
     return zip(counts, rows, strict=True)
