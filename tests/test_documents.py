@@ -7,6 +7,8 @@ import importlib
 import io
 import re
 import shlex
+import sys
+import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -37,7 +39,8 @@ def blocks(page: str) -> list[Block]:
 
 def printed(page: list[Block], *, long: bool) -> Iterator[tuple[str, str]]:
     """What the Python of a page prints, and what the page says, block by block; one namespace for all."""
-    names: dict[str, object] = {}
+    names = vars(module := types.ModuleType("page"))
+    sys.modules["page"] = module  # where classes of the page are found by their names
     for block, after in zip(page, [*page[1:], Block("", "", False)], strict=True):
         if block.language == "python" and (long or not block.is_long):
             out = io.StringIO()

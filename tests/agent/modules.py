@@ -18,6 +18,8 @@ class Plain(nn.Module):
         super().__init__()
         self.inputs = nn.LazyLinear(width)
         self.outputs = nn.Linear(width, num_outputs)
+        self.outputs.weight.data.mul_(0.01)  # so that a policy is nearly uniform at first
+        nn.init.zeros_(self.outputs.bias)
         self.register_buffer("shift", torch.full((width,), 0.5, dtype=torch.float64))
         self.register_buffer("order", torch.arange(width).flip(0))
         self.register_buffer("mask", torch.full((width,), -math.inf), persistent=False)
@@ -94,6 +96,8 @@ class Wrong(nn.Module):
             self.requires_grad_(False)
         if how == "complex weights":
             self.more = nn.Parameter(torch.zeros(2, dtype=torch.complex64))
+        if how == "numbers on no device":
+            self.to("meta")
         if how == "infinite buffer":
             self.register_buffer("mask", torch.tensor(-math.inf))
         if how == "cannot be copied":

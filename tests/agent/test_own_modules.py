@@ -12,6 +12,7 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch import PGTS
+from pgts_torch.agent.components import components
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.iteration import Batch
@@ -21,7 +22,9 @@ from pgts_torch.config import load
 from pgts_torch.errors import Failed, NotFinite, PgtsError
 from pgts_torch.options import MLP, Gradient, NetworkValues, OwnModule
 from pgts_torch.seeding import stream
+from tests.agent.kinds import CELLS, KINDS
 from tests.agent.modules import MAKES_NONE, Attention, Features, Forgetful, Plain, Recurrent, Wrong, deep, makes_nothing
+from tests.agent.test_spaces import seen
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -73,6 +76,22 @@ def test_its_factory_is_given_the_space_of_its_inputs_and_a_call_an_input_for_ea
     module = net.trunk.layers[0].module
     assert (module.image.in_channels, module.number.in_features) == (2, 4)
     torch.testing.assert_close(net.outputs(row_ND), module(image_N, number_N).detach(), atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_given_every_kind_of_observation_with_images_as_such_and_all_else_in_its_shape(kind):
+    space, observe, *_ = KINDS[kind]
+    observations = seen(space)
+    row_N = torch.stack([observations.encode(observe(cell)) for cell in range(CELLS)])
+    net = network(Plain, observations.space)
+    assert len(net.outputs(row_N).unique(dim=0)) == CELLS
+    shapes = [(part.n,) if isinstance(part, spaces.Discrete) else part.shape for part in components(observations.space)]
+    images = [shape[-1:] + shape[:-1] for shape in shapes if len(shape) == 3]
+    found = net.trunk.encoder.shapes
+    assert len(found) == len(shapes)
+    assert [shape for shape in found if len(shape) == 3 and "frame" not in kind] == images
+    if kind in ("a board", "four dimensions", "bits in two dimensions"):
+        assert found == shapes
 
 
 def test_tied_frozen_and_unused_weights_are_trained_frozen_and_left_alone():
@@ -144,6 +163,7 @@ WRONG: dict[str, str] = {
     "no weights": "has no weights that are trained",
     "complex weights": "has complex numbers in more",
     "infinite buffer": "holds mask, which is not finite; register it as a buffer with persistent=False",
+    "numbers on no device": "cannot be moved to the CPU in float32 and copied: NotImplementedError",
     "cannot be copied": "cannot be moved .* and copied",
     "fails when made": "which cannot be made: RuntimeError: no such layer",
     "fails": r"failed with inputs of the shape \(5, 3\): RuntimeError: mat1",

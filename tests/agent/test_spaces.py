@@ -29,6 +29,7 @@ SHORT: dict[str, Any] = {"num_envs": 2, "horizon": {"type": "fixed", "length": 4
 NETWORKS: dict[str, dict[str, Any]] = {
     "mlp": {"type": "mlp", "hidden": [8], "normalize": False},
     "cnn": {"type": "cnn", "channels": [4, 4], "hidden": [8]},
+    "module": {"type": "module", "make": "tests.agent.modules:Plain"},
 }
 SEARCHES: dict[str, dict[str, Any]] = {
     "lookahead": SHORT | {"depth": 1},
@@ -100,8 +101,8 @@ def cases(short: bool) -> Iterator[tuple[str, str, str]]:
     short: each kind once, so that all networks come with both; a learned model with typical kinds alone.
     """
     for number, (kind, (_, _, policies, learned)) in enumerate(KINDS.items()):
-        given = [*itertools.product([kind], policies, SEARCHES)]
-        yield from [given[number % len(given)]] if short else given
+        given = [*itertools.product([kind], [*policies, "module"], SEARCHES)]
+        yield from [given[(number + 2) % len(given)]] if short else given
         if learned and (kind in TYPICAL or not short):
             yield kind, "auto" if learned == "counts" else "mlp", learned
 
@@ -124,7 +125,7 @@ def test_each_kind_trains_is_saved_loaded_evaluated_and_resumed_with_the_same_bi
     first = training.policy.state_dict()
     training.learn(8 if search in SEARCHES else 80)
     training.save(tmp_path / "model.pt")
-    loaded = PGTS.load(tmp_path / "model.pt", env=env_of(kind))
+    loaded = PGTS.load(tmp_path / "model.pt", env=env_of(kind), trust_imports=True)
     training.iterate()
     loaded.iterate()
     assert same_values(training.state_dict(), loaded.state_dict())

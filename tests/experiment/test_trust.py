@@ -137,6 +137,19 @@ def test_a_model_of_the_callers_own_is_named_in_a_configuration_and_imported_onl
     sys.modules.pop("models_of_mine", None)
 
 
+def test_a_network_of_the_callers_own_of_a_run_is_imported_only_where_it_is_trusted(here, capsys):
+    (here / "nets_of_mine.py").write_text("from tests.agent.modules import Plain\nclass Net(Plain):\n    pass\n")
+    for part in ("policy", "critic"):
+        main(["train", *SHORT, f"--run.dir={part}", f"--{part}", "nets_of_mine:Net"])
+        sys.modules.pop("nets_of_mine", None)
+        for command in (["train", "--resume", part], ["evaluate", part]):
+            assert main(command) == 2
+            assert f"names 'nets_of_mine:Net' as its {part}" in capsys.readouterr().err
+        assert "nets_of_mine" not in sys.modules
+        assert main(["evaluate", part, "--trust-imports", "--episodes=1"]) == 0
+        sys.modules.pop("nets_of_mine", None)
+
+
 def test_a_model_of_the_callers_own_takes_arguments(here, tmp_path):
     (here / "models_of_mine.py").write_text(OWN)
     (here / "own.yaml").write_text(
