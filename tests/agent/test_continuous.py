@@ -114,6 +114,12 @@ CASES = {
     "gradient": ("Pendulum-v1", SMALL | {"depth": 0, "update": "gradient", "critic": {"network": "shared"}}),
     "ppo": ("Pendulum-v1", SMALL | {"update": "ppo"}),
     "sampled": ("Pendulum-v1", SMALL | {"depth": 0, "actions": None, "estimator": "sampled"}),
+    "ensemble": (
+        "Pendulum-v1",
+        {"policy": "gaussian", "depth": 1, "actions": 3, "horizon": {"type": "steps", "first": 40, "length": 7}}
+        | {"model": {"type": "ensemble", "members": 2, "hidden": [8], "first_updates": 5}}
+        | {"replay": {"type": "uniform", "starts": 4, "length": 5, "updates_per_step": 0.05}},
+    ),
     "replay": (
         "Pendulum-v1",
         {"policy": "gaussian", "depth": 0, "actions": 3, "horizon": {"type": "steps", "first": 30, "length": 7}}
@@ -234,6 +240,16 @@ def test_steps_are_checked_against_a_simulator_of_vectors():
     wrong.action_N[0] += 1
     assert model.world.model.outcome_of(wrong)[0] == -1
     assert "under action [" in model.world.model.contradiction(wrong)
+
+
+@pytest.mark.parametrize("env", ["MountainCarContinuous-v0", "InvertedPendulum-v5"])
+def test_known_environments_are_simulated_bit_for_bit(env):
+    if env == "InvertedPendulum-v5":
+        pytest.importorskip("mujoco")
+    model = PGTS(env, **SMALL | {"depth": 0, "horizon": {"type": "fixed", "length": 5}})
+    happened = _happened(model.iterate().experience)
+    assert (model.world.model.outcome_of(happened) == 0).all()
+    assert len(happened.state_N) >= 4  # a pendulum may fall soon
 
 
 def _happened(experience):

@@ -1,0 +1,127 @@
+"""Continuous actions: how the lookahead over K drawn actions tends to that over all, and learning beside PPO and SAC.
+
+    python benchmarks/continuous.py draws
+    python benchmarks/continuous.py learning --env Pendulum-v1 --seeds 5 --steps 5000
+
+`draws`: on the double integrator, whose values have a closed form, by how much max_k q falls short of max_a q, and how
+far sum_k pi_hat q is from E_pi q: mean over states (bias) and standard deviation (spread).
+`learning`: the mean return of ten greedy episodes after so many environment steps, of this package and of PPO and SAC
+of Stable-Baselines3 with their defaults, seed by seed, with the CPU seconds of the training.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from pgts_torch import PGTS
+from pgts_torch.agent.evaluate import Evaluator
+from pgts_torch.agent.gaussian import GaussianPolicy, MixtureProposal
+from pgts_torch.models.linear import LinearQuadratic
+
+GAMMA, STATES = 0.9, 500
+SIMULATED: dict[str, Any] = {"depth": 0, "num_envs": 4, "horizon": {"type": "fixed", "length": 250}}
+OURS: dict[str, dict[str, Any]] = {
+    "Pendulum-v1": {"depth": 0, "replay": "uniform"},
+    "MountainCarContinuous-v0": {"depth": 0, "model": "ensemble"},
+    "InvertedPendulum-v5": {"depth": 0, "model": "ensemble"},
+    "Hopper-v5": SIMULATED,
+    "HalfCheetah-v5": SIMULATED,
+}
+"""The settings of this package, by environment; all others are the defaults."""
+
+
+class _Observed:
+    """The states of the integrator as observations."""
+
+    def __init__(self, model: LinearQuadratic) -> None:
+        self.model = model
+
+    def observe(self, state_N: torch.Tensor) -> torch.Tensor:
+        return self.model.states(state_N).float()
+
+
+def draws(counts: list[int]) -> None:
+    """Print a row for each K."""
+    model = LinearQuadratic.double_integrator(gamma=GAMMA)
+    policy = GaussianPolicy(spaces.Box(-np.inf, np.inf, (2,)), 1)
+    P_DD = model.optimal()
+    generator = torch.Generator().manual_seed(0)
+    state_ND = torch.randn(STATES, 2, generator=generator, dtype=torch.float64)
+    state_N, normals = model.number(state_ND), policy.normals(state_ND.float())
+    price = float(model.N_XX + GAMMA * model.G_DX.T @ P_DD @ model.G_DX)
+    mean_N = model.q(P_DD, state_ND, normals.mean_NX) - price * normals.std_NX[:, 0].double().square()
+    best_N = model.v(P_DD, state_ND)
+    print("    K   short of the maximum: mean, largest   mean under pi: bias, spread")
+    for count in counts:
+        proposal = MixtureProposal(_Observed(model), policy, count, 2.0, torch.tensor([1]))  # type: ignore[arg-type]
+        action_NKX, prob_NK = proposal(state_N)
+        q_N = model.q(P_DD, state_ND.repeat_interleave(count, 0), action_NKX.flatten(0, 1))
+        q_NK = q_N.view(-1, count)
+        short_N, off_N = best_N - q_NK.amax(-1), (prob_NK.double() * q_NK).sum(-1) - mean_N
+        print(f"{count:5}{short_N.mean():25.5f}{short_N.max():9.5f}{off_N.mean():24.5f}{off_N.std():9.5f}")
+
+
+def ours(env: str, steps: int, every: int, seed: int) -> Iterator[tuple[int, float]]:
+    model = PGTS(env, policy="gaussian", seed=seed, **OURS.get(env, SIMULATED))
+    with Evaluator(10) as score:
+        while model.num_env_steps < steps:
+            model.learn(min(model.num_env_steps - model.num_env_steps % every + every, steps))
+            yield model.num_env_steps, score(model).episodic_return.mean
+
+
+def stable_baselines(name: str) -> Callable[[str, int, int, int], Iterator[tuple[int, float]]]:
+    def run(env: str, steps: int, every: int, seed: int) -> Iterator[tuple[int, float]]:
+        import stable_baselines3
+        from stable_baselines3.common.evaluation import evaluate_policy
+
+        model = getattr(stable_baselines3, name)("MlpPolicy", gymnasium.make(env), seed=seed, device="cpu")
+        judged = stable_baselines3.common.monitor.Monitor(gymnasium.make(env))
+        while model.num_timesteps < steps:
+            model.learn(min(every, steps - model.num_timesteps), reset_num_timesteps=False)
+            judged.reset(seed=0)
+            yield model.num_timesteps, float(evaluate_policy(model, judged, n_eval_episodes=10)[0])
+
+    return run
+
+
+LEARNERS = {"pgts": ours, "PPO": stable_baselines("PPO"), "SAC": stable_baselines("SAC")}
+
+
+def learning(args: argparse.Namespace) -> None:
+    """Print a row for each learner and seed, the return at each multiple of `every` steps."""
+    for name in args.learners:
+        for seed in range(args.seeds):
+            begin, cells = time.process_time(), []
+            for steps, mean in LEARNERS[name](args.env, args.steps, args.every, seed):
+                cells.append(f"{steps}: {mean:.0f}")
+            print(
+                f"{args.env} {name:5} seed {seed}  {'  '.join(cells)}  ({time.process_time() - begin:.0f} s)",
+                flush=True,
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["draws", "learning"])
+    parser.add_argument("--counts", type=int, nargs="+", default=[2, 4, 8, 16, 32, 64, 128])
+    parser.add_argument("--env", default="Pendulum-v1", choices=list(OURS))
+    parser.add_argument("--learners", nargs="+", default=list(LEARNERS), choices=list(LEARNERS))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=5000)
+    parser.add_argument("--every", type=int, default=1000, help="environment steps between evaluations")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    if args.what == "draws":
+        draws(args.counts)
+    else:
+        learning(args)
+
+
+if __name__ == "__main__":
+    main()
