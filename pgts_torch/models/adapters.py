@@ -55,19 +55,36 @@ _SEQUENCES = list, tuple, deque
 
 
 def same_content(one: Any, other: Any) -> bool:
-    """Whether two values hold the same, however numbers are typed."""
-    if isinstance(one, np.ndarray | np.generic) or isinstance(other, np.ndarray | np.generic):
-        first, second = np.asarray(one), np.asarray(other)
-        if first.dtype.hasobject or second.dtype.hasobject:
-            return first.shape == second.shape and all(map(same_content, first.ravel(), second.ravel()))
-        return first.shape == second.shape and bool(((first == second) | ((first != first) & (second != second))).all())
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(same_content(one[name], other[name]) for name in one)
-    if isinstance(one, _SEQUENCES) and isinstance(other, _SEQUENCES):
-        return len(one) == len(other) and all(map(same_content, one, other))
-    if type(one) is type(other) and type(one).__eq__ is object.__eq__ and hasattr(one, "__dict__"):
-        return same_content(vars(one), vars(other))
-    return bool(one == other) or (one != one and other != other)
+    """Whether two values hold the same, however numbers are typed. Objects may lead back to themselves, as cars to a
+    road with all cars: a pair that was met before is not looked at again."""
+    met, left = dict[tuple[int, int], Any](), [(one, other)]
+    while left:
+        first, second = left.pop()
+        if (pair := (id(first), id(second))) in met:
+            continue
+        if isinstance(first, np.ndarray | np.generic) or isinstance(second, np.ndarray | np.generic):
+            first, second = np.asarray(first), np.asarray(second)
+            if first.shape != second.shape:
+                return False
+            if first.dtype.hasobject or second.dtype.hasobject:
+                left += zip(first.ravel(), second.ravel(), strict=True)
+            elif not ((first == second) | ((first != first) & (second != second))).all():
+                return False
+        elif isinstance(first, dict) and isinstance(second, dict):
+            if first.keys() != second.keys():
+                return False
+            met[pair] = first, second
+            left += [(first[name], second[name]) for name in first]
+        elif isinstance(first, _SEQUENCES) and isinstance(second, _SEQUENCES):
+            if len(first) != len(second):
+                return False
+            met[pair] = first, second
+            left += zip(first, second, strict=True)
+        elif type(first) is type(second) and type(first).__eq__ is object.__eq__ and hasattr(first, "__dict__"):
+            left.append((vars(first), vars(second)))
+        elif not (first == second or (first != first and second != second)):
+            return False
+    return True
 
 
 @final

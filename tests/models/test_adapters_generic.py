@@ -12,6 +12,7 @@ from gymnasium import spaces
 from pgts_torch import PGTS
 from pgts_torch.errors import MissingModel, ModelMismatch, PgtsError
 from pgts_torch.models import SimulatorModel, check_model
+from pgts_torch.models.adapters import same_content
 from pgts_torch.models.adapters_generic import PickledAttributes
 from tests.models.corridors import Bare, Corridor
 
@@ -81,6 +82,36 @@ def test_parts_that_refer_to_each_other_to_the_environment_and_to_its_generator_
     assert other.board.space is other.action_space
     assert other.late[0] is other.board.cells is not one.board.cells
     assert PGTS(Parts, **SHORT).iterate().model_calls > 0
+
+
+class Road:
+    """A road, whose cars know it and each other."""
+
+    def __init__(self, *speeds):
+        self.cars = [Car(self, speed) for speed in speeds]
+        for car, ahead in itertools.pairwise(self.cars):
+            car.ahead, ahead.behind = ahead, [car]
+
+
+class Car:
+    def __init__(self, road, speed):
+        self.road, self.speed, self.ahead, self.behind = road, speed, None, []
+
+
+def test_objects_that_lead_back_to_themselves_are_compared():
+    assert same_content(Road(*range(2000)), Road(*map(np.float64, range(2000))))
+    assert not same_content(Road(1, 2, 3), Road(1, 2, 4))
+    assert not same_content(Road(1, 2), Road(1, 2, 3))
+    ring: list = [1.0]
+    longer: list = [1.0]
+    ring.append(ring)
+    longer.append([2.0, longer])
+    assert same_content(ring, [1, (1, ring)])
+    assert same_content(ring, ring[1])
+    assert not same_content(ring, longer)
+    shared = np.array([ring, None], object)
+    assert same_content([shared, shared], [shared.copy(), np.array([[1, ring], None], object)])
+    assert not same_content(shared, np.array([longer, None], object))
 
 
 def test_its_cost_is_said():
