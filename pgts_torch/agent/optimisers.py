@@ -97,23 +97,23 @@ class Optimiser:
             if self._parameters is not parameters:
                 self._prepare(parameters)
             is_short = self.method == "adam" and len(gradient_D) <= _SHORT
-            total = (self._compiled if is_short and self.compiles else self._move)(gradient_D, norm)
+            loops = is_short and self._compiles(gradient_D.device)
+            total = (self._compiled if loops else self._move)(gradient_D, norm)
             self._readings.check(loss, partial(refuse, "loss", f"the {name} loss"))
             self._readings.check(norm, partial(refuse, "gradient", f"the gradient of the {name} loss"))
             self._readings.check(total, partial(refuse, "gradient", f"the step down the {name} loss"))
             torch._foreach_add_(self._moved, self._pieces)
         return norm
 
-    @property
-    def compiles(self) -> bool:
+    def _compiles(self, device: torch.device) -> bool:
         """Whether compiled loops are used where they save time. No bit of a step depends on it; those of the gradients
         of dense layers do (`dense_steps`)."""
-        return self.num_steps >= _MANY and can_compile(self._step_D.device)
+        return self.num_steps >= _MANY and can_compile(device)
 
     def compiles_all_of(self, parameters: Sequence[Tensor]) -> bool:
         """Whether steps of these parameters are compiled as a whole, with their gradient."""
         is_short = sum(each.numel() for each in parameters) <= _SHORT and parameters[0].dtype == torch.float32
-        return is_short and self.method == "adam" and self.compiles
+        return is_short and self.method == "adam" and self._compiles(parameters[0].device)
 
     def _prepare(self, parameters: Sequence[Tensor]) -> None:
         """Make room for steps of these parameters, which is kept."""

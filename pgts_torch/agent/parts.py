@@ -252,7 +252,8 @@ def _with_learned(
     if isinstance(masks, ActionMasks):
         raise MissingModel(
             f"model is {options.model.type!r}, which does not learn which actions are legal, and {env_name(env)} has "
-            f"{masks.what}: take its simulator (model 'auto'), or depth 0 and the estimator 'sampled'"
+            f"{masks.what}: take its simulator (model 'auto'), or depth 0 and the estimator 'sampled'; or set "
+            "action_masks to 'off', where every action may be taken all the same"
         )
     return learned_world(
         env, options.model, gamma=gamma, action_repeat=repeat, capacity=capacity, seed=seed, masks=masks, **shared

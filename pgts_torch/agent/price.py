@@ -44,7 +44,7 @@ class Price:
     def __str__(self) -> str:
         """In a sentence."""
         about = "up to" if self.is_bound else "about"
-        said = f"an iteration takes {about} {_round(self.calls, 3):,} model calls and {_seconds(self.seconds)}"
+        said = f"an iteration takes {about} {round(_round(self.calls, 3)):,} model calls and {_seconds(self.seconds)}"
         said += f", by {self.search}" * bool(self.search)
         return said + (f"; cheaper: {', '.join(self.advice)}" if self.advice else "")
 

@@ -14,6 +14,7 @@ from pgts_torch.agent import optimisers
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
+from pgts_torch.agent.optimisers import Optimiser
 from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.compiled import torch_only
 from pgts_torch.errors import NotFinite
@@ -176,13 +177,17 @@ def test_ranks_take_the_steps_of_one_process_with_all_rows(calls):
     assert not torch.equal(one, expected)
 
 
-def test_few_steps_large_networks_and_other_layers_are_left_to_torch(calls, monkeypatch):
+def test_few_steps_large_networks_other_layers_and_devices_are_left_to_torch(calls, monkeypatch):
     moved(UPDATES["ppo"](), MLP(hidden=[300, 120]), batch())  # 37,900 weights
     assert calls == []
     policy, update = NetworkPolicy(VECTORS, 4, MLP(hidden=[8]), seed=1), UPDATES["ppo"]()
     policy.network.double()
     assert not update._optimiser.compiles_all_of(policy.network.weights)
     monkeypatch.setattr(optimisers, "_MANY", 7)
+    loaded = Optimiser(learning_rate=1.0, max_grad_norm=None)
+    loaded.load_state_dict({"num_steps": 7, "first_D": torch.zeros(3), "second_D": torch.zeros(3)})
+    assert loaded.compiles_all_of([torch.zeros(3)])
+    assert not loaded.compiles_all_of([torch.zeros(3, device="meta")])  # as on a GPU, where it has taken no step yet
     policy = NetworkPolicy(VECTORS, 4, MLP(hidden=[8]), seed=1)
     for expected in (0, 0, 6):  # steps 1 to 6, 7 to 12 and 13 to 18
         update(policy, batch(), generator=stream(0, "update"))
