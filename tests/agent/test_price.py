@@ -218,3 +218,7 @@ def test_without_a_lookahead_there_is_no_price():
     model = PGTS("CartPole-v1", depth=0, estimator="sampled", policy="mlp", num_envs=2)
     model.learn(model.num_env_steps + 1200)
     assert model.pricing.price is None
+
+
+def test_an_iteration_without_model_calls_is_said_to_have_none():
+    assert str(price.Price(0, 0.014)) == "an iteration takes about 0 model calls and 0.014 s"
