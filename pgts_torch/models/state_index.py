@@ -70,6 +70,8 @@ class StateIndex:
     chosen by its hash, so that rows equal to it are chosen too: when these recur, lookups are resumed, after one call
     that enters the rows that were skipped. A row that got several numbers is then known by the first one.
 
+    count: how many rows there are.
+
     Args:
         num_columns: D.
         dtype: of the rows: floating, where -0.0 equals 0.0, or an integer type.
@@ -98,11 +100,11 @@ class StateIndex:
         self._minus_zero, self._infinity = bits.min if floats else 0, infinity
         # How many rows there were when all were dropped, and how many of them in the table.
         self._expected, self._expected_entered = 0, 0
-        self._count = self._entered = 0
+        self.count = self._entered = 0
         self.clear()
 
     def __len__(self) -> int:
-        return self._count
+        return self.count
 
     @property
     def device(self) -> torch.device:
@@ -121,9 +123,9 @@ class StateIndex:
     @torch.inference_mode(False)
     def clear(self) -> None:
         """Drop all rows and free their memory. The next ones get as much at once."""
-        if self._count:
-            self._expected, self._expected_entered = self._count, self._entered
-        self._count = self._entered = self._looked_up = self._new = 0
+        if self.count:
+            self._expected, self._expected_entered = self.count, self._entered
+        self.count = self._entered = self._looked_up = self._new = 0
         self._merging = self._merge is not False
         self._hold(self._rows.new_empty(0, self._rows.shape[1]))
         self._slots = self._empty_slots(_LEAST_SLOTS)
@@ -141,16 +143,16 @@ class StateIndex:
         if torch.is_inference_mode_enabled():  # what is kept must be ordinary tensors
             with torch.inference_mode(False):
                 return self.number(row_ND)
-        row_ND, N, first = row_ND.detach(), row_ND.shape[0], self._count
+        row_ND, N, first = row_ND.detach(), row_ND.shape[0], self.count
         # All rows are first written behind the known ones, where they can be compared with these and each other: row i
         # is new, with the number `first + i`, unless an equal one is found.
         self._write(row_ND, first)
         if self._merge is False:
-            self._count += N
+            self.count += N
             return torch.arange(first, first + N, device=self.device)
         hash_N = hash_rows(self._bits_RD[first : first + N])
         # At most half of the slots are full even if all these rows are new.
-        needed = 2 * (self._entered + N if self._count else max(N, self._expected_entered))
+        needed = 2 * (self._entered + N if self.count else max(N, self._expected_entered))
         if needed > self._slots.shape[0]:
             self._enter(self._slots[self._slots != _EMPTY], needed)
         sample_bits = 0 if self._merging else _SAMPLE_BITS
@@ -160,7 +162,7 @@ class StateIndex:
             new, looked_up, entered = index_loops().number(*known, *given, first, sample_bits)
         else:
             number_N, new, looked_up, entered = self._numbered(first, hash_N, sample_bits)
-        self._count, self._entered = first + new, self._entered + entered
+        self.count, self._entered = first + new, self._entered + entered
         if self._merge == "auto":
             self._judge(looked_up, entered)
         return number_N
@@ -198,7 +200,7 @@ class StateIndex:
         elif self._looked_up > _PAYS_AGAIN * self._new:
             self._merging = True
             # All rows so far, those that were skipped too; of equal ones the first is entered.
-            self._enter(torch.arange(self._count, device=self.device), 2 * self._count)
+            self._enter(torch.arange(self.count, device=self.device), 2 * self.count)
         self._looked_up = self._new = 0
 
     def _write(self, row_ND: Tensor, first: int) -> None:
@@ -234,7 +236,7 @@ class StateIndex:
         room = self.capacity
         if count > room:
             more = self._rows.new_empty(max(count, 2 * room or self._expected), self._rows.shape[1])
-            more[: self._count] = self._rows[: self._count]
+            more[: self.count] = self._rows[: self.count]
             self._hold(more)
 
     def _hold(self, row_RD: Tensor) -> None:

@@ -104,7 +104,7 @@ class TensorModel(EnumeratingModel, FollowingModel):
 
     @property
     def num_states(self) -> int:  # type: ignore[override]
-        return len(self._index)
+        return self._index.count
 
     def number(self, state_ND: Num[Tensor, "N D"]) -> Int[Tensor, "N"]:
         """The number of each state; new ones get the next numbers.

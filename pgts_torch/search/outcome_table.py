@@ -52,6 +52,7 @@ class OutcomeTable(Table):
         self.prob_RAK, self.discount_RAK = self._column("AK"), self._column("AK")
         self.child_RAK = self._column("AK", dtype=torch.int64)
         self.row_S = torch.empty(0, dtype=torch.int64, device=model.device)
+        self._missing: tuple[Tensor | None, int] = None, 0
         self._seen: tuple[tuple[Tensor, ...], list[np.ndarray]] = (), []
         self.meter: Meter | None = None
 
@@ -70,11 +71,14 @@ class OutcomeTable(Table):
 
     def missing(self, state_N: Int[Tensor, "N"]) -> Int[Tensor, "missing"]:
         """Those of the states that have no row."""
+        if state_N is self._missing[0] and self.num_queried == self._missing[1]:  # found before, of other states
+            return state_N
         self.row_S = with_room(self.row_S, self.model.num_states)
         if pays(self.device, state_N.shape[0]):
             found_N = torch.empty_like(state_N)
             count = _kernels().missing(state_N.numpy(), self.arrays[-1], found_N.numpy())
-            return found_N[:count]
+            self._missing = found_N[:count], self.num_queried
+            return self._missing[0]
         missing_N = self.row_S.index_select(0, state_N) < 0
         return state_N if bool(missing_N.all()) else state_N[missing_N]
 
