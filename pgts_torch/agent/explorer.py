@@ -34,6 +34,11 @@ class Explorer:
         self._steps = 0
 
     @property
+    def learners(self) -> tuple[Critic, Update]:
+        """What it learns by."""
+        return self._critic, self._update
+
+    @property
     def model_calls(self) -> int:
         """For how many (state, action) the model has been queried so far."""
         return self._steps + self.search.model_calls + self._critic.model_calls

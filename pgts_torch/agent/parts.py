@@ -77,6 +77,12 @@ class Parts(NamedTuple):
         explorer = None if self.dyna is None else self.dyna.explorer
         return self.policy if explorer is None else explorer.policy
 
+    def follow(self, num_env_steps: int) -> None:
+        """Tell the number of environment steps to all whose options may be schedules."""
+        explorer = None if self.dyna is None else self.dyna.explorer
+        for part in (self.update, self.critic, *(() if explorer is None else explorer.learners)):
+            part.num_env_steps = num_env_steps
+
 
 def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
     """Make all parts, from the environments to the model check; parts that are given as objects are used as they are.

@@ -169,7 +169,7 @@ class PGTS:
         draws = Draws.of(self.ranks, self.seed, self.num_iterations, self.device)
         calls_before = self._parts.model_calls
         self.pricing.begin()
-        self.update.num_env_steps = self.critic.num_env_steps = self.num_env_steps
+        self._parts.follow(self.num_env_steps)
 
         # Visit states by episodes of pi_k, or of an `Explorer` where the model has optimism: the states where d(s), an
         # estimate of the occupancy d^{pi_k}(s), is positive.

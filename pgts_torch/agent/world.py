@@ -98,7 +98,11 @@ class World:
         """Return one observation of an environment, or rows of them, as the tensor that a policy takes; PgtsError
         unless they are finite and in its observation space."""
         rows = self.observations.encode(observation)
-        return rows if self.legal_of is None else with_legal(rows, self.legal_of(rows))
+        if self.legal_of is None:
+            return rows
+        row_ND = rows.reshape(-1, rows.shape[-1])
+        made_ND = with_legal(row_ND, self.legal_of(row_ND))
+        return made_ND.view(*rows.shape[:-1], made_ND.shape[-1])
 
     def of(self, env: VectorEnv) -> "World":
         """A world without a model for other environments of the same kind; warnings are not repeated in it."""

@@ -90,9 +90,7 @@ def enumerate_sets(
     """
     S, A = mdp.num_states, mdp.num_actions
     check_enumerable(S, A, max_policies=max_policies)
-    if not mdp.outcomes.legal_NA.all():
-        s, a = torch.nonzero(~mdp.outcomes.legal_NA)[0].tolist()
-        raise PgtsError(f"action {a} is not allowed in state {s}; policies are enumerated where all actions are")
+    _check_all_allowed(mdp.outcomes)
     _check_all_end(mdp.outcomes)
     optimum = exact.optimal(mdp)
     slack = _slack(mdp, optimum, tolerance)

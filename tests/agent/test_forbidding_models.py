@@ -74,6 +74,8 @@ def test_its_lookahead_has_the_values_of_the_mdp_without_these_actions_and_predi
     one_hot = torch.eye(6)[:5].numpy()
     assert LEGAL[range(5), training.predict(one_hot)].all()
     assert LEGAL[range(5), training.predict(one_hot, deterministic=False)].all()
+    assert [int(training.predict(one)) for one in one_hot] == training.predict(one_hot).tolist()
+    assert training.predict(one_hot[None]).tolist() == [training.predict(one_hot).tolist()]
     with pytest.raises(PgtsError, match="without action masks"):
         training.predict(one_hot[0], action_mask=[1, 1, 1])
 

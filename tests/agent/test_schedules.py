@@ -103,6 +103,19 @@ def test_the_step_size_of_tables_is_that_of_the_schedule(policy, kind):
     assert not same_bits(scheduled.policy.state_dict(), first)
 
 
+def test_the_policy_that_explores_a_learned_table_follows_the_schedule_too():
+    steps = {"horizon": {"type": "steps", "first": 10, "length": 10}, "num_envs": 1, "replay": {"length": 1}}
+    model = PGTS("pgts/Ladder-v0", model="counts", depth=1, **steps, update=Mirror(step_size="linear(1, 0, 20)"))
+    for _ in range(2):
+        expected = 1 - model.num_env_steps / 20
+        model.iterate()
+        critic, update = model._parts.dyna.explorer.learners
+        assert update is not model.update
+        assert update.step_size == model.update.step_size == pytest.approx(expected)
+        assert critic.num_env_steps == model.critic.num_env_steps
+    assert expected < 1
+
+
 def test_the_clip_of_cmpo_is_that_of_the_schedule():
     given = {"depth": 1, "num_envs": 2, "horizon": {"type": "fixed", "length": 20}}
     model = PGTS("CartPole-v1", **given, update=CMPO(clip="linear(0.5, 0, 1)"))
