@@ -1,5 +1,6 @@
 """The comparison that users ask for, a question each.
 
+    python benchmarks/learning.py atari         does a lookahead pay in games, against PPO at equal cost?
     python benchmarks/learning.py deep_sea      who finds the treasure, and could one have known?
     python benchmarks/learning.py learned       how soon is it solved from steps alone, with a learned model?
     python benchmarks/learning.py learned_images    and from images, with a learned model of them?
@@ -14,7 +15,7 @@ What follows are the options of the script of that name: --help lists them.
 import argparse
 import importlib
 
-QUESTIONS = ("deep_sea", "learned", "learned_images", "simulators", "tasks", "throughput", "variance")
+QUESTIONS = ("atari", "deep_sea", "learned", "learned_images", "simulators", "tasks", "throughput", "variance")
 
 
 def main() -> None:

@@ -130,7 +130,8 @@ def test_the_shipped_configurations_are_those_of_the_paper_and_of_gymnasium() ->
     others = toy_text | {"acrobot", "cartpole", "mountain_car", "door_key"}
     images = {"catch", "minigrid_door_key", "minigrid_empty"}
     learned = {f"learned_{name}" for name in (toy_text | {"acrobot", "cartpole", "deep_sea", "mountain_car"} | images)}
-    emulators = {"mujoco_inverted_pendulum"}
+    games = {f"atari_{name}" for name in ("breakout", "freeway", "montezuma_revenge", "pong")}
+    emulators = games | {"mujoco_inverted_pendulum", "mujoco_hopper"}
     assert set(SHIPPED) == own | others | learned | emulators
     assert own | {"learned_deep_sea"} == {
         name for name, path in SHIPPED.items() if load(path).env.id.startswith("pgts/")

@@ -54,8 +54,10 @@ def few_iterations(folder: Path, *arguments: str, config: Path = ROOT / "configs
 
 
 @pytest.mark.usefixtures("unchecked_shapes")  # other tests check them; here they cost half the time
-@pytest.mark.filterwarnings("ignore:.*has wrappers that are part of the model")
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.filterwarnings("ignore:.*has wrappers that are part of the model", "ignore:.*has random steps")
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long) if name.startswith("atari") else name for name in SHIPPED]
+)
 def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(name, tmp_path, monkeypatch):
     skip_unless_installed(name)
     config = SHIPPED[name]
