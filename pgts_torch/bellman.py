@@ -5,10 +5,13 @@ Both are `Outcomes` and both are backed up by `backup`, so exact values and sear
 On the CPU the loops of `bellman_kernels` do what the torch code says.
 """
 
+import functools
+import sys
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -24,7 +27,9 @@ _LARGE = 2**20
 
 COMPILED_FROM = 256
 """From so many outcomes on, backups are compiled where they can be. For fewer, loading what is compiled takes longer
-than it saves."""
+than it saves, unless it is loaded."""
+
+_KERNELS = "pgts_torch.bellman_kernels"
 
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, int, int]
@@ -101,9 +106,10 @@ class Outcomes:
     def is_compiled(self) -> bool:
         """Whether `backup` and `sweep` are compiled."""
         size, device = self._size_and_device
-        if size < COMPILED_FROM or (size >= _LARGE and torch.get_num_threads() > 1):
+        if size >= _LARGE and torch.get_num_threads() > 1:
             return False
-        return can_compile(device)
+        # Both sum in one order, so that it may depend on what was done before.
+        return size > 0 and (size >= COMPILED_FROM or _KERNELS in sys.modules) and can_compile(device)
 
     @cached_property
     def _size_and_device(self) -> tuple[int, torch.device]:
@@ -187,21 +193,42 @@ def backup(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> Float[Tensor, "N A"]:
     Returns:
         q, in the dtype of `outcomes`; it carries no gradient.
     """
-    return swept_backup(outcomes, v_C, 0)
+    return back_up_steps(((outcomes, 1),), v_C)
 
 
-def swept_backup(outcomes: Outcomes, v_C: Float[Tensor, "C"], sweeps: int) -> Float[Tensor, "N A"]:
-    """`backup` of the values after some sweeps; in one call where it is compiled, and what a call costs counts."""
-    _check_values(outcomes, v_C)
-    if outcomes.is_compiled:
-        arrays = outcomes.arrays
-        q_NA = np.empty((arrays[0].shape[0] // arrays[3], arrays[3]), arrays[0].dtype)
-        _compiled(arrays, v_C, sweeps + 1, q_NA.reshape(-1))
+def back_up_steps(
+    steps: Sequence[tuple[Outcomes, int]], v_C: Float[Tensor, "C"], check: Callable[[], None] | None = None
+) -> Float[Tensor, "N A"]:
+    """`backup` of `sweep` of `sweep` of ...: in compiled loops without the calls of torch between them.
+
+    Args:
+        steps: outcomes, each with how many sweeps, of which the last of all is the backup.
+        check: called before, unless the values are finite beyond doubt.
+    """
+    *lower, (top, times) = steps
+    if top.is_compiled and all(outcomes.is_compiled for outcomes, _ in lower):
+        kernels = _kernels()
+        _check_values(steps[0][0], v_C)
+        v = _array(v_C)
+        if check is not None and not kernels.is_finite(v):
+            check()
+        for outcomes, sweeps in lower:
+            v = kernels.back_up(*outcomes.arrays, v, sweeps, v[:0])
+        arrays = top.arrays
+        q_NA = np.empty((len(arrays[0]) // arrays[3], arrays[3]), arrays[0].dtype)
+        kernels.back_up(*arrays, v, times, q_NA.reshape(-1))
         return torch.from_numpy(q_NA)
+    if check is not None:
+        check()
+    for outcomes, sweeps in lower:
+        v_C = sweep(outcomes, v_C, sweeps) if sweeps > 1 else backup(outcomes, v_C).amax(-1)
+    if lower:
+        return back_up_steps(((top, times),), v_C)
+    _check_values(top, v_C)
     with torch.no_grad():
-        v_C = sweep(outcomes, v_C, sweeps) if sweeps else v_C
-        q = _product(outcomes.weight, outcomes.num_outcomes, v_C, outcomes.reward_NA.reshape(-1))
-        return q.view(outcomes.reward_NA.shape)
+        v_C = sweep(top, v_C, times - 1) if times > 1 else v_C
+        q = _product(top.weight, top.num_outcomes, v_C, top.reward_NA.reshape(-1))
+        return q.view(top.reward_NA.shape)
 
 
 def sweep(
@@ -221,7 +248,8 @@ def sweep(
             reward_NA = reward_N.unsqueeze(1)
         if outcomes.is_compiled and times:
             arrays = outcomes.arrays if action_S is None else _arrays(reward_NA, weight, outcomes.num_outcomes)
-            return torch.from_numpy(_compiled(arrays, v_S, times, None))
+            v = _array(v_S)
+            return torch.from_numpy(_kernels().back_up(*arrays, v, times, v[:0]))
         if times == 0:
             return v_S.clone()
         reward = reward_NA.reshape(-1)
@@ -291,11 +319,13 @@ def _arrays(reward_NA: Float[Tensor, "N A"], weight: Tensor, K: int) -> Arrays:
     )
 
 
-def _compiled(arrays: Arrays, v_C: Float[Tensor, "C"], times: int, q: np.ndarray | None) -> np.ndarray:
-    """The values after `times` >= 1 sweeps, compiled; what the last one maximises is written to q."""
-    from pgts_torch import bellman_kernels
+@functools.cache
+def _kernels() -> Any:
+    from pgts_torch import bellman_kernels  # with which numba is imported
 
-    # Contiguous, because loops are compiled once for each kind of array.
-    v = np.ascontiguousarray((v_C.detach() if v_C.requires_grad else v_C).numpy())
-    values: np.ndarray = bellman_kernels.back_up(*arrays, v, times, v[:0] if q is None else q)
-    return values
+    return bellman_kernels
+
+
+def _array(v_C: Float[Tensor, "C"]) -> np.ndarray:
+    """Contiguous, because loops are compiled once for each kind of array."""
+    return np.ascontiguousarray((v_C.detach() if v_C.requires_grad else v_C).numpy())

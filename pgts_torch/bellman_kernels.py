@@ -6,6 +6,7 @@
 negative ones in every access. They are not checked: the caller has done that.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,11 @@ from pgts_torch.compiled import jit
 _AHEAD = 64
 """How many outcomes ahead a value is fetched from memory."""
 
-_CACHE, _NEAR = 2**20, 2**17
-"""Bytes of values that a cache near the processor holds, and within which values are near each other."""
+_READ_AHEAD = 256
+"""How many outcomes ahead their weights and children are."""
+
+_CACHE, _NEAR, _LINE = 2**20, 2**17, 64
+"""Bytes that a cache near the processor holds, within which values are near each other, and that it reads at once."""
 
 
 @intrinsic
@@ -55,43 +59,63 @@ def is_scattered(child, outcomes, v):  # type: ignore[no-untyped-def]
 
 
 @jit
+def is_finite(v):  # type: ignore[no-untyped-def]
+    """Whether all values are."""
+    off = 0
+    for x in v:
+        off += not math.isfinite(x)
+    return off == 0
+
+
+@jit
 def back_up(reward, weight, child, A, K, v, times, q):  # type: ignore[no-untyped-def]
     """v after `times` sweeps v <- max_a q; with the last of them q is written too, unless it is empty."""
     N, size = len(reward) // A, weight.dtype.type(1)
-    # Values are fetched ahead where a cache near the processor does not hold them, as far as there are outcomes.
-    far = max(0, N - _AHEAD // (A * K) - 1) if is_scattered(child, A * K, v) else 0
-    fours, all_k, none = np.uint64(K // 4 * 4), np.uint64(K), np.uint64(0)
+    # What caches near the processor do not hold is fetched ahead, as far as there are outcomes: the table, which is
+    # read in order, and where they are scattered also the values.
+    far = max(0, N - _AHEAD // (A * K) - 1) if weight.nbytes + child.nbytes > _CACHE else 0
+    scattered = far > 0 and is_scattered(child, A * K, v)
+    fours, rest, outcomes, none = np.uint64(K // 4 * 4), np.uint64(K % 4), np.uint64(A * K), np.uint64(0)
     one, two, three, four = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)  # a signed step is looked after too
-    zero, ahead = size - size, np.uint64(_AHEAD)
+    line, child_line = np.uint64(_LINE // weight.itemsize), np.uint64(_LINE // child.itemsize)
+    zero, ahead, read_ahead = size - size, np.uint64(_AHEAD), np.uint64(_READ_AHEAD)
     old, new = v, np.empty(N, v.dtype)
     for sweep in range(times):
+        writes = len(q) > 0 and sweep == times - 1
         i, m = none, none  # counts outcomes, and pairs of state and action
         for n in range(N):
-            fetches, highest = n < far, -np.inf * size
+            if n < far:
+                _fetch(reward, m + line)
+                for j in range(i + read_ahead, i + read_ahead + outcomes, line):
+                    _fetch(weight, j)
+                for j in range(i + read_ahead, i + read_ahead + outcomes, child_line):
+                    _fetch(child, j)
+                if scattered:
+                    for j in range(i + ahead, i + ahead + outcomes):
+                        _fetch(old, child[j])
+            highest = -np.inf * size
             for _ in range(A):
                 # The order of the sum is that of torch's product in float64: of four at a time, the even and the odd
                 # ones by themselves; then those that are left, one after another.
-                even, odd = zero, zero
-                end, end_of_fours = i + all_k, i + fours
-                while i < end_of_fours:
-                    if fetches:
-                        _fetch(old, child[i + ahead])
-                        _fetch(old, child[i + one + ahead])
-                        _fetch(old, child[i + two + ahead])
-                        _fetch(old, child[i + three + ahead])
-                    even += weight[i] * old[child[i]]
-                    odd += weight[i + one] * old[child[i + one]]
-                    even += weight[i + two] * old[child[i + two]]
-                    odd += weight[i + three] * old[child[i + three]]
-                    i += four
-                total = even + odd
-                while i < end:
-                    if fetches:
-                        _fetch(old, child[i + ahead])
+                total = zero
+                if fours > none:
+                    even, odd, end_of_fours = zero, zero, i + fours
+                    while i < end_of_fours:
+                        even += weight[i] * old[child[i]]
+                        odd += weight[i + one] * old[child[i + one]]
+                        even += weight[i + two] * old[child[i + two]]
+                        odd += weight[i + three] * old[child[i + three]]
+                        i += four
+                    total = even + odd
+                if rest > none:  # a loop would cost twice as much
                     total += weight[i] * old[child[i]]
-                    i += one
+                    if rest > one:
+                        total += weight[i + one] * old[child[i + one]]
+                        if rest > two:
+                            total += weight[i + two] * old[child[i + two]]
+                    i += rest
                 total += reward[m]
-                if len(q) and sweep == times - 1:
+                if writes:
                     q[m] = total
                 m += one
                 if total > highest or total != total:  # what is not a number stays

@@ -109,7 +109,14 @@ def _shared_states() -> dict[str, Any]:
 
 def sample_keys(count: int, *, generator: torch.Generator) -> Int[Tensor, "N"]:
     """Keys, 64 bits each, from a stream."""
-    return torch.randint(-(2**63), 2**63 - 1, (count,), generator=generator, device=generator.device)
+    key_N = torch.empty(count, dtype=torch.int64, device=generator.device)
+    draw_keys(key_N, generator=generator)
+    return key_N
+
+
+def draw_keys(key_N: Int[Tensor, "N"], *, generator: torch.Generator) -> None:
+    """`sample_keys`, written into a tensor."""
+    key_N.random_(-(2**63), 2**63 - 1, generator=generator)
 
 
 def mix(key_N: Int[Tensor, "*#N"], *name_N: Int[Tensor, "*#N"] | int) -> Int[Tensor, "..."]:

@@ -1,7 +1,9 @@
 """Outcomes and the one Bellman kernel."""
 
 import itertools
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +13,7 @@ from jaxtyping import TypeCheckError
 from torch import Tensor
 
 from pgts_torch import compiled
-from pgts_torch.bellman import Outcomes, backup, policy_mean, sweep
+from pgts_torch.bellman import Outcomes, back_up_steps, backup, policy_mean, sweep
 from pgts_torch.seeding import stream
 from tests.support import ZOO, mdps, weights, zoo
 
@@ -140,8 +142,27 @@ def test_what_is_not_a_number_comes_out_as_that(form):
     assert 0 < int(meets_S.sum()) < 20
 
 
-def test_small_tables_stay_with_torch():
-    assert not zoo("ladder").outcomes.is_compiled
+def test_small_tables_stay_with_torch_unless_the_loops_are_loaded(monkeypatch):
+    outcomes = zoo("ladder").outcomes
+    monkeypatch.setattr("pgts_torch.bellman._KERNELS", "as if not loaded")
+    assert not outcomes.is_compiled
+    monkeypatch.setattr("pgts_torch.bellman._KERNELS", "torch")
+    assert outcomes.is_compiled == compiled.can_compile(torch.device("cpu"))
+
+
+@pytest.mark.parametrize("K", [2, 5])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, None])
+def test_steps_are_backups_one_above_the_other_and_say_before_that_values_are_not_finite(K, bad, form):
+    closed, step, top = (some_outcomes(N, 3, K) for N in (12, 12, 7))
+    top = replace(top, child_NAK=top.child_NAK + 5, num_children=12)
+    v_S = torch.randn(12, dtype=torch.float64, generator=stream(0, "v"))
+    if bad is not None:
+        v_S[3] = bad
+    calls = []
+    q_NA = back_up_steps(((closed, 2), (step, 1), (top, 1)), v_S, lambda: calls.append(v_S))
+    expected = backup(top, sweep(step, sweep(closed, v_S, 2), 1))
+    torch.testing.assert_close(q_NA, expected, rtol=0, atol=0, equal_nan=True)
+    assert len(calls) == (bad is not None or form == "torch")
 
 
 @pytest.mark.parametrize("v_S", [torch.ones(6, dtype=torch.float64), torch.ones(5), torch.ones(0).double()])

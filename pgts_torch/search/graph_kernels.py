@@ -12,7 +12,8 @@ import numpy as np
 
 from pgts_torch.compiled import inlined, jit
 from pgts_torch.search.node_kernels import begin, due, expand, open_mass, outcome, select
-from pgts_torch.search.tree_records import NEW, WANTED
+from pgts_torch.search.state_kernels import is_known, learn
+from pgts_torch.search.tree_records import FULL, NEW, NOT_FINITE, TOO_MANY, UNKNOWN, WANTED
 
 
 @inlined
@@ -92,20 +93,21 @@ def _finish(child, node, arm, edge, node_at, rules, nodes, q_BA, mass_BA, mass_N
 @jit
 def search(  # type: ignore[no-untyped-def]
     reward, prob, discount, child, table_row, state, prior, node, arm, edge, slot, lane, rules, root_B, preference,
-    q_BA, mass_BA, wanted, turn, valued_L, mass_N, score_A, class_A, node_at, path,
+    q_BA, mass_BA, wanted, turn, valued_L, mass_N, score_A, class_A, child_C, v_C, learned, row, step, node_at, path,
 ):  # fmt: skip
-    """Go on with all searches. Return 0 where they are over, -1 where the nodes are too many, -2 where there is no room
-    for them, and -3 where a state is unknown.
+    """Go on with all searches. Return 0 where they are over, or why not.
 
-    After that it is to run ahead, and returns how many states are wanted, which are listed in `wanted`; what it has
-    changed in `node`, `arm`, `edge` and `slot` is to be taken back.
+    Where a state is unknown it is then to run ahead, and returns how many states are wanted, which are listed in
+    `wanted`; what it has changed in `node`, `arm`, `edge`, `slot` and `path` is to be taken back.
 
     Args:
-        turn: how many nodes there are, whether a round is under way, the root and its action that are next in it, and
-            whether to run ahead.
+        turn: how many nodes there are, whether a round is under way, the root and its action that are next in it,
+            whether to run ahead, and 1 + the level at which the next simulation has ended already, or 0.
         slot, lane: of each root.
         node_at, path: see above; `path` has room for a simulation.   All others as in `tree_kernels.search`.
     """
+    if not learn(state, child_C, v_C, learned, row, step):
+        return NOT_FINITE
     B = len(root_B)
     if turn[0] == 0:
         turn[0] = B
@@ -127,7 +129,9 @@ def search(  # type: ignore[no-untyped-def]
                 _finish(child, node, arm, edge, node_at, rules, turn[0], q_BA, mass_BA, mass_N)
                 return 0
             turn[1], turn[2], turn[3] = 1, 0, 0
-        num_wanted, nodes, i, runs_ahead = 0, turn[0], turn[3], turn[4] == 1
+        num_wanted, nodes, i, runs_ahead, level_after = 0, turn[0], turn[3], turn[4] == 1, turn[5]
+        if not runs_ahead:
+            turn[5] = 0
         for b in range(turn[2], B):
             while i < slot[b].waiting:
                 root_arm = arm[b, lane[b, i].action]
@@ -135,19 +139,24 @@ def search(  # type: ignore[no-untyped-def]
                     slot[b].used -= 1
                     i += 1
                     continue
-                level, below = _descend(child, node, arm, edge, path, node_at, rules, b, lane[b, i].action, score_A)
+                # On its way down a simulation brings nodes up to date, so that a second time it may go another way.
+                level, below = level_after - 1, 0
+                if level_after == 0:
+                    level, below = _descend(child, node, arm, edge, path, node_at, rules, b, lane[b, i].action, score_A)
+                level_after = 0
                 if below == 0:
                     below, y = nodes, path[level]
                     s = child[node[y.node].row, y.action, y.k]
-                    if not runs_ahead and (below == len(node) or state[s].row < 0):
-                        turn[0], turn[2], turn[3] = nodes, b, i
-                        return -2 if below == len(node) else -3
+                    known = is_known(reward, prob, discount, child, table_row, state, rules, s)
+                    if not runs_ahead and (below == len(node) or not known):
+                        turn[0], turn[2], turn[3], turn[5] = nodes, b, i, level + 1
+                        return FULL if below == len(node) else UNKNOWN
                     if below == len(node):
                         break
                     nodes += 1
                     place = s * (rules.bottom + 1) + level + 1
                     node[below].place, node[below].parent, node_at[place] = place, node_at[place], below
-                    if state[s].row >= 0:
+                    if known:
                         node[below].v, _ = expand(
                             reward, prob, discount, child, table_row, state, prior, node, arm, edge, rules, below, s,
                             level + 1,
@@ -170,7 +179,7 @@ def search(  # type: ignore[no-untyped-def]
                     _refresh(child, node, arm, edge, node_at, rules, y.node)
                 slot[b].used -= not is_used  # it can be sent again
                 if valued_L[-1] > rules.max_nodes:
-                    return -1
+                    return TOO_MANY
                 i += 1
             i = 0
         if runs_ahead:
@@ -178,4 +187,4 @@ def search(  # type: ignore[no-untyped-def]
                 node_at[node[n].place] = node[n].parent
             return num_wanted
         turn[0], turn[1] = nodes, 0
-    return -1
+    return TOO_MANY

@@ -1,13 +1,28 @@
 """The levels of a lookahead: which states it has at which depth, and how values go up through them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from pgts_torch.bellman import Outcomes, backup, sweep, swept_backup
+from pgts_torch.bellman import Outcomes, back_up_steps, backup
+
+
+class Plan(NamedTuple):
+    """A search of so many levels, which stays the same once they are there.
+
+    bottom: the states at the bottom.
+    steps: the outcomes from there up, with how many levels have them.
+    nodes_per_level, nodes: how many nodes each of the levels holds, from the roots on, and all of them.
+    """
+
+    bottom: Int[Tensor, "N"]
+    steps: tuple[tuple[Outcomes, int], ...]
+    nodes_per_level: tuple[int, ...]
+    nodes: int
 
 
 @dataclass(eq=False)
@@ -21,6 +36,7 @@ class Levels:
     closed_states: every state met so far, in the order of `closed`; all there are once there is a closed set.
     root_row_B: the position of each root in frontier 0.
     given_B: the tensor in which the roots were given last.
+    plans: of the searches so far, by their number of levels.
     """
 
     frontiers: list[Int[Tensor, "N"]]
@@ -29,6 +45,7 @@ class Levels:
     closed: Outcomes | None = None
     given_B: Int[Tensor, "B"] | None = None
     closed_states: Int[Tensor, "N"] = field(init=False)
+    plans: dict[int, Plan] = field(init=False, default_factory=dict)
 
     _in_order: bool = field(init=False)
 
@@ -46,45 +63,55 @@ class Levels:
         closed = 0 if self.closed is None else self.closed.num_states
         return closed + sum(outcomes.num_states for outcomes in self.outcomes)
 
+    def plan(self, expansions: int) -> Plan:
+        """The search of so many levels, which are there."""
+        if expansions not in self.plans:
+            # Levels below the last frontier all are the closed set, which needs one table for all of them.
+            last = min(expansions, len(self.outcomes))
+            steps = [(self.outcomes[k], 1) for k in reversed(range(last))]
+            if expansions > last:
+                assert self.closed is not None
+                steps.insert(0, (self.closed, expansions - last))
+                if steps[1][0] is self.closed:  # the roots are closed
+                    steps = [(self.closed, expansions)]
+            # The last step leads into the closed set, not into a frontier.
+            in_closed = self.closed is not None and expansions >= len(self.outcomes)
+            bottom = self.closed_states if in_closed else self.frontiers[expansions]
+            frontiers = [frontier.shape[0] for frontier in self.frontiers[: expansions + 1]]
+            # Where levels are missing in `frontiers`, they are the closed set.
+            missing = [self.closed_states.shape[0]] * (expansions + 1 - len(frontiers))
+            nodes_per_level = *frontiers, *missing
+            self.plans[expansions] = Plan(bottom, tuple(steps), nodes_per_level, sum(nodes_per_level))
+        return self.plans[expansions]
+
     def sweeps(self, expansions: int) -> int:
-        """How many of `expansions` levels, counted from the leaves, are the closed set."""
+        """How many of so many levels, counted from the leaves, are the closed set."""
         return max(0, expansions - len(self.outcomes))
 
-    def bottom(self, expansions: int) -> Int[Tensor, "N"]:
-        """The states at the bottom of `expansions` levels."""
-        # The last step leads into the closed set, not into a frontier.
-        if self.closed is not None and expansions >= len(self.outcomes):
-            return self.closed_states
-        return self.frontiers[expansions]
-
     def back_up(
-        self, v_N: Float[Tensor, "leaves"], expansions: int, *, reward: Callable[[Tensor], Tensor | None] | None = None
+        self,
+        v_N: Float[Tensor, "leaves"],
+        expansions: int,
+        *,
+        check: Callable[[], None] | None = None,
+        reward: Callable[[Tensor], Tensor | None] | None = None,
     ) -> Float[Tensor, "N A"]:
         """Values of all actions in frontier 0, from values v of the leaves below `expansions` >= 1 levels.
 
         Args:
+            check: as in `back_up_steps`.
             reward: takes the place of the rewards of allowed actions; states [N] to [N, A], or to None: those stay.
         """
-
-        if reward is None and len(self.outcomes) == 1 and self.closed is self.outcomes[0]:  # the roots are closed
-            return swept_backup(self.closed, v_N, expansions - 1)
-
-        def paying(outcomes: Outcomes, states: Tensor) -> Outcomes:
-            reward_NA = None if reward is None else reward(states)
-            return outcomes if reward_NA is None else outcomes.paying(reward_NA)
-
-        # Levels below the last frontier all are the closed set, which needs one table for all of them.
-        if sweeps := self.sweeps(expansions):
-            assert self.closed is not None
-            v_N = sweep(paying(self.closed, self.closed_states), v_N, sweeps)
-        steps = range(min(expansions, len(self.outcomes)))
-        return back_up((paying(self.outcomes[k], self.frontiers[k]) for k in reversed(steps)), v_N)
-
-    def nodes_per_level(self, expansions: int) -> tuple[int, ...]:
-        """How many nodes each of the levels 0 .. expansions holds."""
-        frontiers = [len(frontier) for frontier in self.frontiers[: expansions + 1]]
-        # Where levels are missing in `frontiers`, they are the closed set.
-        return (*frontiers, *[len(self.closed_states)] * (expansions + 1 - len(frontiers)))
+        steps: Sequence[tuple[Outcomes, int]] = self.plan(expansions).steps
+        if reward is not None:
+            above = reversed(self.frontiers[: min(expansions, len(self.outcomes))])
+            states = *[self.closed_states] * (self.sweeps(expansions) > 0), *above
+            rewards = [reward(state_N) for _, state_N in zip(steps, states, strict=False)]
+            steps = [
+                (outcomes if reward_NA is None else outcomes.paying(reward_NA), times)
+                for (outcomes, times), reward_NA in zip(steps, rewards, strict=True)
+            ]
+        return back_up_steps(steps, v_N, check)
 
     def nodes(self, expansions: int) -> int:
         """How many these are together, in constant time for any depth of a closed set."""

@@ -75,8 +75,9 @@ class Lookahead:
         doubt_BA: Float[Tensor, "B A"] | None = None,
     ) -> Self:
         """What a search finds that enumerates outcomes: without sampling error, and by default of full width."""
-        zero_BA = _zero(q_BA.dtype, q_BA.device).expand_as(q_BA)  # one number in memory
-        pruned_BA = zero_BA if pruned_BA is None else pruned_BA
+        zero_BA = _zeros(q_BA.shape, q_BA.dtype, q_BA.device)
+        if pruned_BA is None:
+            pruned_BA = zero_BA
         return cls(q_BA, zero_BA, pruned_BA, model_calls, critic_calls, nodes_per_level, doubt_BA=doubt_BA)
 
     def interval(self, confidence: float = 0.95) -> tuple[Float[Tensor, "B A"], Float[Tensor, "B A"]]:
@@ -176,12 +177,29 @@ class Leaves:
         """v, or max_a Q(s, a); PgtsError, with the state, if the critic's values are of a wrong shape or not finite."""
         if self._v_leaf is None:
             return self.q(state_N).amax(-1)
-        return self._called(self._v_leaf, state_N, (len(state_N),))
+        values = self._called(self._v_leaf, state_N, (state_N.shape[0],))
+        self.check(values, state_N)
+        return values
+
+    def unchecked(self, state_N: Int[Tensor, "N"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N ..."]]:
+        """v, which the caller checks; and the critic's values, for `check` where it is not finite."""
+        if self._v_leaf is not None:
+            values = self._called(self._v_leaf, state_N, (state_N.shape[0],))
+            return values, values
+        assert self._q_leaf is not None
+        values = self._called(self._q_leaf, state_N, (state_N.shape[0], self._model.num_actions))
+        return values.amax(-1), values
+
+    def check(self, values: Float[Tensor, "N ..."], state_N: Int[Tensor, "N"]) -> None:
+        """PgtsError, with the state, where the critic's values are not finite; at once or when `readings` are read."""
+        check_finite("value", "the critic's value", values, state_N, self.readings)
 
     def q(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"]:
         """Q(s, .), -inf where an action is not allowed; as `v` otherwise. Only for critics of Q^pi."""
         assert self._q_leaf is not None
-        return self._called(self._q_leaf, state_N, (len(state_N), self._model.num_actions))
+        values = self._called(self._q_leaf, state_N, (state_N.shape[0], self._model.num_actions))
+        self.check(values, state_N)
+        return values
 
     def errors(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N"] | Float[Tensor, "N A"]:
         """The bounds of the error of v, or of Q; PgtsError, with the state, if they cannot be bounds."""
@@ -213,14 +231,14 @@ class Leaves:
             values = values.to(self._model.dtype)
         if values.shape != shape:
             raise PgtsError(f"the critic's values have shape {tuple(values.shape)}; of {len(state_N)} leaves: {shape}")
-        check_finite("value", "the critic's value", values, state_N, self.readings)
         return values
 
 
-@functools.cache
+@functools.lru_cache(maxsize=64)
 @torch.inference_mode(False)
-def _zero(dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.zeros((), dtype=dtype, device=device)
+def _zeros(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """One number in memory."""
+    return torch.zeros((), dtype=dtype, device=device).expand(shape)
 
 
 def checked_errors(

@@ -23,6 +23,9 @@ from pgts_torch.search.topology import Topology, topology_of
 from pgts_torch.search.tree import Tree
 from pgts_torch.seeding import mix, sample_keys, uniform
 
+_KEPT = 2**20
+"""The most bytes that compiled trees keep between searches: those that take more have no need of it."""
+
 _WHOLE = 1e-6
 """In a graph shares of simulations add up to whole ones up to rounding."""
 
@@ -127,20 +130,29 @@ def _options(**given: Any) -> MCTS:
         return MCTS(**given)
 
 
-@torch.no_grad()
 def search_tree(
     leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], options: MCTS, generator: torch.Generator | None
 ) -> Lookahead:
     """`mcts`, with leaves and topology at hand."""
-    check_roots(root_B, topology.model.num_states)
+    with torch.set_grad_enabled(False):  # half of what `no_grad` costs, which small searches notice
+        return _search_tree(leaves, topology, root_B, options, generator)
+
+
+def _search_tree(
+    leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], options: MCTS, generator: torch.Generator | None
+) -> Lookahead:
+    compiled = _can_compile(topology.model, options)
+    if not compiled or root_B.shape != (1,) or root_B.dtype != torch.int64 or leaves.expansions == 0:
+        check_roots(root_B, topology.model.num_states)  # compiled loops look at a single root themselves
     if leaves.expansions == 0:
         return unexpanded(leaves, root_B)
     topology.table.meter = leaves.meter
     # A root alone needs no sorting, which takes as long as many of its simulations.
     state_B, row_B = (root_B, None) if root_B.shape[0] == 1 else root_B.unique(return_inverse=True)
     calls_before = topology.table.model_calls
-    grow = _grow_fixed if _fits_arrays(topology.model, len(state_B), options) else _grow
-    grow = _grow_compiled if _can_compile(topology.model, options) else grow
+    grow = _grow_compiled
+    if not compiled:
+        grow = _grow_fixed if _fits_arrays(topology.model, len(state_B), options) else _grow
     q_NA, pruned_NA, nodes_per_level = grow(leaves, topology, state_B, options, generator)
     return Lookahead.enumerated(
         q_NA if row_B is None else q_NA[row_B],
@@ -160,10 +172,17 @@ def _grow_compiled(
     leaves: Leaves, topology: Topology, state_B: Tensor, options: MCTS, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor, tuple[int, ...]]:
     """q and pruned mass of the roots, and the nodes of each level."""
-    forest = Forest(leaves, topology, options, state_B)
-    values = forest.search(generator)
-    q_BA, pruned_BA = (value_BA.to(topology.model.dtype) for value_BA in values)
-    return q_BA, pruned_BA, forest.nodes_per_level
+    kind = options, leaves.expansions, state_B.shape[0]
+    # While it is in use, or when it has failed, no other search has it.
+    forest, topology.forest = topology.forest, None
+    if not isinstance(forest, Forest) or not forest.serves(*kind, topology.model.num_states):
+        forest = Forest(topology, *kind)
+    q_BA, pruned_BA, nodes_per_level = forest.search(leaves, state_B, generator)
+    if forest.num_bytes <= _KEPT:
+        topology.forest = forest
+    if topology.model.dtype != torch.float64:
+        q_BA, pruned_BA = q_BA.to(topology.model.dtype), pruned_BA.to(topology.model.dtype)
+    return q_BA, pruned_BA, nodes_per_level
 
 
 def _fits_arrays(model: EnumeratingModel, roots: int, options: MCTS) -> bool:

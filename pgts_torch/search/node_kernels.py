@@ -22,7 +22,7 @@ _VISITS, _SCALE = 50.0, 0.1
 
 class Rules(NamedTuple):
     """The options, as numbers. A node at level `bottom` is never expanded; `halves`: sequential halving at the root.
-    `room`: nodes of a tree."""
+    `room`: nodes of a tree.   `uniform`: all states have one prior."""
 
     room: int
     bottom: int
@@ -31,6 +31,7 @@ class Rules(NamedTuple):
     rule: int
     exploration: float
     mean: bool
+    uniform: bool
     max_nodes: int
 
 

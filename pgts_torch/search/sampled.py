@@ -156,12 +156,12 @@ def _expanded(
             break
     steps: list[Step] = list(zip(levels.frontiers, levels.outcomes, strict=False))
     if levels.closed is None:
-        return steps, levels.bottom(expansions), levels.nodes_per_level(expansions)
+        return steps, levels.plan(expansions).bottom, levels.plan(expansions).nodes_per_level
     if options.share == "search":
         # States recur: the remaining levels are the closed set, again and again.
         topology.levels(empirical.root_B, expansions, max_nodes=options.max_nodes)
         steps += [(levels.closed_states, levels.closed)] * levels.sweeps(expansions)
-        return steps, levels.bottom(expansions), levels.nodes_per_level(expansions)
+        return steps, levels.plan(expansions).bottom, levels.plan(expansions).nodes_per_level
     # Paths, and states at a level, never recur: where no new node is met, no outcome of the level before has weight.
     widths = [len(frontier) for frontier in levels.frontiers]
     return steps, None, (*widths, *[0] * (expansions + 1 - len(widths)))

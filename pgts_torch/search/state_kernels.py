@@ -23,11 +23,11 @@ def _avalanche(x):  # type: ignore[no-untyped-def]
     return x ^ (x >> _31)
 
 
-@jit
-def add_noise(key, state_B, noise_BA):  # type: ignore[no-untyped-def]
+@inlined
+def _add_noise(key, state_B, noise_BA):  # type: ignore[no-untyped-def]
     """Add standard Gumbel noise, the same for equal keys, states and actions: `seeding.uniform` of `seeding.mix`."""
     for b in range(len(state_B)):
-        of_state = _avalanche(key * _ODD + np.uint64(state_B[b]))
+        of_state = _avalanche(np.uint64(key) * _ODD + np.uint64(state_B[b]))
         for a in range(noise_BA.shape[1]):
             bits = _avalanche(_avalanche(of_state * _ODD + np.uint64(a)) + _ODD) >> _11
             noise_BA[b, a] -= math.log(-math.log(max(float(bits) * 2.0**-53, _TINY)))
@@ -39,77 +39,92 @@ def _has_weight(reward, prob, discount, r, a, k):  # type: ignore[no-untyped-def
     return prob[r, a, k] > 0 and discount[r, a, k] > 0 and reward[r, a] > -np.inf
 
 
-@inlined
-def _reach(reward, prob, discount, child, table_row, state, wanted, count, levels):  # type: ignore[no-untyped-def]
-    """Add the states that follow the first `count` wanted ones within so many levels, as far as their outcomes are
-    known and there is room; how many are wanted now."""
-    A, K = prob.shape[1:]
-    first, last = 0, count
-    for _ in range(levels):
+@jit
+def reach(reward, prob, discount, child, table_row, state, wanted, count, levels, child_C):  # type: ignore[no-untyped-def]
+    """Add to the first `count` wanted states those that follow within so many levels, as far as outcomes are known and
+    there is room; how many are wanted now. And list the children of all of them of which the critic's values are not
+    known, each once; how many there are."""
+    first, last, listed = 0, count, 0
+    for level in range(levels + 1):
         for i in range(first, last):
             r = table_row[wanted[i]]
-            for a in range(A):
-                for k in range(K):
-                    s = child[r, a, k]
-                    if not _has_weight(reward, prob, discount, r, a, k) or state[s].row != NEW or table_row[s] < 0:
+            for a in range(prob.shape[1]):
+                if reward[r, a] == -np.inf:
+                    continue
+                for k in range(prob.shape[2]):
+                    if not (prob[r, a, k] > 0 and discount[r, a, k] > 0):
                         continue
-                    if count == len(wanted):
-                        return count
-                    state[s].row = WANTED
-                    wanted[count] = s
-                    count += 1
+                    s = child[r, a, k]
+                    if math.isnan(state[s].v):
+                        state[s].v = np.inf
+                        child_C[listed] = s
+                        listed += 1
+                    if level < levels and count < len(wanted) and state[s].row == NEW and table_row[s] >= 0:
+                        state[s].row = WANTED
+                        wanted[count] = s
+                        count += 1
         first, last = last, count
-        if first == last:
-            break
-    return count
+    return count, listed
 
 
 @jit
-def children(reward, prob, discount, child, table_row, state, state_N, child_C):  # type: ignore[no-untyped-def]
-    """List the children of these states of which the critic's values are not known, each once, ascending; how many
-    there are."""
-    A, K = prob.shape[1:]
-    count = 0
-    for i in range(len(state_N)):
-        r = table_row[state_N[i]]
-        for a in range(A):
-            for k in range(K):
-                s = child[r, a, k]
-                if _has_weight(reward, prob, discount, r, a, k) and math.isnan(state[s].v):
-                    state[s].v = np.inf
-                    child_C[count] = s
-                    count += 1
-    child_C[:count].sort()
-    return count
+def begin(  # type: ignore[no-untyped-def]
+    reward, prob, discount, child, table_row, state, root_B, levels, wanted, child_C, slot, turn, valued_L,
+    preference, prior, noisy, key,
+):  # fmt: skip
+    """Forget the search before. Want the roots, and as many as there is room for of what follows them within so many
+    levels, as far as their outcomes are known. Return how many are wanted, which are listed in `wanted`, and of how
+    many children the critic is to say the values, which are listed in `child_C`; or -1 where a root has no row.
 
-
-@jit
-def has_rows(table_row, state_N):  # type: ignore[no-untyped-def]
-    """Whether all these states have a row in the table of outcomes."""
-    missing = 0
-    for s in state_N:
-        missing += table_row[s] < 0
-    return missing == 0
-
-
-@jit
-def begin(reward, prob, discount, child, table_row, state, root_B, levels, wanted):  # type: ignore[no-untyped-def]
-    """Forget what is known of states; want the roots, and as many as there is room for of what follows them within so
-    many levels. How many are wanted; they are listed in `wanted`, ascending."""
+    Args:
+        preference: becomes log prior, plus noise by the key if there is to be noise.
+    """
+    B = len(root_B)
+    for b in range(B):
+        if not 0 <= root_B[b] < len(table_row) or table_row[root_B[b]] < 0:
+            return -1, 0
     for s in range(len(state)):
         state[s].v, state[s].row = math.nan, NEW
-    for b in range(len(root_B)):
+    for b in range(B):
         state[root_B[b]].row = WANTED
         wanted[b] = root_B[b]
-    count = _reach(reward, prob, discount, child, table_row, state, wanted, len(root_B), levels)
-    wanted[:count].sort()
-    return count
+    for w in range(len(slot)):
+        slot[w].root = -1
+    turn[:] = 0
+    valued_L[:] = 0
+    valued_L[0] = valued_L[-1] = B
+    preference[:] = prior
+    if noisy:
+        _add_noise(key[0], root_B, preference)
+    return reach(reward, prob, discount, child, table_row, state, wanted, B, levels, child_C)
 
 
 @jit
 def learn(state, child_C, v_C, state_N, row, step):  # type: ignore[no-untyped-def]
-    """Write the critic's values of children, and the rows of priors: row, row + step, row + 2 step, ..."""
+    """Write the critic's values of children, and the rows of priors: row, row + step, row + 2 step, ... False, and
+    nothing is written, where a value is not finite."""
+    for v in v_C:
+        if not math.isfinite(v):
+            return False
     for i in range(len(child_C)):
         state[child_C[i]].v = v_C[i]
     for i in range(len(state_N)):
         state[state_N[i]].row = row + i * step
+    return True
+
+
+@inlined
+def is_known(reward, prob, discount, child, table_row, state, rules, s):  # type: ignore[no-untyped-def]
+    """Whether a state can be expanded. Where all have one prior this may be found out here: if its outcomes are in the
+    table, and its children have values."""
+    if state[s].row >= 0:
+        return True
+    if not rules.uniform or state[s].row == WANTED or table_row[s] < 0:
+        return False
+    r = table_row[s]
+    for a in range(prob.shape[1]):
+        for k in range(prob.shape[2]):
+            if _has_weight(reward, prob, discount, r, a, k) and math.isnan(state[child[r, a, k]].v):
+                return False
+    state[s].row = 0
+    return True

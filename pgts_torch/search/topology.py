@@ -4,7 +4,7 @@ import functools
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import replace
-from typing import final
+from typing import Protocol, final
 
 import torch
 from jaxtyping import Bool, Int
@@ -26,6 +26,12 @@ _REMEMBERED_ROOTS = 8
 """How many different batches of roots keep their levels."""
 
 
+class Kept(Protocol):
+    """Something that takes memory between searches."""
+
+    num_bytes: int
+
+
 @final
 class Topology:
     """What a model has answered so far: it is queried once for a (state, action), in however many searches that occurs.
@@ -34,6 +40,7 @@ class Topology:
     from the same roots finds its levels ready, to any depth.
 
     table: the answers.
+    forest: what the last tree search has left for the next one, if it is little.
 
     Args:
         model: enumerates outcomes.
@@ -47,6 +54,7 @@ class Topology:
         self._generation = model.generation
         # By the roots; the least recently used first.
         self._levels: OrderedDict[Hashable, Levels] = OrderedDict()
+        self.forest: Kept | None = None
 
     def fresh(self) -> "Topology":
         """An empty one of the same model and limits."""
@@ -72,7 +80,7 @@ class Topology:
         self._check_generation()
         key = None if readings is None else self._recognised(root_B, readings)
         if key is None:
-            key = root_B.dtype, root_B.shape, root_B.cpu().numpy().tobytes()
+            key = root_B.dtype, root_B.shape, (root_B if root_B.is_cpu else root_B.cpu()).numpy().tobytes()
         levels = self._levels.get(key)
         if levels is None:
             levels = self._levels[key] = self._start(root_B)
@@ -82,7 +90,9 @@ class Topology:
         self._levels.move_to_end(key)
         if levels.closed is None and len(levels.outcomes) < expansions:
             self._grow(levels, expansions, max_nodes)
-        self._check_nodes(levels, expansions, expansions, max_nodes)
+        plan = levels.plans.get(expansions)
+        if plan is None or plan.nodes > max_nodes:
+            self._check_nodes(levels, expansions, expansions, max_nodes)
         return levels
 
     def _recognised(self, root_B: Int[Tensor, "B"], readings: Readings) -> Hashable | None:
@@ -156,7 +166,10 @@ class Topology:
             # Such a model keeps what it has sampled, and the bootstrap resamples a level as a whole.
             rows = [step.num_states for each in self._levels.values() for step in each.outcomes]
             counts |= {"sampled": remembered, "sampling": new, "resampled": max([looked_up, *rows])}
-        return search_bytes(sizes, states=states, remembered=remembered, looked_up=looked_up, kept=kept, **counts)
+        left = 0 if self.forest is None else self.forest.num_bytes
+        return left + search_bytes(
+            sizes, states=states, remembered=remembered, looked_up=looked_up, kept=kept, **counts
+        )
 
     def _expand(self, levels: Levels) -> None:
         """One more level: query the model for the states of the last frontier that are new, and find their children."""
@@ -257,6 +270,8 @@ class Topology:
             check_memory(needed(), self.max_bytes, f"the outcomes of {which} of the lookahead ({size})")
 
         # Levels of other roots only save time: they go first, the least recently used before the others.
+        if needed() > self.max_bytes:
+            self.forest = None
         while needed() > self.max_bytes and any(each is not levels for each in self._levels.values()):
             self._levels.pop(next(key for key, each in self._levels.items() if each is not levels))
         check()

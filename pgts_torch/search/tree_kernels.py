@@ -10,7 +10,8 @@ import numpy as np
 
 from pgts_torch.compiled import inlined, jit
 from pgts_torch.search.node_kernels import begin, due, expand, open_mass, outcome, select
-from pgts_torch.search.tree_records import NEW, WANTED
+from pgts_torch.search.state_kernels import is_known, learn
+from pgts_torch.search.tree_records import NEW, NOT_FINITE, TOO_MANY, WANTED
 
 
 @inlined
@@ -82,11 +83,10 @@ def _average(discount, node, arm, edge, root, n, a, k, value):  # type: ignore[n
 @jit
 def search(  # type: ignore[no-untyped-def]
     reward, prob, discount, child, table_row, state, prior, node, arm, edge, slot, lane, rules, root_B, preference,
-    q_BA, mass_BA, wanted, begun, valued_L, mass_N, score_A, class_A,
+    q_BA, mass_BA, wanted, turn, valued_L, mass_N, score_A, class_A, child_C, v_C, learned, row, step,
 ):  # fmt: skip
-    """Go on with all searches. Return how many states are wanted, which are listed in `wanted`; -1 where the nodes are
-    too many. It is over when none is wanted. It is one function because parts of it as `inlined` ones cost a tenth of
-    its time.
+    """Go on with all searches. Return how many states are wanted, which are listed in `wanted`, or why not. It is over
+    when none is wanted. It is one function because parts of it as `inlined` ones cost a tenth of its time.
 
     Args:
         reward, prob, discount, child, table_row: the columns of the `OutcomeTable`.
@@ -94,24 +94,27 @@ def search(  # type: ignore[no-untyped-def]
         preference: what is added to sigma(q) in sequential halving.
         root_B: states that are known.
         q_BA, mass_BA: what is found, as in `Lookahead`.
-        begun: one number, how many roots have had a slot.
+        turn: its first number is how many roots have had a slot.
         valued_L: counts the nodes that have a value by level, and all of them in its last place.
         mass_N, score_A, class_A: scratch.
+        child_C, v_C, learned, row, step: what `learn` is to write first.
     """
+    if not learn(state, child_C, v_C, learned, row, step):
+        return NOT_FINITE
     num_wanted = 0
     for w in range(len(slot)):
         x, root = slot[w], w * rules.room
         while True:
             if x.root < 0:
-                if begun[0] == len(root_B):
+                if turn[0] == len(root_B):
                     break
                 x.nodes, node[root].parent = 1, -1
                 _, width = expand(
                     reward, prob, discount, child, table_row, state, prior, node, arm, edge, rules, root,
-                    root_B[begun[0]], np.int64(0),
+                    root_B[turn[0]], np.int64(0),
                 )  # fmt: skip
-                begin(arm, slot, lane, rules, w, begun[0], root)
-                begun[0] += 1
+                begin(arm, slot, lane, rules, w, turn[0], root)
+                turn[0] += 1
                 valued_L[1] += width
                 valued_L[-1] += width
             # The states that are to be expanded must all be known.
@@ -120,7 +123,7 @@ def search(  # type: ignore[no-untyped-def]
                 y = lane[w, i]
                 if edge[y.node, y.action, y.k].below == 0 and node[y.node].level + 1 < rules.bottom:
                     s = child[node[y.node].row, y.action, y.k]
-                    if state[s].row < 0:
+                    if not is_known(reward, prob, discount, child, table_row, state, rules, s):
                         waits = True
                         if state[s].row == NEW:
                             state[s].row = WANTED
@@ -150,14 +153,16 @@ def search(  # type: ignore[no-untyped-def]
                     _backward(node, arm, edge, root, n, a, k, value, node[root + below].open == 0)
             x.waiting = 0
             if valued_L[-1] > rules.max_nodes:
-                return -1
+                return TOO_MANY
             count = due(node, arm, slot, lane, rules, preference, w, root, score_A, class_A)
             for i in range(count):
                 _descend(node, arm, edge, lane, rules, w, i, lane[w, i].action, score_A)
             if count == 0:
                 for a in range(arm.shape[1]):
                     q_BA[x.root, a] = arm[root, a].q
-                if not rules.mean:
+                if rules.mean:
+                    mass_BA[x.root] = np.inf
+                else:
                     for i in range(x.nodes - 1, -1, -1):  # children come after their parents
                         mass_N[i] = open_mass(node, edge, rules, root + i, mass_N, mass_BA[x.root])
                 x.root = -1

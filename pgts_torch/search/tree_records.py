@@ -5,6 +5,10 @@ import numpy as np
 NEW, WANTED = -1, -2
 """The `row` of a state that no tree has reached, and of one that is to be made known."""
 
+TOO_MANY, FULL, UNKNOWN, NOT_FINITE = -1, -2, -3, -4
+"""What the loops return: there are more nodes than are allowed, or than there is room for; a state is unknown (in a
+graph); one of the critic's values is not finite."""
+
 STATE = np.dtype([("v", "f8"), ("row", "i8")])
 """v: the critic's value; NaN where it is not known, infinite where the critic is to be called.
 row: of the prior, where the outcomes of the state and the values of its children are known too."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pgts_torch import bellman
-from pgts_torch.bellman import sweep, swept_backup
+from pgts_torch.bellman import back_up_steps, sweep
 from pgts_torch.compiled import torch_only
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models import TabularModel
@@ -49,7 +49,7 @@ def warm(name: str, leaf: str, depth: int) -> tuple[Callable[..., Lookahead], Te
     shape = (mdp.num_states,) if leaf == "v" else (mdp.num_states, mdp.num_actions)
     old, new = (torch.randn(shape, dtype=torch.float64, generator=stream(seed, "leaf")) for seed in range(2))
     expectimax(model, roots, depth=depth, topology=topology, **{f"{leaf}_leaf": old.__getitem__})
-    q_SA = new if leaf == "q" else swept_backup(mdp.outcomes, new, 0)
+    q_SA = new if leaf == "q" else back_up_steps(((mdp.outcomes, 1),), new)
 
     def search(**more) -> Lookahead:
         return expectimax(model, roots, depth=depth, topology=topology, **{f"{leaf}_leaf": new.__getitem__}, **more)
@@ -135,7 +135,7 @@ def test_a_sweep_takes_two_operations_and_a_backup_one(times):
     with Counting() as swept:
         sweep(mdp.outcomes, v_S, times)
     with Counting() as backed_up:
-        swept_backup(mdp.outcomes, v_S, times)
+        back_up_steps(((mdp.outcomes, times + 1),), v_S)
     assert swept.num_operations == max(1, 2 * times)
     assert backed_up.num_operations == 2 * times + 1
     assert swept.num_reads == backed_up.num_reads == 0

@@ -15,6 +15,7 @@ from pgts_torch.models import TabularModel
 from pgts_torch.search import Lookahead, Topology, expectimax
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP, exact, grid, ladder
+from tests.counting import Counting
 from tests.search.models import (
     Critic,
     InterningModel,
@@ -44,6 +45,23 @@ def walkable_depth(mdp: TabularMDP, most_paths: int = 4_000) -> int:
     """The largest depth for which walking the tree from every state stays fast."""
     wide = mdp.num_actions * mdp.outcomes.num_outcomes
     return int(math.log(max(1, most_paths / (mdp.num_states * mdp.num_actions))) / math.log(max(wide, 2)))
+
+
+def test_a_compiled_search_over_known_states_takes_no_operation_but_the_critics():
+    pytest.importorskip("numba")
+    mdp, root_B = grid(), torch.arange(100)
+    model, v_S = TabularModel(mdp), some_v(mdp)
+    topology = Topology(model)
+
+    def search() -> Counting:
+        with Counting() as counts:
+            expectimax(model, root_B, depth=8, v_leaf=lambda state_N: v_S[state_N], topology=topology)
+        return counts
+
+    assert search().num_operations > 10
+    known = search()
+    assert known.operations == {"index": 1}
+    assert known.reads == {"numpy": 2}  # the roots, and the critic's values
 
 
 # The same as the exact operator, at every state, action and depth

@@ -10,11 +10,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pgts_torch.compiled import torch_only
+from pgts_torch.errors import NotFinite
 from pgts_torch.models import EnumeratingModel, TabularModel
 from pgts_torch.search import Lookahead, Topology, mcts
 from pgts_torch.search import forest as forest_module
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import random_mdp
+from tests.counting import Counting
 from tests.search.models import Critic, InterningModel, all_states, assert_close, paths, some_v, watched, zeros
 from tests.support import mdps, random_policy, rewarded
 
@@ -68,6 +70,16 @@ def test_compiled_trees_are_those_of_torch(mdp, depth, simulations, seed, root, 
         options["prior"] = Critic(random_policy(mdp, seed))
     options |= {"depth": depth, "v_leaf": Critic(scale * some_v(mdp, seed)), "simulations": simulations}
     assert_same(*both(TabularModel(mdp), all_states(mdp), **options), merge="merge" in form)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_graph_goes_on_as_if_it_had_not_stopped_at_unknown_states(known):
+    mdp = random_mdp(80, 3, branching=3, seed=2)
+    model, options = TabularModel(mdp), {"depth": 4, "v_leaf": Critic(some_v(mdp, 1)), "merge": True}
+    if known:
+        options["topology"] = topology = Topology(model)
+        topology.query(torch.arange(80))
+    assert_same(*both(model, torch.tensor([3]), simulations=36, noise=1, **options), merge=True)
 
 
 @pytest.mark.parametrize("merge", [False, True])
@@ -167,3 +179,71 @@ def test_trees_that_take_turns_in_a_few_slots_are_the_same(monkeypatch):
     assert torch.equal(in_turns.pruned_BA, at_once.pruned_BA)
     assert in_turns.nodes_per_level == at_once.nodes_per_level
     assert calls[1] > 2 * calls[0]
+
+
+@pytest.mark.parametrize("merge", [False, True])
+def test_a_search_over_known_states_takes_no_operation_but_the_noise_and_the_critics(merge):
+    mdp = random_mdp(60, 3, branching=3)
+    model, v_S = TabularModel(mdp), some_v(mdp)
+    topology, generator = Topology(model), stream(0, "noise")
+
+    def search() -> Counting:
+        options = {"depth": 5, "simulations": 30, "merge": merge, "topology": topology, "generator": generator}
+        with Counting() as counts:
+            mcts(model, torch.tensor([7]), v_leaf=lambda state_N: v_S[state_N], **options)
+        return counts
+
+    assert search().num_operations > 4
+    search()
+    known = search()
+    assert known.operations == {"random_": 1, "index": 1}
+    assert known.reads == {"numpy": 2}  # the root, and the critic's values
+
+
+@pytest.mark.parametrize("form", [{}, {"merge": True}, {"backup": "mean"}, {"prior": True}])
+def test_what_a_search_has_left_for_the_next_one_changes_nothing_there(form):
+    mdp = random_mdp(80, 3, branching=3, seed=2)
+    model, options = TabularModel(mdp), {"depth": 4, "simulations": 40} | form
+    if "prior" in form:
+        options["prior"] = Critic(random_policy(mdp, 1))
+    topology, calls = Topology(model), []
+
+    def search(roots: list[int], seed: int, topology: Topology | None, bad: float = 0.0, **more) -> Lookahead:
+        v_S = some_v(mdp, seed)
+        v_S[::2] += bad
+        return mcts(
+            model, torch.tensor(roots), v_leaf=lambda s: v_S[s], topology=topology, generator=stream(seed, "n"),
+            **options | more,
+        )  # fmt: skip
+
+    def within(state_N: Tensor) -> Tensor:  # a critic that searches by itself
+        calls.append(search([5], 1, topology))
+        return some_v(mdp, 3)[state_N]
+
+    cases = [([3], 0), ([4], 1), ([4, 70, 9], 2), ([4, 70, 9], 3), ([3], 1), ([3], 1, 1)]
+    for roots, seed, *fewer in cases:
+        more = {"simulations": 39} if fewer else {}
+        with pytest.raises(NotFinite, match="the critic's value of state"):
+            search(roots, seed, topology, bad=math.nan, **more)
+        for _ in range(2):
+            look, fresh = search(roots, seed, topology, **more), search(roots, seed, None, **more)
+            assert torch.equal(look.q_BA, fresh.q_BA)
+            assert torch.equal(look.pruned_BA, fresh.pruned_BA)
+            assert look.nodes_per_level == fresh.nodes_per_level
+    first = look.q_BA.clone()
+    searching = mcts(model, torch.tensor([5]), v_leaf=within, topology=topology, **options)
+    assert torch.equal(searching.q_BA, mcts(model, torch.tensor([5]), v_leaf=Critic(some_v(mdp, 3)), **options).q_BA)
+    assert all(torch.equal(inner.q_BA, search([5], 1, None).q_BA) for inner in calls)
+    assert torch.equal(look.q_BA, first)  # results are the caller's
+
+
+def test_what_is_kept_for_the_next_search_is_little_and_counts_as_memory():
+    mdp = random_mdp(80, 3, branching=3, seed=2)
+    topology, options = Topology(TabularModel(mdp)), {"depth": 4, "v_leaf": zeros}
+    before = topology.bytes(0)
+    mcts(topology.model, torch.arange(80), simulations=60, topology=topology, **options)
+    assert topology.forest is None
+    mcts(topology.model, torch.arange(2), simulations=60, topology=topology, **options)
+    assert topology.forest is not None
+    assert topology.bytes(0) > before + topology.forest.num_bytes > before + 10_000
+    assert topology.fresh().forest is None

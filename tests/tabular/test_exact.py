@@ -238,6 +238,7 @@ def test_within_a_tolerance_values_are_so_near_to_the_optimum_and_the_policy_los
     name, share, unit, way, monkeypatch
 ):
     monkeypatch.setattr("pgts_torch.bellman.COMPILED_FROM", WAYS[way])
+    monkeypatch.setattr("pgts_torch.bellman._KERNELS", "as if not loaded")
     mdp = rewarded(zoo(name), factor=unit)
     truth = exact.optimal(mdp)
     tolerance = share * float(truth.v_S.abs().max())
