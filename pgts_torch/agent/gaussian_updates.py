@@ -5,8 +5,10 @@ advantages K = 1, the action taken, with probability 1: then `GaussianGradientUp
 is PPO.
 """
 
+import itertools
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, final
 
 import torch
@@ -24,6 +26,7 @@ from pgts_torch.agent.updates import Update
 from pgts_torch.options.fields import limit
 from pgts_torch.options.schedules import at
 from pgts_torch.options.updates import MPO, PPO, Gradient
+from pgts_torch.ranks import Ranks
 from pgts_torch.search.lookahead import check_finite
 
 _HALVINGS, _WIDEST = 40, 1e6
@@ -78,18 +81,18 @@ class GaussianUpdate(Update):
             scaled_N = weight_N / share.mean("weights", weight_N)
             columns = input_N, *old, scaled_N, *self.aims(old, batch, scaled_N)
             num_epochs, size = self._passes(share.total)
-            for _ in range(num_epochs):
-                for count, part in minibatches(columns, size, share, generator=generator):
-                    made = Forward(network, part[0])
-                    now = policy.read(made.output_ND)
-                    loss_N, mean_NX, log_std_NX = self.loss(now, Normals(*part[1:3]), *part[4:])
-                    down_N1 = (part[3] * (1 / count))[:, None]
-                    down_ND = policy.through(made.output_ND, down_N1 * mean_NX, down_N1 * log_std_NX)
-                    found = made.gradients(down_ND), mean(part[3], loss_N, count)
-                    gradients, (loss,) = ranks.summed("the gradient of the policy", *found)
-                    readings.add(
-                        policy=loss, grad_norm=self._optimiser.step(network.weights, gradients, loss, "policy")
-                    )
+            passes = (minibatches(columns, size, share, generator=generator) for _ in range(num_epochs))
+            for count, part in itertools.chain.from_iterable(passes):
+                made = Forward(network, part[0])
+                now, was = policy.read(made.output_ND), Normals(*part[1:3])
+                if self._is_far(ranks, lambda: mean(part[3], was.divergence(now), count)):  # noqa: B023
+                    break
+                loss_N, mean_NX, log_std_NX = self.loss(now, was, *part[4:])
+                down_N1 = (part[3] * (1 / count))[:, None]
+                down_ND = policy.through(made.output_ND, down_N1 * mean_NX, down_N1 * log_std_NX)
+                found = made.gradients(down_ND), mean(part[3], loss_N, count)
+                gradients, (loss,) = ranks.summed("the gradient of the policy", *found)
+                readings.add(policy=loss, grad_norm=self._optimiser.step(network.weights, gradients, loss, "policy"))
             with torch.no_grad():
                 new = policy.read(network(input_N))
             readings.check(new.entropy().sum(), lambda _: check_finite("probability", "the next policy", new[1], None))
@@ -100,6 +103,11 @@ class GaussianUpdate(Update):
             if not fresh:
                 encoder.absorb(batch.observation_N, ranks)
         return readings.means
+
+    def _is_far(self, ranks: Ranks, kl: Callable[[], Tensor]) -> bool:
+        """Whether KL(pi_old || pi) of a minibatch, of which `kl` computes the part of this process, ends the steps."""
+        most = getattr(self.options, "target_kl", None)
+        return most is not None and float(ranks.sum("the divergence", kl())) > most
 
     def _passes(self, rows: int) -> tuple[int, int]:
         """How many passes over how large minibatches."""
@@ -237,7 +245,7 @@ class GaussianPPOUpdate(GaussianUpdate):
         maximise  mean_s w(s) [ sum_k pi_hat_k min(rho_k adv_k, clip(rho_k, 1 - clip_range, 1 + clip_range) adv_k)
                                 + entropy_coef H(pi(.|s)) ],        rho_k = pi(a_k|s) / pi_old(a_k|s)
 
-    `normalize_advantage` is that of `PPOUpdate`.
+    `normalize_advantage` and `target_kl` are those of `PPOUpdate`.
     """
 
     options: PPO

@@ -98,6 +98,17 @@ def test_ppo_leaves_an_action_alone_whose_density_has_changed_enough():
     assert (update.loss(old, old, *aims)[1] != 0).all()
 
 
+def test_steps_of_ppo_end_where_the_policy_has_moved_far_enough():
+    def found(target_kl: float | None) -> tuple[int, list[torch.Tensor]]:
+        update, policy = GaussianPPOUpdate(PPO(target_kl=target_kl, num_epochs=20, learning_rate=0.02)), gaussian()
+        weights = after(update, policy, batch(policy))
+        return update._optimiser.num_steps, weights
+
+    (all_steps, free), (few, _), (bound, far) = (found(target_kl) for target_kl in (None, 0.01, 1e9))
+    assert 1 <= few < all_steps == bound == 20
+    assert all(map(torch.equal, free, far))
+
+
 def test_with_quadratic_advantages_the_improved_policy_has_the_moments_of_the_normal_distribution_that_it_is():
     policy = gaussian()
     aim, curve, kl = 0.7, 0.9, 0.05
