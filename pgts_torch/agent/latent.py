@@ -16,18 +16,14 @@ from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.optimisers import Optimiser
 from pgts_torch.agent.policies import Policy
 from pgts_torch.errors import NotFinite, PgtsError, check_count
-from pgts_torch.models.base import Experience, LearningModel, Transitions
-from pgts_torch.models.held_out import BLOCK, held_out_rows, runs, sequences
-from pgts_torch.models.replay import ReplayBuffer
+from pgts_torch.models.base import Experience, Transitions
+from pgts_torch.models.fitted import SELDOM, FittedModel
+from pgts_torch.models.held_out import held_out_rows, runs, sequences
 from pgts_torch.models.state_index import hash_rows
-from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options.models import Latent
 from pgts_torch.options.policies import CNN, MLP
 from pgts_torch.ranks import Ranks
-from pgts_torch.seeding import stream, uniform
-
-_SELDOM = 0.02
-"""Smaller probabilities of an end count as 0: a classifier never returns 0, and over many steps small ones add up."""
+from pgts_torch.seeding import stream
 
 _ENDS = 0.25
 """How many steps that ended an episode are added to a minibatch, as a share of its other steps."""
@@ -45,7 +41,7 @@ _MOST_MEASURED = 256
 
 
 @final
-class LatentModel(TensorModel, LearningModel):
+class LatentModel(FittedModel):
     """Networks that represent an image as a latent vector z of D numbers, with mean 0 and variance 1, and step it:
 
         z = norm(h(image)),    (change, r_0, r_1, logit) = g(z, a),    z' = norm(z + change)
@@ -67,16 +63,12 @@ class LatentModel(TensorModel, LearningModel):
     `step` is deterministic, `sample` samples the end. A tenth of the steps is held out to measure errors.
 
     space: of the vectors.
-    replay: the steps seen; its columns "state" and "next_state" have the images, as they came.
+    replay: its columns "state" and "next_state" have the images, as they came.
 
-    Args:
+    Args (others as of `FittedModel`):
         space: of images, (height, width, channels).
-        num_actions: A.
-        gamma: discount of a step after which the episode goes on.
         options: of networks and fits.
-        capacity: the number of steps that are kept; PgtsError unless it is above 32, and memory has room.
         seed: initial weights are from the stream (seed, "model").
-        action_repeat: see `TensorModel`.
     """
 
     def __init__(
@@ -92,17 +84,15 @@ class LatentModel(TensorModel, LearningModel):
         action_repeat: int = 1,
     ) -> None:
         super().__init__(
-            options.size, num_actions, merge=False, dtype=torch.float64, device=device, action_repeat=action_repeat
+            options.size,
+            num_actions,
+            torch.from_numpy(np.zeros((0, *space.shape), space.dtype)),
+            gamma=gamma,
+            capacity=capacity,
+            device=device,
+            action_repeat=action_repeat,
         )
-        if capacity <= BLOCK:
-            raise PgtsError(
-                f"capacity is {capacity}; a latent model keeps more than {BLOCK} steps, because so many in a row may "
-                "be held out (replay.capacity)"
-            )
-        self.gamma, self.options = gamma, options
-        self.replay: ReplayBuffer = ReplayBuffer(capacity)
-        none, images = torch.zeros(0), torch.from_numpy(np.zeros((0, *space.shape), space.dtype))
-        self.replay.add(state=images, action=none.long(), reward=none, end=none, next_state=images, follows=none.bool())
+        self.options = options
         generator, inputs = stream(seed, "model"), spaces.Box(-np.inf, np.inf, (options.size + num_actions,))
         self.space = spaces.Box(-np.inf, np.inf, (options.size,))
         network = options.network if isinstance(options.network, CNN) else default_network(space)
@@ -145,26 +135,12 @@ class LatentModel(TensorModel, LearningModel):
             PgtsError: steps with a discount other than gamma and 0.
             NotFinite: a reward, a loss or a gradient is not finite.
         """
-        discount_N, is_first = experience.discount_N, self.replay.num_added == 0
-        named_N = (discount_N != 0) & (discount_N != self.gamma)
-        if bool(named_N.any()):
-            raise PgtsError(
-                f"a step has the discount {float(discount_N[named_N][0])}; a latent model learns only whether an "
-                f"episode ends, so that discounts must be 0 or gamma, and gamma is {self.gamma}"
-            )
-        self.replay.add(
-            state=experience.observation_N,
-            action=experience.action_N,
-            reward=experience.reward_N.float(),
-            end=(discount_N == 0).float(),
-            next_state=experience.next_observation_N,
-            follows=experience.follows_N,
-        )
-        ranks = experience.ranks
+        ends, ranks, is_first = self._ends(experience.discount_N), experience.ranks, self.replay.num_added == 0
+        self._keep(experience)
         self._representation.trunk.encoder.absorb(experience.observation_N.to(self.device), ranks)
         self._measure_rewards(ranks)
         held_out = held_out_rows(self.replay)
-        count = self.options.updates_per_step * ranks.totals("steps", len(discount_N))[0]
+        count = self.options.updates_per_step * ranks.totals("steps", len(ends))[0]
         losses = self._fit(held_out, self.options.first_updates if is_first else round(count), generator, ranks)
         self.generation += 1
         return {**losses, **self._errors(held_out, ranks)}
@@ -270,7 +246,7 @@ class LatentModel(TensorModel, LearningModel):
         """The expected reward, the discount gamma (1 - p), and the next vector."""
         next_ND, output_N3 = self._advanced(state_ND, action_N)
         end_N = (output_N3[:, 2].double() - self._log_odds_added).sigmoid()
-        end_N = torch.where(end_N < _SELDOM, 0.0, end_N)
+        end_N = torch.where(end_N < SELDOM, 0.0, end_N)
         reward_N2 = self._reward_mean + self._reward_scale * output_N3[:, :2].double()
         return reward_N2[:, 0].lerp(reward_N2[:, 1], end_N), self.gamma * (1 - end_N), next_ND
 
@@ -279,10 +255,7 @@ class LatentModel(TensorModel, LearningModel):
         no end is sampled, and the discount is the mean one, as that of `step`."""
         if self.action_repeat > 1:
             return super().sample(state_N, action_N, key_N=key_N)
-        self.simulator_steps += len(state_N)
-        reward_N, discount_N, next_ND = self.step(self.states(state_N), action_N)
-        goes_on_N = uniform(key_N) * self.gamma < discount_N
-        return Transitions(reward_N, self.gamma * goes_on_N.double(), self.number(next_ND))
+        return self._with_ends(*self.step(self.states(state_N), action_N), key_N=key_N)
 
     @torch.no_grad()
     def _errors(self, held_out: Bool[Tensor, "R"], ranks: Ranks) -> dict[str, float]:

@@ -11,19 +11,15 @@ from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor, nn
 
 from pgts_torch.errors import NotFinite, PgtsError, check_count
-from pgts_torch.models.base import Experience, FallibleModel, LearningModel, Transitions
+from pgts_torch.models.base import Experience, FallibleModel, Transitions
 from pgts_torch.models.ensemble_networks import EnsembleNetworks
-from pgts_torch.models.held_out import BLOCK, held_out_rows, prediction_errors
+from pgts_torch.models.fitted import SELDOM, FittedModel
+from pgts_torch.models.held_out import held_out_rows, prediction_errors
 from pgts_torch.models.prediction import Prediction
-from pgts_torch.models.replay import ReplayBuffer
 from pgts_torch.models.rewards import value_range
-from pgts_torch.models.tensor import TensorModel
 from pgts_torch.options.models import Ensemble
 from pgts_torch.ranks import Ranks
-from pgts_torch.seeding import stream, uniform
-
-_SELDOM = 0.02
-"""Smaller probabilities of an end count as 0: a classifier never returns 0, and over many steps small ones add up."""
+from pgts_torch.seeding import stream
 
 _ENDS = 0.25
 """The share of a minibatch that is sampled from steps that ended an episode, which may be rare among all steps."""
@@ -33,7 +29,7 @@ _ENOUGH_STEPS, _UNEXPLAINED = 2000, 0.5
 
 
 @final
-class EnsembleModel(TensorModel, LearningModel, FallibleModel):
+class EnsembleModel(FittedModel, FallibleModel):
     """E networks that learn from steps alone what follows a state, a vector of D numbers, and an action:
 
         change of the state      smooth L1 loss, in standard deviations of changes
@@ -46,16 +42,9 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
     thing that is random in this model, and trusts no step on which members differ much. The model is an estimate:
     steps of the environment measure its error, and no step contradicts it.
 
-    replay: the steps seen; its column "state" has the states.
-
-    Args:
-        state_size: D.
-        num_actions: A; 0 where actions are vectors.   action_size: X, of these.
-        gamma: discount of a step after which the episode goes on.
+    Args (others as of `FittedModel`):
         options: of networks and fits.
-        capacity: the number of steps that are kept; PgtsError unless it is above 32, and memory has room.
         seed: initial weights are from the stream (seed, "model").
-        action_repeat: see `TensorModel`.
     """
 
     def __init__(
@@ -72,21 +61,17 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         action_size: int = 0,
     ) -> None:
         super().__init__(
-            state_size, num_actions, merge=False, dtype=torch.float64, device=device, action_repeat=action_repeat
+            state_size,
+            num_actions,
+            torch.zeros(0, state_size),
+            gamma=gamma,
+            capacity=capacity,
+            device=device,
+            action_repeat=action_repeat,
+            action_size=action_size,
+            copies=torch.zeros(0, options.members),
         )
-        self.gamma, self.options = gamma, options
-        if capacity <= BLOCK:
-            raise PgtsError(
-                f"capacity is {capacity}; an ensemble keeps more than {BLOCK} steps, because so many in a row may be "
-                "held out (replay.capacity)"
-            )
-        self.replay: ReplayBuffer = ReplayBuffer(capacity)
-        none = torch.zeros(0)
-        vectors, whole, flags = torch.zeros(0, state_size), none.long(), none.bool()
-        copies, actions = torch.zeros(0, options.members), whole if num_actions else torch.zeros(0, action_size)
-        self.replay.add(
-            state=vectors, action=actions, reward=none, end=none, next_state=vectors, follows=flags, copies=copies
-        )
+        self.options = options
         self._warned, self._end_share = False, 0.0
         self._reward_limits: tuple[float, float] | None = None  # where others have seen rewards as well
         self._networks = EnsembleNetworks(
@@ -119,22 +104,18 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         Warns:
             UserWarning: once, where half of the variance of changes is unexplained: observations may not be states.
         """
-        states, ends, ranks = self._checked(experience), experience.discount_N == 0, experience.ranks
-        is_first = self.replay.num_added == 0
-        self.replay.add(
-            state=states,
-            action=experience.action_N,
-            reward=experience.reward_N.float(),
-            end=ends.float(),
-            next_state=experience.next_observation_N.float(),
-            follows=experience.follows_N,
-            copies=self._copies(ends, generator),
-        )
+        if (shape := experience.observation_N.shape)[1:] != (self.state_size,):
+            raise PgtsError(
+                f"an observation has shape {tuple(shape[1:])}; an ensemble learns from vectors of {self.state_size} "
+                "numbers"
+            )
+        ends, ranks, is_first = self._ends(experience.discount_N), experience.ranks, self.replay.num_added == 0
+        self._keep(experience, copies=self._copies(ends, generator))
         self._measure_moments(ranks)
         held_out = held_out_rows(self.replay)
         trained = torch.nonzero(~held_out).flatten()
         ended = trained[self.replay.rows("end", trained) > 0]
-        new_R, *rows = ranks.each("kept steps", len(states), len(trained), len(ended)).T.tolist()
+        new_R, *rows = ranks.each("kept steps", len(ends), len(trained), len(ended)).T.tolist()
         self._end_share = sum(rows[1]) / sum(rows[0])
         count = self.options.first_updates if is_first else round(self.options.updates_per_step * sum(new_R))
         losses = [self._fit(trained, ended, rows, generator, ranks) for _ in range(count)]
@@ -144,22 +125,6 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
                 raise NotFinite(f"the loss of the learned model is {value}", what="model")
         self.generation += 1
         return {"loss": sum(found) / max(count, 1), **self._errors(held_out, ranks)}
-
-    def _checked(self, experience: Experience) -> Float[Tensor, "N D"]:
-        observation_N, discount_N = experience.observation_N, experience.discount_N
-        if observation_N.shape[1:] != (self.state_size,):
-            raise PgtsError(
-                f"an observation has shape {tuple(observation_N.shape[1:])}; an ensemble learns from vectors of "
-                f"{self.state_size} numbers"
-            )
-        named_N = (discount_N != 0) & (discount_N != self.gamma)
-        if bool(named_N.any()):
-            raise PgtsError(
-                f"a step has the discount {float(discount_N[named_N][0])}; an ensemble learns only whether an episode "
-                f"ends, so that discounts must be 0 or gamma, and gamma is {self.gamma}: give the gamma that all steps "
-                "have, if there is one"
-            )
-        return observation_N.float()
 
     def _copies(self, end_N: Bool[Tensor, "N"], generator: torch.Generator) -> Float[Tensor, "N E"]:
         """How often each member has each step: Poisson with mean 1, as in a bootstrap sample of many steps (Oza and
@@ -228,7 +193,7 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
     def members(self, state_ND: Float[Tensor, "N D"], action_N: Num[Tensor, "N ..."]) -> Prediction:
         """The predictions of all members."""
         said = self._networks.predict(state_ND, action_N, self._log_odds_added)
-        return said._replace(end_EN=torch.where(said.end_EN < _SELDOM, 0.0, said.end_EN))
+        return said._replace(end_EN=torch.where(said.end_EN < SELDOM, 0.0, said.end_EN))
 
     @property
     def _log_odds_added(self) -> float:
@@ -257,12 +222,9 @@ class EnsembleModel(TensorModel, LearningModel, FallibleModel):
         sampled, the discount is the mean one, as that of `step`, and all steps are trusted."""
         if self.action_repeat > 1:
             return super().sample(state_N, action_N, key_N=key_N)
-        self.simulator_steps += len(state_N)
         said = self.members(self.states(state_N), action_N)
         trusted_N = said.disagreement(self._deviations["state"]) <= self.options.max_disagreement
-        reward_N, discount_N, next_ND = self._means(said)
-        goes_on_N = uniform(key_N) * self.gamma < discount_N
-        return Transitions(reward_N, self.gamma * goes_on_N.double(), self.number(next_ND), trusted_N)
+        return self._with_ends(*self._means(said), key_N=key_N, trusted_N=trusted_N)
 
     def step_error(self, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N A"] | None:
         """An estimate, `Prediction.spread` for the values [l, u] that the rewards seen allow; None with one member,
