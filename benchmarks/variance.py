@@ -32,9 +32,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from pgts_torch.agent.advantages import gae, lambda_returns, score_function
+from pgts_torch.agent.collect import rollout
 from pgts_torch.agent.critics import TabularCritic
 from pgts_torch.agent.policies import SoftmaxPolicy
-from pgts_torch.agent.rollout import Rollout, rollout
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import TabularWorld
 from pgts_torch.bellman import backup
 from pgts_torch.envs.vector import TabularVectorEnv

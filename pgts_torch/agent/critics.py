@@ -12,8 +12,9 @@ from torch import Tensor
 
 from pgts_torch.agent.advantages import critic_targets
 from pgts_torch.agent.components import legal_only
+from pgts_torch.agent.imagine import simulated_returns
 from pgts_torch.agent.policies import Policy, exact_probs, fitting
-from pgts_torch.agent.rollout import Rollout, simulated_returns
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.bellman import policy_mean
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import SamplingModel

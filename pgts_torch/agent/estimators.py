@@ -15,10 +15,11 @@ from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.iteration import PolicyBatch
 from pgts_torch.agent.policies import Policy, TabularPolicy
-from pgts_torch.agent.rollout import Rollout, StateWeight
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.roots import Roots, roots_of
 from pgts_torch.errors import ModelMismatch
 from pgts_torch.models.drawn_actions import Drawn
+from pgts_torch.options.updates import StateWeight
 from pgts_torch.tabular.ascent import centred
 
 _ROUNDINGS = 16

@@ -10,12 +10,13 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Float
 from torch import Tensor
 
+from pgts_torch.agent.collect import rollout
 from pgts_torch.agent.gaussian import GaussianPolicy, Mean
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.rollout import FixedHorizon, rollout
 from pgts_torch.errors import check_count
 from pgts_torch.models.environments import EnvSource, close_environments
+from pgts_torch.options.rollouts import FixedHorizon
 from pgts_torch.seeding import SharedGenerators, stream
 
 UNLIMITED_LENGTH = 1000

@@ -3,14 +3,16 @@
 from typing import Any
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgts_torch.agent.collect import check_end, survival
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import COLUMNS, Rollout
 from pgts_torch.agent.world import ModelWorld, SimulatedWorld
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import SamplingModel
+from pgts_torch.options.rollouts import Horizon
 from pgts_torch.seeding import sample_keys
 
 
@@ -73,3 +75,44 @@ def imagine(
     )
     searched_TB = None if search_every == 1 else step_TB % search_every == 0
     return Rollout(torch.stack(observations), **columns, state_UB=torch.stack(states), searched_TB=searched_TB)
+
+
+def simulated_returns(
+    model: SamplingModel,
+    policy: Policy,
+    state_B: Int[Tensor, "B"],
+    horizon: Horizon,
+    *,
+    first_action_B: Int[Tensor, "B"] | None = None,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "B"], int]:
+    """Run one episode in the model from each state. Return their weighted sums of rewards, and their steps in total.
+
+    Args:
+        first_action_B: the first actions; None: they are sampled from the policy as well.
+
+    Raises:
+        PgtsError: an episode is longer than `max_length` of the geometric horizon, or a discount is outside [0, 1].
+    """
+    returns_B = torch.zeros(len(state_B), dtype=torch.float64, device=state_B.device)
+    row_N, state_N, weight_N = torch.arange(len(state_B), device=state_B.device), state_B, torch.ones_like(returns_B)
+    action_N = policy.sample(state_B, generator=generator) if first_action_B is None else first_action_B
+    num_steps = 0
+    for _ in range(horizon.limit):
+        sampled = model.sample(state_N, action_N, key_N=sample_keys(len(state_N), generator=generator))
+        if bool((off_N := ~((sampled.discount_N >= 0) & (sampled.discount_N <= 1))).any()):
+            n = int(torch.nonzero(off_N)[0, 0])
+            raise PgtsError(
+                f"the model's discount of state {int(state_N[n])} and action {int(action_N[n])} is "
+                f"{float(sampled.discount_N[n])}; it must be in [0, 1]"
+            )
+        returns_B[row_N] += weight_N * sampled.reward_N
+        num_steps += len(row_N)
+        weight_N = weight_N * survival(horizon, sampled.discount_N, generator)
+        alive_N = weight_N > 0
+        row_N, state_N, weight_N = row_N[alive_N], sampled.next_state_N[alive_N], weight_N[alive_N]
+        if len(row_N) == 0:
+            break
+        action_N = policy.sample(state_N, generator=generator)
+    check_end(horizon, len(row_N))
+    return returns_B, num_steps

@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pgts_torch.agent.collect import shared_generators
 from pgts_torch.agent.episodes import Episodes
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.rollout import COLUMNS, Rollout, shared_generators
+from pgts_torch.agent.rollout import COLUMNS, Rollout
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import PgtsError, check_count

@@ -1,48 +1,17 @@
-"""Rollouts: episodes of a policy in an environment, or in a model of it."""
+"""Rollouts: episodes of a policy, in an environment or in a model of it, and how many several processes have made."""
 
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Num, Shaped
 from torch import Tensor
 
-from pgts_torch.agent.episodes import Episodes
-from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.world import ModelWorld, World
-from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import Experience, SamplingModel
-from pgts_torch.models.snapshots import env_name
-from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, Horizon
+from pgts_torch.models.base import Experience
 from pgts_torch.options.updates import StateWeight
 from pgts_torch.ranks import ALONE, Ranks, Share
-from pgts_torch.seeding import SharedGenerators, sample_keys, seed_sequence
-
-
-def survival(horizon: Horizon, discount_B: Float[Tensor, "B"], generator: torch.Generator) -> Float[Tensor, "B"]:
-    """The factor of the weight of an episode after a step of this discount.
-
-    Fixed horizon: the discount. Geometric horizon: 1 with the discount as its probability, else 0; so visits are an
-    unbiased sample of d^pi, and undiscounted sums of rewards are unbiased estimates of v^pi.
-    """
-    if isinstance(horizon, FixedHorizon):
-        return discount_B.double()
-    uniform_B = torch.rand(discount_B.shape, generator=generator, dtype=torch.float64, device=generator.device)
-    return (uniform_B.to(discount_B.device) < discount_B).double()
-
-
-def check_end(horizon: Horizon, num_alive: int) -> None:
-    """PgtsError if episodes are alive at the limit of a geometric horizon."""
-    if num_alive and isinstance(horizon, GeometricHorizon):
-        raise PgtsError(
-            f"an episode is longer than max_length = {horizon.max_length} of the geometric horizon; is gamma 1?"
-        )
-
 
 COLUMNS = ("action_TB", "reward_TB", "discount_TB", "alive_TB", "weight_TB", "survival_TB")
 """The fields of `Rollout` with a row for each step."""
@@ -254,127 +223,3 @@ class Rollout:
         if state_weight == "occupancy":
             return weight_V / self.whole.episodes
         return torch.full_like(weight_V, 1 / self.share.total if state_weight == "visits" else 1.0)
-
-
-def rollout(
-    world: World,
-    policy: Policy,
-    horizon: Horizon,
-    *,
-    seed: int,
-    names: tuple[str | int, ...],
-    generator: torch.Generator,
-) -> Rollout:
-    """Run one episode in each environment of a world, from a reset.
-
-    The episodes are a function of (seed, names), `generator` and the policy alone. Environments are seeded, and while
-    they run so are the generators of the whole process (`SharedGenerators`), in case they use these.
-
-    Args:
-        world: the environments; where it has a model the rollout has states, which a lookahead may start from.
-        seed, names: the stream that the environments are seeded from.
-        generator: for actions and the geometric horizon.
-
-    Raises:
-        PgtsError: an episode is longer than `max_length` of the geometric horizon; or the environment raised an error
-            or returned something that is not a number; the message names environment, step and seed.
-
-    Warns:
-        UserWarning: an environment uses the generators of the whole process, once for each world.
-    """
-    seeds = seed_sequence(seed, *names, "env").generate_state(world.env.num_envs).tolist()
-    with shared_generators(world, seed, names):
-        return _episodes(world, policy, horizon, seeds, generator)
-
-
-@contextmanager
-def shared_generators(world: World, seed: int, names: tuple[str | int, ...]) -> Iterator[None]:
-    """A context in which the generators of the whole process are seeded, in case the environments use these."""
-    if world.draws_its_own:
-        yield
-        return
-    with SharedGenerators(seed, *names) as shared:
-        yield
-    if shared.used and not world.warned:
-        world.warned = True
-        warnings.warn(
-            f"{env_name(world.env)} uses the generator of {shared.used[0]}, which the whole process shares: it is "
-            "seeded for each iteration and restored afterwards; better use self.np_random",
-            stacklevel=4,
-        )
-
-
-def _episodes(world: World, policy: Policy, horizon: Horizon, seeds: list[int], generator: torch.Generator) -> Rollout:
-    num_envs, model_world = world.env.num_envs, world if isinstance(world, ModelWorld) else None
-    episodes = Episodes(world.env, gamma=world.gamma, seeds=seeds, masks=world.masks)
-    observations: list[Tensor] = []
-    reads: list[Tensor] = []
-
-    def observe() -> None:
-        observations.append(world.encode(episodes.observation))
-        if model_world:
-            reads.append(model_world.read(episodes.observation, observations[-1]))
-
-    with episodes.named("at the start"):
-        episodes.reset()
-        observe()
-    # numpy until the end, because operations on a few numbers cost several times more in torch
-    alive_B, weight_B = np.ones(num_envs, dtype=bool), np.ones(num_envs)
-    rows: list[tuple[np.ndarray, ...]] = []
-    while len(rows) < horizon.limit and alive_B.any():
-        action_B = policy.sample(world.perceive(observations[-1]), generator=generator).cpu().numpy()
-        with episodes.named(f"in step {len(rows)}"):
-            reward_B, discount_B, truncated_B = episodes.step(action_B, alive_B)
-            if world.reward_range is not None:
-                world.reward_range.check(reward_B[alive_B])
-            observe()
-        survival_B = survival(horizon, torch.from_numpy(discount_B), generator).numpy()
-        rows.append((action_B, reward_B, discount_B, alive_B, weight_B * alive_B, survival_B))
-        weight_B = weight_B * survival_B
-        alive_B = alive_B & (survival_B > 0) & ~truncated_B
-    check_end(horizon, int(alive_B.sum()))
-    arrays = (torch.from_numpy(np.array(column)).to(world.device) for column in zip(*rows, strict=True))
-    columns: dict[str, Any] = dict(zip(COLUMNS, arrays, strict=True))
-    state_UB = model_world.numbers(torch.cat(reads)).view(len(reads), -1) if model_world else None
-    return Rollout(torch.stack(observations), **columns, state_UB=state_UB)
-
-
-def simulated_returns(
-    model: SamplingModel,
-    policy: Policy,
-    state_B: Int[Tensor, "B"],
-    horizon: Horizon,
-    *,
-    first_action_B: Int[Tensor, "B"] | None = None,
-    generator: torch.Generator,
-) -> tuple[Float[Tensor, "B"], int]:
-    """Run one episode in the model from each state. Return their weighted sums of rewards, and their steps in total.
-
-    Args:
-        first_action_B: the first actions; None: they are sampled from the policy as well.
-
-    Raises:
-        PgtsError: an episode is longer than `max_length` of the geometric horizon, or a discount is outside [0, 1].
-    """
-    returns_B = torch.zeros(len(state_B), dtype=torch.float64, device=state_B.device)
-    row_N, state_N, weight_N = torch.arange(len(state_B), device=state_B.device), state_B, torch.ones_like(returns_B)
-    action_N = policy.sample(state_B, generator=generator) if first_action_B is None else first_action_B
-    num_steps = 0
-    for _ in range(horizon.limit):
-        sampled = model.sample(state_N, action_N, key_N=sample_keys(len(state_N), generator=generator))
-        if bool((off_N := ~((sampled.discount_N >= 0) & (sampled.discount_N <= 1))).any()):
-            n = int(torch.nonzero(off_N)[0, 0])
-            raise PgtsError(
-                f"the model's discount of state {int(state_N[n])} and action {int(action_N[n])} is "
-                f"{float(sampled.discount_N[n])}; it must be in [0, 1]"
-            )
-        returns_B[row_N] += weight_N * sampled.reward_N
-        num_steps += len(row_N)
-        weight_N = weight_N * survival(horizon, sampled.discount_N, generator)
-        alive_N = weight_N > 0
-        row_N, state_N, weight_N = row_N[alive_N], sampled.next_state_N[alive_N], weight_N[alive_N]
-        if len(row_N) == 0:
-            break
-        action_N = policy.sample(state_N, generator=generator)
-    check_end(horizon, len(row_N))
-    return returns_B, num_steps

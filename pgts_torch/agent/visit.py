@@ -2,10 +2,11 @@
 
 from typing import Any
 
+from pgts_torch.agent.collect import rollout
 from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.ongoing import OngoingEpisodes
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.rollout import Rollout, rollout
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import ModelWorld, World
 from pgts_torch.ranks import Ranks
 

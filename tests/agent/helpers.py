@@ -5,11 +5,13 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
+from pgts_torch.agent.collect import rollout
 from pgts_torch.agent.policies import Policy, SimplexPolicy
-from pgts_torch.agent.rollout import Horizon, Rollout, rollout
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import TabularWorld
 from pgts_torch.envs import TabularVectorEnv
 from pgts_torch.models.tabular import tabular_truth
+from pgts_torch.options.rollouts import Horizon
 from pgts_torch.seeding import stream
 from pgts_torch.tabular import TabularMDP
 

@@ -8,12 +8,14 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 
+from pgts_torch.agent.collect import rollout
 from pgts_torch.agent.make_world import make_world
 from pgts_torch.agent.neural import NetworkPolicy
-from pgts_torch.agent.rollout import Horizon, Rollout, rollout
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.options import FixedHorizon, GeometricHorizon
 from pgts_torch.options.environment import Observed
+from pgts_torch.options.rollouts import Horizon
 from pgts_torch.seeding import stream
 
 

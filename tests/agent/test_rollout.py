@@ -5,7 +5,8 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
 
-from pgts_torch.agent.rollout import Rollout, simulated_returns
+from pgts_torch.agent.imagine import simulated_returns
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.bellman import Outcomes
 from pgts_torch.envs import TabularVectorEnv
 from pgts_torch.errors import PgtsError

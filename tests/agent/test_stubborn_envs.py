@@ -10,8 +10,8 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch import PGTS, evaluate
+from pgts_torch.agent.imagine import simulated_returns
 from pgts_torch.agent.policies import SoftmaxPolicy
-from pgts_torch.agent.rollout import simulated_returns
 from pgts_torch.cli.main import main
 from pgts_torch.errors import Failed, MissingModel, NotFinite, PgtsError
 from pgts_torch.models import check_model

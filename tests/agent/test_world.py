@@ -14,7 +14,7 @@ from torch import Tensor
 from pgts_torch import PGTS
 from pgts_torch.agent import make_world as worlds
 from pgts_torch.agent.build import make_policy
-from pgts_torch.agent.rollout import rollout
+from pgts_torch.agent.collect import rollout
 from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel, with_torques
