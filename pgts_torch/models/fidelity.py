@@ -150,8 +150,7 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
         raise PgtsError(f"continuations is {continuations} and length is {length}; both must be at least 1")
     make = EnvSource.of(env).make_one
     first, claims = make(), tuple(_claims(make(), seed=seed))
-    name, space = env_name(first), first.action_space
-    known, mdp = None, published_table(first, gamma=_GAMMA)
+    name, known, mdp = env_name(first), None, published_table(first, gamma=_GAMMA)
     try:
         known = known_adapter(first)
     except MissingModel:
@@ -160,38 +159,15 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
     if known is None and mdp is not None:
         share = float(((TabularModel(mdp).frequencies() > 0).sum(-1) > 1).double().mean())
         return Report(name, "table", mdp.num_states, mdp.num_actions, share, claims, cost=None)
-    adapter: SnapshotAdapter = known or PickledAttributes()
-    is_box = isinstance(space, spaces.Box)
-    outer = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if is_box else all_actions(space)
+    setup, shares = _setup(make, first, known or PickledAttributes(), seed=seed), [0.0]
     try:
-        actions = [*map(transforms_of(first).action, outer)]
-    except MissingModel:  # a wrapper may have a memory, which then belongs to the state
-        adapter, actions = Layered(adapter), [*outer]
-    random, alike = numpy_stream(seed, "check_model"), not own_to_each(make)
-    setup = Setup(lambda: inside(make(), adapter), adapter, actions, random, alike=alike)
-    try:
-        setup = replace(setup, masks=masks_in(new := setup.make(), actions, setup.reset(new, seed=seed).info))
+        seen = setup.reset(new := setup.make(), seed=seed)
+        setup = replace(setup, masks=masks_in(new, setup.actions, seen.info))
         walks = walks_of(setup, continuations, length)
     except PgtsError as error:
         raise failure(f"{name} fails in random walks with seed {seed}", error) from error
-    shares, others = [0.0], functools.cache(lambda: repeated(setup, walks))
-
-    def restore() -> str:
-        beside_snapshots(setup)
-        if isinstance(adapter, Layered):
-            check_resets(setup)
-        return restored(walks, others())
-
-    checks = (
-        _check("answers", lambda: _answers(setup, walks, shares)),
-        _check("restore", restore),
-        _check("merge", lambda: _merged(walks, others()), needed=False),
-        _check("chance", lambda: chance(setup, walks)),
-        _check("untouched", lambda: untouched(setup, length)),
-        *_clock(setup),
-        *claims,
-    )
-    report = Report(name, adapter.name, None, len(actions), shares[-1], checks, cost=None)
+    checks = (*_simulator_checks(setup, walks, length, shares), *claims)
+    report = Report(name, setup.adapter.name, None, len(setup.actions), shares[-1], checks, cost=None)
     if known is None and not report.usable:
         raise MissingModel(f"{not_restored(first)}; its attributes, pickled, are not enough: {report.missing}")
     try:
@@ -200,6 +176,37 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
         if report.usable:
             raise failure(f"{name} fails where its calls are timed", error) from error
         return report
+
+
+def _setup(make: Callable[[], gymnasium.Env], env: gymnasium.Env, adapter: SnapshotAdapter, *, seed: int) -> Setup:
+    """How walks are made and restored. A wrapper that may have a memory is a part of what is restored."""
+    space = env.action_space
+    is_box = isinstance(space, spaces.Box)
+    outer = sampled_actions(space, _CONTINUOUS_ACTIONS, seed=seed) if is_box else all_actions(space)
+    try:
+        actions = [*map(transforms_of(env).action, outer)]
+    except MissingModel:
+        adapter, actions = Layered(adapter), [*outer]
+    random, alike = numpy_stream(seed, "check_model"), not own_to_each(make)
+    return Setup(lambda: inside(make(), adapter), adapter, actions, random, alike=alike)
+
+
+def _simulator_checks(setup: Setup, walks: Sequence[Walk], length: int, shares: list[float]) -> Iterator[Check]:
+    """The checks of what is restored, in the order of `check_model`; `shares` gets that of random outcomes."""
+    others = functools.cache(lambda: repeated(setup, walks))
+
+    def restore() -> str:
+        beside_snapshots(setup)
+        if isinstance(setup.adapter, Layered):
+            check_resets(setup)
+        return restored(walks, others())
+
+    yield _check("answers", lambda: _answers(setup, walks, shares))
+    yield _check("restore", restore)
+    yield _check("merge", lambda: _merged(walks, others()), needed=False)
+    yield _check("chance", lambda: chance(setup, walks))
+    yield _check("untouched", lambda: untouched(setup, length))
+    yield from _clock(setup)
 
 
 def _check(name: str, check: Callable[[], str], *, needed: bool = True) -> Check:
