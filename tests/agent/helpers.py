@@ -45,7 +45,7 @@ def made_in(
     generator: torch.Generator | None = None,
 ) -> Rollout:
     """A rollout in the world of these environments; `gamma` is the discount of steps that name none."""
-    world = TabularWorld(env, tabular_truth(env, gamma=0.9))
+    world = TabularWorld(env, tabular_truth(env, gamma=0.9), masks="off")
     world.gamma = gamma
     generator = generator or stream(seed, *names)
     return rollout(world, policy, horizon, seed=seed, names=names, generator=generator)
