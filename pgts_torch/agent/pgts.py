@@ -14,11 +14,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pgts_torch.agent import saved, saving
+from pgts_torch.agent.acting import Acting
 from pgts_torch.agent.build import Description, MakesModule, make_device, plain
-from pgts_torch.agent.components import row_shape
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.draws import Draws
-from pgts_torch.agent.gaussian import GaussianPolicy, Mean
+from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.iteration import Iteration, PolicyBatch
 from pgts_torch.agent.model_check import Mode
 from pgts_torch.agent.parts import make_parts
@@ -31,7 +31,6 @@ from pgts_torch.agent.world import SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.environments import Given, close_environments
-from pgts_torch.models.masks import ActionMasks, Masked
 from pgts_torch.options.arguments import shortest
 from pgts_torch.ranks import present_ranks
 from pgts_torch.search.lookahead import Lookahead
@@ -152,7 +151,7 @@ class PGTS:
             self.options, self.search, self.dyna, levels=levels, calls=lambda: parts.model_calls, ranks=self.ranks
         )
         self._arguments = arguments | {"env": self.source.description, "device": str(self.device)}
-        self._own_actions, self._squash = self.source.own_actions(self.world.env), self.source.squash(self.world.env)
+        self._act = Acting(self.world, self.source)
         self._generator = stream(seed, "predict", device=self.device)
 
     @torch.inference_mode(False)
@@ -318,41 +317,8 @@ class PGTS:
         Raises:
             PgtsError: an observation or a mask is none of the environment, or the mask is missing, or of no use.
         """
-        observation_N = self.world.encode(self._masked(observation, action_mask))
-        shape = observation_N.shape[: observation_N.ndim - len(row_shape(self.world.observation_space))]
-        observation_N = self.world.perceive(observation_N.reshape(-1, *observation_N.shape[len(shape) :]))
         generator = generator or self._generator
-        if isinstance(self.policy, GaussianPolicy):
-            policy: Policy = Mean(self.policy) if deterministic else self.policy
-            vector_NX = policy.sample(observation_N, generator=generator).cpu().numpy()
-            assert self._squash is not None
-            return self._squash.actions(vector_NX.reshape(*shape, -1))
-        if deterministic:
-            action_N = self.policy.probs(observation_N).argmax(-1)
-        else:
-            action_N = self.policy.sample(observation_N, generator=generator)
-        action = action_N.cpu().numpy().reshape(shape)
-        return action[()] if self._own_actions is None else self._own_actions[action]
-
-    def _masked(self, observation: Any, action_mask: Any) -> Any:
-        """An observation with its legal actions."""
-        masks = self.world.masks
-        if isinstance(masks, ActionMasks) and not self.world.shows_masks and action_mask is None:
-            return observation  # a table knows the legal actions of each state
-        if not isinstance(masks, ActionMasks):
-            if action_mask is not None:
-                raise PgtsError(
-                    f"action_mask is given; {self.source.name} was trained without action masks, with all actions legal"
-                )
-            return observation
-        if action_mask is None:
-            raise PgtsError(
-                f"{self.source.name} has action masks: give the one of this observation, as {masks.what} has it, in "
-                "predict(observation, action_mask=...)"
-            )
-        one = isinstance(action_mask, tuple) or np.ndim(action_mask) <= 1
-        legal_A = masks.read(action_mask) if one else np.array([masks.read(row) for row in np.asarray(action_mask)])
-        return Masked(observation, legal_A)
+        return self._act(self.policy, observation, action_mask, deterministic=deterministic, generator=generator)
 
     def save(self, path: str | Path) -> None:
         """Write arguments and state into one file with a checksum, without an environment that was given as an object.

@@ -83,7 +83,9 @@ def test_a_pendulum_is_trained_by_a_knob_and_measured_again_from_its_folder(tmp_
     assert summary.model_calls > 0
     answer = evaluate_run(tmp_path / "run", episodes=3, seed=0)
     assert answer["deterministic"] == summary.deterministic
-    with pytest.raises(PgtsError, match=r"the actions of Pendulum-v1 are continuous, .*: set actions_per_dimension"):
+    with pytest.raises(
+        PgtsError, match=r"the actions of Pendulum-v1 are continuous, .*: take the policy 'gaussian', or set actions"
+    ):
         run.build(small(tmp_path, env="Pendulum-v1"))
 
 
