@@ -139,12 +139,12 @@ def test_continuous_actions_need_no_model_where_advantages_are_sampled():
         (
             "Pendulum-v1",
             {},
-            r"the actions of Pendulum-v1 are continuous, Box.*: take the policy 'gaussian', or set actions_per_dimension",
+            r"the actions of Pendulum-v1 are continuous, Box.*: take the policy 'gaussian', or set actions",
         ),
         (
             Field,
             {},
-            r"the actions of Field are continuous, Box.*: take the policy 'gaussian', or set actions_per_dimension",
+            r"the actions of Field are continuous, Box.*: take the policy 'gaussian', or set actions",
         ),
         ("CartPole-v1", {"actions_per_dimension": 3}, r"actions_per_dimension is 3; .*CartPole-v1.* discrete actions"),
         ("pgts/Ladder-v0", {"actions_per_dimension": 3}, "actions_per_dimension is 3; pgts/Ladder-v0 has discrete"),
