@@ -67,6 +67,7 @@ def test_the_python_of_a_page_runs_and_prints_what_it_says(page, tmp_path, monke
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("default::UserWarning")  # which say what a model costs
 @pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize("page", [page for page, path in PAGES.items() if "<!-- long -->" in path.read_text()])
 def test_what_takes_longer_runs_too(page, tmp_path, monkeypatch):
