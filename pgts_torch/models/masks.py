@@ -231,13 +231,8 @@ def masks_of(env: VectorEnv, make: Callable[[], gymnasium.Env] | None) -> Action
     if isinstance(base, TabularVectorEnv | CartPoles) or not isinstance(space, spaces.Discrete):
         return None
     by_method = has_method(env)
-    if not by_method:
-        other = None if make is None else make()
-        info = (env if other is None else other).reset(seed=0)[1]
-        if other is not None:
-            other.close()
-        if KEY not in info:
-            return None
+    if not by_method and KEY not in (env if make is None else make()).reset(seed=0)[1]:
+        return None
     if isinstance(base, SyncVectorEnv):
         return ActionMasks.of_env(base.envs[0], range(int(space.n)), by_method=by_method)
     return ActionMasks.plain(int(space.n), by_method=by_method)
