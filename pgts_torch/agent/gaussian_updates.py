@@ -9,7 +9,7 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, final
+from typing import final
 
 import torch
 from jaxtyping import Float
@@ -19,12 +19,10 @@ from pgts_torch.agent.gaussian import GaussianPolicy, Normals
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural_updates import check_numbers, mean
-from pgts_torch.agent.optimisers import Optimiser, minibatches
+from pgts_torch.agent.optimisers import minibatches
 from pgts_torch.agent.policies import Policy
+from pgts_torch.agent.stepped import SteppedUpdate
 from pgts_torch.agent.target_updates import advantage_scale
-from pgts_torch.agent.updates import Update
-from pgts_torch.options.fields import limit
-from pgts_torch.options.schedules import at
 from pgts_torch.options.updates import MPO, PPO, Gradient
 from pgts_torch.ranks import Ranks
 from pgts_torch.search.lookahead import check_finite
@@ -33,23 +31,12 @@ _HALVINGS, _WIDEST = 40, 1e6
 """How often an interval of temperatures is halved, from this factor below the scale of advantages to it above."""
 
 
-class GaussianUpdate(Update):
+class GaussianUpdate(SteppedUpdate):
     """Gradient steps on the parameters of a Gaussian policy. Statistics of observations are treated as by
     `NetworkUpdate`.
-
-    now: the options, with the present values of those that are schedules.
     """
 
     policies = (GaussianPolicy,)
-
-    def __init__(self, options: Any) -> None:
-        self.options, self.state_weight = options, options.state_weight
-        self.now = at(options, 0)
-        self._optimiser = Optimiser(
-            learning_rate=self.now.learning_rate,
-            max_grad_norm=limit(options.max_grad_norm),
-            method=options.optimizer,
-        )
 
     def __call__(self, policy: Policy, batch: Batch, *, generator: torch.Generator) -> dict[str, float]:
         """Take the gradient steps.
@@ -66,8 +53,7 @@ class GaussianUpdate(Update):
         assert isinstance(policy, GaussianPolicy)
         assert batch.drawn is not None
         network, encoder, ranks = policy.network, policy.network.trunk.encoder, batch.ranks
-        self.now = at(self.options, self.num_env_steps)
-        self._optimiser.learning_rate = self.now.learning_rate
+        self._follow_schedules()
         with self._optimiser.attempt(network.tensors) as readings:
             check_numbers(batch, readings)
             if fresh := encoder.fresh:
@@ -122,17 +108,6 @@ class GaussianUpdate(Update):
         self, now: Normals, old: Normals, *aims: Tensor
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N X"], Float[Tensor, "N X"]]:
         """The loss of each row, and its gradient in mean and log std of the present policy."""
-
-    def state_dict(self) -> dict[str, Any]:
-        return self._optimiser.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._optimiser.load_state_dict(state)
-
-    def check(self, policy: Policy) -> None:
-        super().check(policy)
-        assert isinstance(policy, GaussianPolicy)
-        self._optimiser.check_fits(policy.network.weights)
 
 
 @final

@@ -25,12 +25,10 @@ from pgts_torch.agent.gradients import Forward, through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural import NetworkPolicy
-from pgts_torch.agent.optimisers import Optimiser, minibatches
+from pgts_torch.agent.optimisers import minibatches
 from pgts_torch.agent.policies import Policy
-from pgts_torch.agent.updates import Update
+from pgts_torch.agent.stepped import SteppedUpdate
 from pgts_torch.errors import NotFinite, PgtsError
-from pgts_torch.options.fields import limit
-from pgts_torch.options.schedules import at
 from pgts_torch.options.updates import PPO, Gradient
 from pgts_torch.ranks import Ranks, Share
 from pgts_torch.readings import Readings
@@ -40,10 +38,9 @@ _LOG_OF_ZERO = -1e4
 """In place of log pi(a|s) = -inf of an action that is not legal: its exp is 0, and 0 times it is no NaN."""
 
 
-class NetworkUpdate(Update):
+class NetworkUpdate(SteppedUpdate):
     """Gradient steps on the parameters of a network policy.
 
-    now: the options, with the present values of those that are schedules.
     form: what its objective is for `DenseSteps.policy`.
 
     The batch is added to running statistics of observations after the steps, so that these start from the policy that
@@ -52,15 +49,6 @@ class NetworkUpdate(Update):
 
     policies = (NetworkPolicy,)
     form: str
-
-    def __init__(self, options: Any) -> None:
-        self.options, self.state_weight = options, options.state_weight
-        self.now = at(options, 0)
-        self._optimiser = Optimiser(
-            learning_rate=self.now.learning_rate,
-            max_grad_norm=limit(options.max_grad_norm),
-            method=options.optimizer,
-        )
 
     def __call__(self, policy: Policy, batch: Batch, *, generator: torch.Generator) -> dict[str, float]:
         """Take the gradient steps.
@@ -76,8 +64,7 @@ class NetworkUpdate(Update):
         """
         assert isinstance(policy, NetworkPolicy)
         network, encoder = policy.network, policy.network.trunk.encoder
-        self.now = at(self.options, self.num_env_steps)
-        self._optimiser.learning_rate = self.now.learning_rate
+        self._follow_schedules()
         ranks = batch.ranks
         with self._optimiser.attempt(network.tensors) as readings:
             if (legal_NA := encoder.legal(batch.observation_N)) is not None:
@@ -95,17 +82,6 @@ class NetworkUpdate(Update):
             if not fresh:
                 encoder.absorb(batch.observation_N, ranks)
         return readings.means
-
-    def state_dict(self) -> dict[str, Any]:
-        return self._optimiser.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._optimiser.load_state_dict(state)
-
-    def check(self, policy: Policy) -> None:
-        super().check(policy)
-        if isinstance(policy, NetworkPolicy):
-            self._optimiser.check_fits(policy.network.weights)
 
     @abstractmethod
     def move(

@@ -227,14 +227,18 @@ class PGTS:
                 self.world.model.env.close()
 
     def __repr__(self) -> str:
-        """The call that makes such a training; what its lookahead queries, and how far it is."""
+        """The call that makes such a training, where the environment is an id; what is queried, and how far it is."""
         others = {name: self._arguments[name] for name in ("gamma", "env_kwargs", "seed", "device")}
         given = shortest(self.options) | {
             name: each for name, each in others.items() if each not in (None, {}, 0, "cpu")
         }
         model = getattr(self.world, "model", None)
         queried = "no model" if self.depth_choice is None or model is None else type(model).__name__
-        arguments = [repr(self.source.name), *(f"{name}={value!r}" for name, value in given.items())]
+        env = self._arguments["env"]
+        arguments = [
+            repr(env) if isinstance(env, str) else self.source.name,
+            *(f"{name}={value!r}" for name, value in given.items()),
+        ]
         return f"PGTS({', '.join(arguments)})  # {queried}, {self.num_env_steps:,} steps"
 
     def __enter__(self) -> Self:

@@ -54,7 +54,7 @@ class PolicyLookahead:
 
     def restart(self, generator: torch.Generator) -> None:
         """Reset the search before a lookahead for which states have got new numbers, or the model has learned. Where
-        actions are drawn they are drawn anew, from a key of this generator."""
+        actions are drawn, others are drawn, from a key of this generator."""
         if self._drawing is not None:
             assert isinstance(self.policy, GaussianPolicy)
             key = mix(sample_keys(1, generator=generator), 1).to(self.world.device)

@@ -180,7 +180,8 @@ def test_a_capacity_of_which_all_may_be_held_out_is_refused(capacity):
 
 
 def test_a_capacity_of_one_block_and_a_step_is_enough():
-    PGTS("CartPole-v1", **ENSEMBLE | {"replay": REPLAY.model_copy(update={"capacity": 33})}).learn(150)
+    model = PGTS("CartPole-v1", **ENSEMBLE | {"replay": REPLAY.model_copy(update={"capacity": 33})}).learn(150)
+    assert model.num_env_steps >= 150
 
 
 @pytest.mark.parametrize("wrapper", [gymnasium.wrappers.NormalizeObservation, gymnasium.wrappers.NormalizeReward])

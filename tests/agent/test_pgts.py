@@ -369,3 +369,7 @@ def test_what_is_printed_of_a_training_makes_the_same_one_again(arguments):
     assert (again.gamma, again.seed, again.source.name) == (model.gamma, model.seed, model.source.name)
     assert repr(again) == repr(model)
     assert repr(PGTS(**{**arguments, "seed": 9})) != repr(model)
+
+
+def test_an_environment_that_is_an_object_is_printed_as_no_id():
+    assert repr(PGTS(lambda: gymnasium.make("CartPole-v1"), depth=1)).startswith("PGTS(<lambda>, ")
