@@ -17,8 +17,11 @@ HERE = Path(__file__).parent
 
 project, author = "pgts_torch", "the authors of pgts_torch"
 version = release = version_of("pgts_torch")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "figures"]
+# Tutorials are run where they have changed; a cell that fails ends the build.
+nb_execution_mode, nb_execution_cache_path = "cache", str(HERE / "_build/.jupyter_cache")
+nb_execution_timeout, nb_execution_raise_on_error = 600, True
 html_theme, html_title = "furo", f"pgts_torch {version}"
 myst_heading_anchors = 3
 autodoc_member_order, autodoc_typehints = "bysource", "none"

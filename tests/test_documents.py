@@ -22,6 +22,8 @@ PAGES = {
     str(path.relative_to(ROOT)): path
     for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs/start").glob("*.md")))
 }
+LINKED = PAGES | {str(path.relative_to(ROOT)): path for path in sorted((ROOT / "docs/tutorials").glob("*.md"))}
+"""With those whose Python `test_tutorials` runs."""
 
 
 class Block(NamedTuple):
@@ -33,7 +35,7 @@ class Block(NamedTuple):
 
 
 def blocks(page: str) -> list[Block]:
-    found = re.findall(r"^(<!-- long -->\n)?```(\w*)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    found = re.findall(r"^(<!-- long -->\n)?```(\w*|\{code-cell\} python)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     return [Block(language, text, bool(long)) for long, language, text in found]
 
 
@@ -83,9 +85,9 @@ def test_another_number_than_the_printed_one_is_noticed():
     assert says(wanted.replace("1.26", "1.25"), got)
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", LINKED)
 def test_commands_and_links_of_a_page_exist(page, capsys):
-    text = PAGES[page].read_text(encoding="utf-8")
+    text = LINKED[page].read_text(encoding="utf-8")
     for block in blocks(text):
         for line in block.text.splitlines() if block.language == "sh" else ():
             program, command, *arguments = shlex.split(line)
@@ -95,7 +97,7 @@ def test_commands_and_links_of_a_page_exist(page, capsys):
                 known = capsys.readouterr().out
                 assert all(word in known for word in arguments if word.startswith("--"))
     for link in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
-        assert (PAGES[page].parent / link).exists(), link
+        assert (LINKED[page].parent / link).exists(), link
 
 
 @pytest.mark.parametrize("package", ["models", "search", "tabular", "envs"])

@@ -1,0 +1,89 @@
+"""The tutorials of docs/tutorials: their cells run as plain Python, and what their text says is what these find."""
+
+import contextlib
+import io
+import re
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import pytest
+
+TUTORIALS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "docs/tutorials").glob("*.md"))}
+
+SHORT: dict[str, dict[str, Any]] = {}
+"""Of the tutorials that take longer: the values that shorten their cell tagged `parameters`, as papermill has them."""
+
+
+def run(text: str, parameters: dict[str, Any]) -> tuple[types.SimpleNamespace, str]:
+    """The names that the cells of a tutorial leave, and what they print."""
+    import matplotlib.pyplot as plt
+
+    names = vars(module := types.ModuleType("tutorial"))
+    sys.modules["tutorial"] = module  # where its classes are found by their names
+    with contextlib.redirect_stdout(io.StringIO()) as out, matplotlib.rc_context({"backend": "agg"}):
+        for options, cell in re.findall(r"^```\{code-cell\} python\n((?::\w+:[^\n]*\n)*)(.*?)^```$", text, re.M | re.S):
+            exec(cell, names)
+            if "parameters" in options:
+                assert set(parameters) <= set(names)
+                names.update(parameters)
+        plt.close("all")
+    return types.SimpleNamespace(**names), out.getvalue()
+
+
+def certificate(it: Any, out: str) -> None:
+    # Stuck: the gap is 0, and the certificate large. Free: it ends by its certificate.
+    assert all(gap < 1e-3 and bound > 6 for gap, bound, _ in it.stuck_rows)
+    assert it.stuck.certificates.trust == it.free.certificates.trust == "proved"
+    assert it.free_rows[-1][1] <= 0.01 < it.free_rows[-2][1]
+    # Upper bounds, on the line with an exact critic, behind it with a learned one.
+    assert all(bound >= missing for _, bound, missing in [*it.stuck_rows, *it.free_rows, *it.learned_rows])
+    assert all(bound == pytest.approx(missing, abs=1e-3) for _, bound, missing in it.free_rows)
+    assert it.learned.certificates.trust == "critic"
+    assert it.learned_rows[-1][1] > 1 > 0.01 > it.learned_rows[-1][2]
+    # Counts: from nothing known to little missing, and not in each iteration.
+    assert it.computed[0] == 10 > 1 > it.computed[-1]
+    assert len(it.computed) < len(it.bounds)
+
+
+CLAIMS: dict[str, Callable[[Any, str], None]] = {"certificate": certificate}
+
+
+def test_every_tutorial_is_short_and_ends_with_what_to_try_next():
+    assert set(CLAIMS) == set(TUTORIALS)
+    for path in TUTORIALS.values():
+        text = path.read_text(encoding="utf-8")
+        assert 60 <= len(text.splitlines()) <= 150
+        assert text.count("\n## What to try next\n") == 1
+        assert not re.search(r"^#", text.split("\n## What to try next\n")[1], re.M)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.filterwarnings("default::UserWarning")  # which say what a model costs
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_the_cells_of_a_tutorial_run_as_plain_python(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = run(TUTORIALS[name].read_text(encoding="utf-8"), SHORT.get(name, {}))
+    if name not in SHORT:
+        CLAIMS[name](*found)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.filterwarnings("default::UserWarning")
+@pytest.mark.parametrize("name", SHORT)
+def test_what_a_longer_tutorial_says_is_what_its_cells_find(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    CLAIMS[name](*run(TUTORIALS[name].read_text(encoding="utf-8"), {}))
+
+
+def test_a_failing_cell_and_an_unknown_parameter_are_noticed():
+    cell = "```{code-cell} python\n:tags: [parameters]\nsteps = 5\n```\n```{code-cell} python\nprint(1 / steps)\n```\n"
+    assert run(cell, {"steps": 4})[1] == "0.25\n"
+    with pytest.raises(ZeroDivisionError):
+        run(cell, {"steps": 0})
+    with pytest.raises(AssertionError):
+        run(cell, {"stps": 4})
