@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from pgts_torch.compiled import jit
+from pgts_torch.compiled import allocating, jit
 
 _AHEAD = 64
 """How many outcomes ahead a value is fetched from memory."""
@@ -67,7 +67,7 @@ def is_finite(v):  # type: ignore[no-untyped-def]
     return off == 0
 
 
-@jit
+@allocating
 def back_up(reward, weight, child, A, K, v, times, q):  # type: ignore[no-untyped-def]
     """v after `times` sweeps v <- max_a q; with the last of them q is written too, unless it is empty."""
     N, size = len(reward) // A, weight.dtype.type(1)

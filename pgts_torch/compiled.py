@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -25,6 +25,8 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 
 SWITCH = "PGTS_COMPILED"
 """The environment variable that is 0 where nothing is to be compiled; a process reads it once."""
+
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 _LITTLE = 256
 """Work on fewer numbers takes less time than loading numba."""
@@ -59,41 +61,48 @@ def torch_only() -> Iterator[None]:
 
 def jit(function: _Function) -> _Function:
     """The function, compiled by numba when it is first called: for numpy arrays and numbers, and with sums in the order
-    in which they are written. Divisions by zero are not noticed.
+    in which they are written. Divisions by zero are not noticed. It makes no arrays and returns none: numba then counts
+    no references to those that it is given, which in loops over nodes takes up to half of the time.
 
     What it calls must be marked too, and stand in a file of the same folder whose name ends in `_kernels` or
     `_records`: a function is read from the disk as long as none of these files has changed.
     """
-    import numba
+    return _kept(function, _nrt=False)
 
-    function = inspect.unwrap(function)  # without the shape checks of tests, which numba cannot read
-    # Numba compares the age of one file, but also finds what it has kept by this name.
-    function.__qualname__ += "_" + _digest(Path(function.__code__.co_filename).parent)
-    try:
-        machine_code: _Function = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError as error:  # no folder for it
-        _say_not_kept(str(error))
-        machine_code = numba.njit(nogil=True, error_model="numpy")(function)
-    return machine_code
+
+def allocating(function: _Function) -> _Function:
+    """As `jit`, for a function that makes arrays, if only by `max` or `np.dot`, or returns them."""
+    return _kept(function)
 
 
 def inlined(function: _Function) -> _Function:
     """The function, which becomes a part of those that call it: they are marked with `jit`, see there."""
     import numba
 
-    function = inspect.unwrap(function)
-    inside = numba.njit(
-        forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, nogil=True, error_model="numpy"
-    )
-    machine_code: _Function = inside(function)
+    inside = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, **_OPTIONS)
+    machine_code: _Function = inside(inspect.unwrap(function))
+    return machine_code
+
+
+def _kept(function: _Function, **options: Any) -> _Function:
+    import numba
+
+    function = inspect.unwrap(function)  # without the shape checks of tests, which numba cannot read
+    # Numba compares the age of one file, but also finds what it has kept by this name.
+    function.__qualname__ += "_" + _digest(Path(function.__code__.co_filename).parent)
+    try:
+        machine_code: _Function = numba.njit(cache=True, **_OPTIONS, **options)(function)
+    except RuntimeError as error:  # no folder for it
+        _say_not_kept(str(error))
+        machine_code = numba.njit(**_OPTIONS, **options)(function)
     return machine_code
 
 
 @functools.cache
 def _digest(folder: Path) -> str:
-    """Of the compiled loops in a folder, and what they read."""
+    """Of the compiled loops in a folder, what they read, and how they are compiled."""
     files = sorted(path for end in ("kernels", "records") for path in folder.glob(f"*_{end}.py"))
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in (*files, Path(__file__)))).hexdigest()[:12]
 
 
 @functools.cache

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from pgts_torch.compiled import jit
+from pgts_torch.compiled import allocating, jit
 
 VALUES, CLIPPED, FREE, TARGETS = range(4)
 """What is minimised: squares of values off their targets; a clipped objective, or one that is not, from the policy as
@@ -38,7 +38,7 @@ def _tanh(x):  # type: ignore[no-untyped-def]
     return x * above / (((_BELOW_0 * s + _BELOW_1) * s + _BELOW_2) * s + _BELOW_3)
 
 
-@jit
+@allocating
 def _forward(theta_D, size_L, is_tanh, input_NX):  # type: ignore[no-untyped-def]
     """The input and what each layer makes of it, with its activation but for the last one."""
     values, at = [input_NX], 0
@@ -64,7 +64,7 @@ def _forward(theta_D, size_L, is_tanh, input_NX):  # type: ignore[no-untyped-def
     return values
 
 
-@jit
+@allocating
 def _backward(theta_D, size_L, is_tanh, values, down, gradient_D):  # type: ignore[no-untyped-def]
     """Add the gradient in the weights, from that in the outputs."""
     at = len(theta_D)
@@ -104,7 +104,7 @@ def _of_values(out_ND, action_N, y_N, count, down_ND):  # type: ignore[no-untype
     return loss / count
 
 
-@jit
+@allocating
 def _log_softmax(out_ND):  # type: ignore[no-untyped-def]
     for n in range(len(out_ND)):
         most, total = out_ND[n].max(), np.float32(0)
@@ -150,7 +150,7 @@ def _of_policy(form, log_NA, before_NA, advantage_NA, weight_N, count, low, high
     return loss, divergence
 
 
-@jit
+@allocating
 def gradient(theta_D, size_L, is_tanh, form, given, count, numbers, rows, gradient_E):  # type: ignore[no-untyped-def]
     """Write the gradient of a minibatch, and after it the loss and the KL divergence.
 
@@ -193,7 +193,7 @@ def gradient(theta_D, size_L, is_tanh, form, given, count, numbers, rows, gradie
         _backward(theta_D, size_L, is_tanh, values, down_ND, gradient_D)
 
 
-@jit
+@allocating
 def _square(x_D):  # type: ignore[no-untyped-def]
     """The sum of squares, by pieces that BLAS sums in one thread."""
     total = 0.0
@@ -202,7 +202,7 @@ def _square(x_D):  # type: ignore[no-untyped-def]
     return total
 
 
-@jit
+@allocating
 def descend(theta_D, gradient_D, first_D, second_D, longest, epsilon, rate):  # type: ignore[no-untyped-def]
     """Take a step of Adam (`Optimiser`). Return the norm of the gradient, and a number that is finite as the weights
     are."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pgts_torch.compiled import inlined, jit
+from pgts_torch.compiled import allocating, inlined, jit
 
 _ODD = np.uint64(0x9E3779B97F4A7C15)
 _FACTORS = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
@@ -57,7 +57,7 @@ def place(bits_RD, given_ND, first, minus_zero, infinity):  # type: ignore[no-un
     return off
 
 
-@jit
+@allocating
 def hash_rows(bits_ND, hash_N):  # type: ignore[no-untyped-def]
     """As `state_index.hash_rows`."""
     D = bits_ND.shape[1]
