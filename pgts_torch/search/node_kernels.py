@@ -102,12 +102,12 @@ def select(arm, rules, n, score_A):  # type: ignore[no-untyped-def]
         score_A[a] = x
     norm = max(norm, _TINY)
     for a in range(A):
-        if arm[n, a].open > 0:
-            score = score_A[a]
-            if rules.rule == GUMBEL:
-                score = np.rint((score / norm * (total + 1.0) - arm[n, a].visits) * _GRID)
-            if score > best:
-                best, chosen = score, a
+        score = score_A[a]
+        if rules.rule == GUMBEL:
+            score = np.rint((score / norm * (total + 1.0) - arm[n, a].visits) * _GRID)
+        score = score if arm[n, a].open > 0 else -np.inf
+        chosen = a if score > best else chosen
+        best = max(best, score)
     return chosen
 
 
@@ -117,10 +117,10 @@ def outcome(arm, edge, n, a):  # type: ignore[no-untyped-def]
     best, chosen = -np.inf, 0
     for k in range(edge.shape[2]):
         e = edge[n, a, k]
-        if e.prob >= 0:
-            lack = np.rint((e.prob * (arm[n, a].visits + 1.0) - e.visits) * _GRID)
-            if lack > best:
-                best, chosen = lack, k
+        lack = np.rint((e.prob * (arm[n, a].visits + 1.0) - e.visits) * _GRID)
+        lack = lack if e.prob >= 0 else -np.inf
+        chosen = k if lack > best else chosen
+        best = max(best, lack)
     return chosen
 
 
