@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import re
 import sys
 import types
@@ -49,7 +50,38 @@ def certificate(it: Any, out: str) -> None:
     assert len(it.computed) < len(it.bounds)
 
 
-CLAIMS: dict[str, Callable[[Any, str], None]] = {"certificate": certificate}
+def inventory(it: Any, out: str) -> None:
+    *closed, shop = re.findall(r"rest +(-?[\d.]+) +warm up +(-?[\d.]+)", out)[:2]
+    assert all(float(warm) < float(rest) for rest, warm in closed)
+    assert float(shop[1]) > float(shop[0])
+    J_0, J_1, J_2 = (float(J) for J in re.findall(r"depth \d: J = +(-?[\d.]+)", out))
+    assert J_0 <= 0 < 0.99 * it.best.J < min(J_1, J_2)
+    visited_S = it.exact.evaluate(it.mdp, it.pi_SA).d_S > 0.01
+    assert it.pi_SA[visited_S].argmax(1).equal(it.best.pi_SA[visited_S].argmax(1))
+    assert not it.pi_SA.argmax(1).equal(it.best.pi_SA.argmax(1))
+    # As the square root: four times as many samples halve the error, give or take 100 searches' chance.
+    errors = [it.errors[n] for n in (2, 8, 32)]
+    assert all(1.4 < more / less < 2.8 for more, less in itertools.pairwise(errors))
+    assert all(it.stated[n] == pytest.approx(it.errors[n], rel=0.3) for n in it.errors)
+    assert it.J_sampled > 0.95 * it.best.J
+
+
+def paper(it: Any, out: str) -> None:
+    down, up = it.seen[3]
+    assert down == up == 0 < it.seen[4][1] - it.seen[4][0]
+    counts = [it.sets.count(depth) for depth in it.depths]
+    assert counts == sorted(set(counts), reverse=True)
+    assert counts[-1] == 1
+    assert it.sets.worst_return(4) == pytest.approx(it.best.J)
+    assert all(it.sets.worst_return(m) >= it.best.J - it.stationary.closed_form_bound(it.mdp, m) for m in it.depths)
+    assert [float(run.J_K[-1]) for run in it.runs.values()] == pytest.approx([0, 0, 0, 0, it.best.J, it.best.J])
+    assert it.runs[4].J_K.tolist() == pytest.approx(it.runs[5].J_K.tolist(), rel=0.2)
+    assert it.walks[0].J_K.abs().max() == 0
+    assert it.walks[1].J_K.min() < it.walks[1].J_K[0] < it.walks[1].J_K[-1]
+    assert it.reached == pytest.approx(it.best.J, rel=0.01)
+
+
+CLAIMS: dict[str, Callable[[Any, str], None]] = {"certificate": certificate, "inventory": inventory, "paper": paper}
 
 
 def test_every_tutorial_is_short_and_ends_with_what_to_try_next():

@@ -231,6 +231,8 @@ def _look_of(value: Any, *, as_one: bool) -> Any:
         plain = value.item() if isinstance(value, np.generic) else float(value)
         return plain if plain == plain else "nan"
     if isinstance(value, torch.Tensor):
+        if value.layout is not torch.strided:
+            return _PARTS
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         content = value.tobytes()
@@ -255,6 +257,9 @@ def _parts_of(value: Any, left_out: Set[str]) -> list[tuple[Any, Any]]:
         return list(enumerate(value))
     if isinstance(value, np.ndarray):
         return list(enumerate(value.ravel().tolist()))
+    if isinstance(value, torch.Tensor):  # a sparse one
+        entries = value.detach().to_sparse_coo().coalesce()
+        return [("shape", str(entries.shape)), ("indices", entries.indices()), ("values", entries.values())]
     if isinstance(value, types.FunctionType):
         return [(name, getattr(value, name)) for name in ("__code__", "__defaults__", "__kwdefaults__", "__closure__")]
     if isinstance(value, types.CellType):

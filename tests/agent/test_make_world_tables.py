@@ -7,13 +7,17 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
 
+from pgts_torch import PGTS
 from pgts_torch.agent.world import ModelWorld, SimulatedWorld, TabularWorld
-from pgts_torch.tabular import exact
+from pgts_torch.envs import TabularEnv
+from pgts_torch.models.attributes import fingerprint
+from pgts_torch.tabular import exact, ladder
 from tests.agent.cells import FIRST, Cells, N, Walk, row_of_cells, told_of, world_of
 
 
@@ -182,3 +186,15 @@ def test_a_table_that_changes_from_episode_to_episode_is_contradicted():
     assert "gave reward 0, an end; the table says reward 1, an end" in told_of(
         lambda: Changing(row_of_cells(), starts=FIRST)
     )
+
+
+def test_environments_may_share_an_mdp_that_has_been_solved():
+    # Whose sparse matrices are kept, and are compared as other tensors are.
+    mdp = ladder(5)
+    best = exact.optimal(mdp)
+    model = PGTS(lambda: TabularEnv(mdp), critic="exact", depth=4).learn(10_000)
+    assert exact.evaluate(mdp, model.policy_table()).J == pytest.approx(best.J, rel=1e-3)
+    for layout in (torch.sparse_coo, torch.sparse_csr, torch.sparse_csc):
+        eye, others = (torch.eye(3).to_sparse(layout=layout) * weight for weight in (1.0, 2.0))
+        assert fingerprint(eye) == fingerprint(eye.clone()) != fingerprint(others)
+        assert fingerprint(eye) != fingerprint(torch.eye(4).to_sparse(layout=layout))
