@@ -24,7 +24,7 @@ from records import Key, Record, benchmark
 
 from pgts_torch import PGTS
 from pgts_torch.bellman import backup
-from pgts_torch.experiment.sweep import bootstrap_interval, interquartile_mean
+from pgts_torch.experiment.statistics import bootstrap_interval, interquartile_mean
 from pgts_torch.tabular import TabularMDP, deep_sea, exact
 from pgts_torch.tabular.ascent import softmax_step
 

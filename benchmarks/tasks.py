@@ -23,7 +23,7 @@ from pgts_torch import PGTS
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.config import load
 from pgts_torch.experiment import run as experiment
-from pgts_torch.experiment.sweep import bootstrap_interval, interquartile_mean
+from pgts_torch.experiment.statistics import bootstrap_interval, interquartile_mean
 
 ROOT = Path(__file__).resolve().parent.parent
 RUNS = Path("runs/learning/tasks.jsonl")

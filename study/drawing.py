@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from pgts_torch.experiment.statistics import bootstrap_interval
 from pgts_torch.seeding import numpy_stream
 
 Data = Mapping[str, Any]
@@ -194,6 +195,6 @@ def mean_interval(values: Sequence[float], *names: str | int) -> tuple[float, fl
         names: of the stream that resamples.
     """
     given = np.asarray(values, dtype=float)
-    resampled = numpy_stream(0, "mean_interval", *names).integers(0, len(given), size=(1000, len(given)))
-    low, high = np.quantile(given[resampled].mean(1), [0.025, 0.975])
+    random = numpy_stream(0, "mean_interval", *names)
+    low, high = bootstrap_interval(given, statistic=lambda drawn: drawn.mean(axis=-1), random=random)
     return float(given.mean()), float(low), float(high)

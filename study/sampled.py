@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.stats
 import torch
 from jaxtyping import Float
 
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.experiment.statistics import bootstrap_interval, interquartile_mean
 from pgts_torch.seeding import numpy_stream, seed_sequence
 from pgts_torch.tabular import exact
 
 WORKERS = 2
-CONFIDENCE = 0.95
 RESAMPLES = 2000
 
 
@@ -77,13 +76,6 @@ def band(J_NK: Float[np.ndarray, "N K"], *names: str | int) -> Band:
     Args:
         names: of the stream that resamples the seeds.
     """
-    resampled_RN = numpy_stream(0, "bootstrap", *names).integers(0, len(J_NK), size=(RESAMPLES, len(J_NK)))
-    means_RK = interquartile_mean(J_NK[resampled_RN], axis=1)
-    tail = (1 - CONFIDENCE) / 2
-    low_K, high_K = np.quantile(means_RK, [tail, 1 - tail], axis=0)
-    return Band(interquartile_mean(J_NK, axis=0).tolist(), low_K.tolist(), high_K.tolist())
-
-
-def interquartile_mean(values: np.ndarray, axis: int) -> np.ndarray:
-    """The mean without the lowest and the highest quarter."""
-    return scipy.stats.trim_mean(values, 0.25, axis=axis)
+    random = numpy_stream(0, "bootstrap", *names)
+    low_K, high_K = bootstrap_interval(J_NK.T, random=random, resamples=RESAMPLES)
+    return Band(interquartile_mean(J_NK.T).tolist(), low_K.tolist(), high_K.tolist())

@@ -137,6 +137,18 @@ def unit_interval(text: str) -> float:
     return value
 
 
+def env_scale(text: str) -> tuple[str, tuple[float, float]]:
+    """An argparse type: ENV=LOW,HIGH."""
+    env, _, ends = text.rpartition("=")
+    try:
+        low, high = map(float, ends.split(","))
+    except ValueError:
+        low = high = math.nan
+    if not (env and math.isfinite(high - low) and low < high):
+        raise argparse.ArgumentTypeError(f"{text!r} is not ENV=LOW,HIGH, with two ascending numbers")
+    return env, (low, high)
+
+
 def path_kind(text: str) -> str | None:
     """Return what is at a path (`files.kind`); ArgumentTypeError where it cannot be looked up."""
     try:

@@ -1,6 +1,5 @@
 """Train one configuration at several depths and with several seeds: `pgts sweep`."""
 
-import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -8,21 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 from pydantic import TypeAdapter, ValidationError
 
 from pgts_torch import files
 from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.ownership import CONFIG_FILE, METRICS_FILE, SUMMARY_FILE
+from pgts_torch.experiment.ownership import CONFIG_FILE, SUMMARY_FILE
 from pgts_torch.experiment.processes import train_all
+from pgts_torch.experiment.statistics import Mean, estimate, interquartile_mean
 
 if TYPE_CHECKING:
     from pgts_torch.experiment.summary import Summary
 
-CONFIDENCE = 0.95
-RESAMPLES = 1000
-CURVE_POINTS = 100
 TABLE_FILE, CURVES_FILE = "table.json", "curves.png"
 
 SET_BY_SWEEP = {
@@ -53,15 +49,6 @@ class Run:
     @property
     def name(self) -> str:
         return f"depth {self.depth}, seed {self.seed}"
-
-
-@dataclass(frozen=True)
-class Mean:
-    """An interquartile mean over seeds with its bootstrap interval; no interval for one seed."""
-
-    mean: float
-    low: float | None
-    high: float | None
 
 
 @dataclass(frozen=True)
@@ -135,7 +122,10 @@ def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
         PgtsError: what a configuration describes cannot be built; nothing was started.
         Stopped: a signal came; see `train_all`.
     """
-    from pgts_torch.experiment.run import build  # torch waits until the arguments have proved themselves
+    # torch waits until the arguments have proved themselves
+    from pgts_torch.experiment.compare.comparison import compare
+    from pgts_torch.experiment.compare.drawing import figure, png
+    from pgts_torch.experiment.run import build
 
     waiting = [run for run in runs if _summary(run) is None]
     for config in {run.depth: run.config for run in waiting}.values():
@@ -149,23 +139,8 @@ def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
     table, curves = _targets(out)
     files.replace(table, (json.dumps(asdict(answer), indent=2) + "\n").encode())
     if finished:
-        files.replace(curves, _curves([run for run, _ in finished]))
+        files.replace(curves, png(figure(compare([run.folder for run, _ in finished]))))
     return answer
-
-
-def interquartile_mean(score_XR: Float[np.ndarray, "*X R"]) -> Float[np.ndarray, "*X"]:
-    """The mean over runs without the lowest and the highest quarter of them, rounded down (Agarwal et al. 2021)."""
-    num_runs = score_XR.shape[-1]
-    cut = num_runs // 4
-    return np.asarray(np.sort(score_XR, axis=-1)[..., cut : num_runs - cut].mean(axis=-1))
-
-
-def bootstrap_interval(score_XR: Float[np.ndarray, "*X R"]) -> Float[np.ndarray, "2 *X"]:
-    """The ends of the middle 95 % of the interquartile means of resampled runs (Efron 1979), by a fixed seed."""
-    num_runs = score_XR.shape[-1]
-    rows_YR = np.random.default_rng(0).integers(num_runs, size=(RESAMPLES, num_runs))
-    tail = (1 - CONFIDENCE) / 2
-    return np.quantile(interquartile_mean(score_XR[..., rows_YR]), [tail, 1 - tail], axis=-1)
 
 
 def describe(answer: Sweep) -> str:
@@ -222,49 +197,4 @@ def _rows(finished: "Sequence[tuple[Run, Summary]]", score_is: str) -> Iterator[
         greedy = [each.deterministic.episodic_return.mean for each in summaries]
         costs = [[each.env_steps, each.model_calls, each.seconds] for each in summaries]
         mean_costs = interquartile_mean(np.array(costs, dtype=np.float64).T).tolist()
-        yield Row(depth, len(summaries), _mean(scores), _mean(greedy), *mean_costs)
-
-
-def _mean(scores: Sequence[float]) -> Mean:
-    score_R = np.array(scores, dtype=np.float64)
-    low, high = bootstrap_interval(score_R).tolist() if len(scores) > 1 else (None, None)
-    return Mean(float(interquartile_mean(score_R)), low, high)
-
-
-def _curves(runs: Sequence[Run]) -> bytes:
-    """The interquartile mean over seeds against environment steps, a line with its interval for each depth, as PNG."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.subplots()
-    tag = ""
-    for depth in dict.fromkeys(run.depth for run in runs):
-        histories = [_history(run) for run in runs if run.depth == depth]
-        tag = histories[0][0]
-        first = max(step_K[0] for _, step_K, _ in histories)
-        last = min(step_K[-1] for _, step_K, _ in histories)
-        step_X = np.linspace(first, last, CURVE_POINTS)
-        value_XR = np.stack([np.interp(step_X, step_K, value_K) for _, step_K, value_K in histories], axis=-1)
-        [line] = axes.plot(step_X, interquartile_mean(value_XR), label=f"depth {depth}")
-        if len(histories) > 1:
-            low_X, high_X = bootstrap_interval(value_XR)
-            axes.fill_between(step_X, low_X, high_X, color=line.get_color(), alpha=0.2, linewidth=0)
-    axes.set(xlabel="environment steps", ylabel=tag, title=f"{runs[0].config.name}, {runs[0].config.env.id}")
-    axes.legend()
-    axes.grid(alpha=0.3)
-    png = io.BytesIO()
-    figure.savefig(png, dpi=120)
-    return png.getvalue()
-
-
-def _history(run: Run) -> tuple[str, np.ndarray, np.ndarray]:
-    """The tag of a learning curve, its steps and its values."""
-    from pgts_torch.experiment.tracking import read_metrics
-
-    lines = read_metrics(run.folder)
-    tag = "exact/J" if lines and "exact/J" in lines[0] else "charts/episodic_return"
-    points = [(line["step"], line[tag]) for line in lines if "step" in line and line.get(tag) is not None]
-    if not points:
-        raise PgtsError(f"{run.folder / METRICS_FILE} has no line of {tag}")
-    step_K, value_K = np.array(points, dtype=np.float64).T
-    return tag, step_K, value_K
+        yield Row(depth, len(summaries), estimate([np.array(scores)]), estimate([np.array(greedy)]), *mean_costs)

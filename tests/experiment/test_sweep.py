@@ -11,18 +11,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import pytest
-import scipy.stats
 
-from pgts_torch.agent.evaluate import Evaluation, Score
 from pgts_torch.cli.main import main
-from pgts_torch.config import dump
 from pgts_torch.errors import PgtsError, Stopped
 from pgts_torch.experiment import ownership, run, sweep
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.processes import train_all
-from pgts_torch.experiment.summary import Summary
+from pgts_torch.experiment.statistics import Mean
+from tests.experiment import finished
 from tests.forks import PATIENCE, ForkedCommand, in_child
 
 SMALL = ["--total_steps", "60", "--rollout.num_envs", "3", "--rollout.horizon.length", "10", "--eval.episodes", "2"]
@@ -51,31 +48,10 @@ def test_every_depth_meets_every_seed_in_a_folder_of_its_own(here):
 
 def finish(each: sweep.Run, *, J: float | None) -> None:
     """What a finished run with this result leaves."""
-    each.folder.mkdir(parents=True)
-    (each.folder / "config.yaml").write_text(dump(each.config))
-    length = Score(20.0, None)
-    sampled, greedy = (Evaluation(2, Score(mean + each.seed, 1.0), Score(0.5, 1.0), length) for mean in (10.0, 20.0))
-    summary = Summary(
-        run=str(each.folder),
-        seed=each.seed,
-        depth=int(each.depth),
-        search="none",
-        J=J,
-        J_optimal=J,
-        stationarity_gap=J,
-        certificate=None,
-        ended_by="total_steps",
-        iterations=3,
-        env_steps=60 + each.seed,
-        model_calls=7,
-        seconds=1.0,
-        deterministic=greedy,
-        sampled=sampled,
-    )
-    (each.folder / "summary.json").write_text(json.dumps(asdict(summary)))
     tag = "charts/episodic_return" if J is None else "exact/J"
     lines = [{"step": step + each.seed, tag: value} for step, value in ((30, 0.0), (45, None), (60, J))]
-    (each.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    what = finished.summary(each.config, J=J, env_steps=60 + each.seed, greedy=20.0 + each.seed)
+    finished.leave(each.folder, each.config, lines, what)
 
 
 def test_finished_runs_are_kept_and_summed_up_without_a_process(here, monkeypatch):
@@ -101,7 +77,7 @@ def test_where_nothing_exact_is_known_sampled_episodes_score_and_one_seed_has_no
     [each] = planned(depths=(0,), num_seeds=1)
     finish(each, J=None)
     answer = sweep.sweep([each], jobs=1, out=Path("out"))
-    assert (answer.score_is, answer.rows[0].score) == ("return", sweep.Mean(10.0, None, None))
+    assert (answer.score_is, answer.rows[0].score) == ("return", Mean(10.0, None, None))
     assert "return of sampled episodes" in sweep.describe(answer)
 
 
@@ -278,33 +254,3 @@ def test_a_mistake_is_one_line_with_exit_code_2_and_starts_nothing(arguments, he
     assert mistake.startswith("error: ")
     assert MISTAKES[arguments] in mistake
     assert not list(here.iterdir())
-
-
-def test_the_interquartile_mean_is_that_of_scipy():
-    generator = np.random.default_rng(0)
-    for count in (1, 2, 3, 4, 5, 8, 10, 13):
-        score_R = generator.normal(size=count)
-        assert sweep.interquartile_mean(score_R) == pytest.approx(scipy.stats.trim_mean(score_R, 0.25))
-    assert sweep.interquartile_mean(np.array([0.0, 1.0, 2.0, 1e9])) == 1.5
-
-
-def test_the_interval_covers_the_truth_about_as_often_as_it_says():
-    # 400 experiments of 20 runs: between 330 and 395 covers unless p is below 0.87 or above 0.98 (error below 1e-3).
-    generator = np.random.default_rng(1)
-    intervals = [sweep.bootstrap_interval(generator.normal(3.0, 2.0, size=20)) for _ in range(400)]
-    assert 330 <= sum(low <= 3.0 <= high for low, high in intervals) <= 395
-    assert sweep.bootstrap_interval(np.array([1.0, 1.0])).tolist() == [1.0, 1.0]
-
-
-def test_intervals_of_many_points_are_those_of_each(here):
-    score_XR = np.random.default_rng(3).normal(size=(4, 7))
-    each = np.stack([sweep.bootstrap_interval(score_R) for score_R in score_XR], axis=-1)
-    np.testing.assert_array_equal(sweep.bootstrap_interval(score_XR), each)
-
-
-def test_the_interval_shrinks_with_the_root_of_the_number_of_runs():
-    def width(count: int) -> float:
-        low, high = sweep.bootstrap_interval(np.random.default_rng(2).normal(size=count))
-        return float(high - low)
-
-    assert width(1600) == pytest.approx(width(100) / 4, rel=0.25)

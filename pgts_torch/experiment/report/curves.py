@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
@@ -105,13 +106,18 @@ def draw(panel: Panel) -> Figure:
     positive = [value for curve in panel["curves"] for value in curve["values"] if value is not None and value > 0]
     if panel["title"] == MISSING and positive and max(positive) > 100 * min(positive):
         axes.set_yscale("log", nonpositive="clip")
+    style(axes, "environment steps")
+    if len(axes.lines) > 1:
+        figure.legend(loc="outside upper left", ncols=4, frameon=False, labelcolor=INK, handlelength=1.6)
+    return figure
+
+
+def style(axes: Axes, x: str) -> None:
+    """Name the horizontal axis, and draw axes and grid in colours that fit light and dark pages."""
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.set_xlabel("environment steps", color=INK)
+    axes.set_xlabel(x, color=INK)
     axes.tick_params(color=GREY, labelcolor=INK)
     axes.margins(x=0.01)
     axes.grid(alpha=0.25, color=GREY)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(GREY)
-    if len(axes.lines) > 1:
-        figure.legend(loc="outside upper left", ncols=4, frameon=False, labelcolor=INK, handlelength=1.6)
-    return figure

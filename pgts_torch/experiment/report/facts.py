@@ -41,7 +41,7 @@ def gather(run: Path, *, trust_imports: bool = False) -> tuple[dict[str, Any], P
     summary = _read(run / ownership.SUMMARY_FILE, from_json, notes)
     failure = _read(run / ownership.FAILURE_FILE, _mapping, notes)
     versions = _read(run / ownership.VERSIONS_FILE, _mapping, notes)
-    lines = _metrics(run, notes)
+    lines = metrics(run, notes)
     latest = {tag: value for line in lines for tag, value in line.items()}
     curves, constant, never_finite = panels(lines)
     path, last = _last_checkpoint(run, notes)
@@ -94,7 +94,7 @@ def _mapping(raw: bytes) -> Values:
     return dict(json.loads(raw))
 
 
-def _metrics(run: Path, notes: list[str]) -> list[Values]:
+def metrics(run: Path, notes: list[str]) -> list[Values]:
     """Return the lines of metrics.jsonl that can be read; values that cannot be plotted are None."""
     lines, unread = list[Values](), 0
     with suppress(OSError):

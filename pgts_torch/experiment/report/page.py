@@ -1,31 +1,24 @@
-"""The HTML page about a run. It has no scripts, loads nothing from elsewhere, and all text is escaped."""
+"""The HTML page about a run."""
 
-import base64
-import io
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jinja2
-import matplotlib
 import torch
-from matplotlib.figure import Figure
 
 from pgts_torch import files
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.experiment.ownership import REPORT_FILE
 from pgts_torch.experiment.pictures import policy_picture
-from pgts_torch.experiment.report.curves import INK, draw
+from pgts_torch.experiment.report.curves import draw
 from pgts_torch.experiment.report.facts import gather
+from pgts_torch.experiment.report.html import Filters, image, render, typeset
 from pgts_torch.experiment.resume import resuming
 from pgts_torch.tabular import exact
 
 SIGN = b'<meta name="generator" content="pgts report">'
 """A tag by which a page of `pgts report` is recognised."""
-
-DARK = f'@media (prefers-color-scheme: dark) {{ [style*="{INK}"] {{ fill: #e4e7ec !important }} }}</style>'
 
 
 def write(run: Path, out: Path | None, *, trust_imports: bool = False) -> dict[str, Any]:
@@ -43,21 +36,8 @@ def write(run: Path, out: Path | None, *, trust_imports: bool = False) -> dict[s
     facts, algorithm = gather(run, trust_imports=trust_imports)
     policy = None if algorithm is None or algorithm.world.mdp is None else _policy(algorithm)
     resume = resuming(facts["run"], facts["world_size"], imports=facts["imports"])
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pgts_torch.experiment.report", ""),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "typeset": typeset,
-        "json": json.dumps,
-        "tiles": tiles,
-        "curve": lambda panel: image(draw(panel), transparent=True),
-    }
-    page = environment.get_template("page.html").render(facts, policy=policy, resume=resume)
-    files.replace(out, page.encode())
+    filters: Filters = {"tiles": tiles, "curve": lambda panel: image(draw(panel), transparent=True)}
+    files.replace(out, render("page.html", {**facts, "policy": policy, "resume": resume}, filters=filters))
     return {"page": str(out), **facts}
 
 
@@ -72,22 +52,6 @@ def _policy(algorithm: PGTS) -> dict[str, Any]:
         "actions": ", ".join(mdp.action_names),
         "picture": image(policy_picture(mdp, pi_SA)),
     }
-
-
-def image(figure: Figure, *, transparent: bool = False) -> str:
-    """Return a figure as the `src` of an image, the same bytes each time; a transparent one fits a dark page, too."""
-    # The salt makes ids reproducible. Simplification by up to a pixel keeps curves of many points small.
-    file = io.StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "pgts", "path.simplify_threshold": 1.0}):
-        figure.savefig(file, format="svg", dpi=150, transparent=transparent, metadata={"Date": None, "Creator": None})
-    svg = file.getvalue().replace("</style>", DARK, 1)
-    return f"data:image/svg+xml;base64,{base64.b64encode(svg.encode()).decode()}"
-
-
-def typeset(text: str) -> str:
-    """Replace <=, +- and minus signs of ASCII text by their typographic characters."""
-    text = text.replace("<=", "\N{LESS-THAN OR EQUAL TO}").replace("+-", "\N{PLUS-MINUS SIGN}")
-    return re.sub(r"(?<![A-Za-z0-9])-(?=[ 0-9])|(?<=[0-9]e)-(?=[0-9])", "\N{MINUS SIGN}", text)
 
 
 def tiles(rows: Mapping[str, str]) -> list[tuple[str, str, str]]:
