@@ -19,7 +19,7 @@ from pgts_torch.compiled import allocating, jit
 _AHEAD = 64
 """How many outcomes ahead a value is fetched from memory."""
 
-_READ_AHEAD = 256
+_READ_AHEAD = 512
 """How many outcomes ahead their weights and children are."""
 
 _CACHE, _NEAR, _LINE = 2**20, 2**17, 64
@@ -78,6 +78,7 @@ def back_up(reward, weight, child, A, K, v, times, q):  # type: ignore[no-untype
     fours, rest, outcomes, none = np.uint64(K // 4 * 4), np.uint64(K % 4), np.uint64(A * K), np.uint64(0)
     one, two, three, four = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)  # a signed step is looked after too
     line, child_line = np.uint64(_LINE // weight.itemsize), np.uint64(_LINE // child.itemsize)
+    lines, child_lines = (outcomes + line - one) // line, (outcomes + child_line - one) // child_line
     zero, ahead, read_ahead = size - size, np.uint64(_AHEAD), np.uint64(_READ_AHEAD)
     old, new = v, np.empty(N, v.dtype)
     for sweep in range(times):
@@ -86,10 +87,10 @@ def back_up(reward, weight, child, A, K, v, times, q):  # type: ignore[no-untype
         for n in range(N):
             if n < far:
                 _fetch(reward, m + line)
-                for j in range(i + read_ahead, i + read_ahead + outcomes, line):
-                    _fetch(weight, j)
-                for j in range(i + read_ahead, i + read_ahead + outcomes, child_line):
-                    _fetch(child, j)
+                for j in range(lines):
+                    _fetch(weight, i + read_ahead + j * line)
+                for j in range(child_lines):
+                    _fetch(child, i + read_ahead + j * child_line)
                 if scattered:
                     for j in range(i + ahead, i + ahead + outcomes):
                         _fetch(old, child[j])

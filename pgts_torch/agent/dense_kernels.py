@@ -65,6 +65,14 @@ def _forward(theta_D, size_L, is_tanh, input_NX):  # type: ignore[no-untyped-def
 
 
 @allocating
+def outputs(theta_D, size_L, is_tanh, input_NX, rows, out_ND):  # type: ignore[no-untyped-def]
+    """Write the outputs; all others as in `gradient`."""
+    for start in range(0, len(input_NX), rows):
+        end = min(start + rows, len(input_NX))
+        out_ND[start:end] = _forward(theta_D, size_L, is_tanh, input_NX[start:end])[-1]
+
+
+@allocating
 def _backward(theta_D, size_L, is_tanh, values, down, gradient_D):  # type: ignore[no-untyped-def]
     """Add the gradient in the weights, from that in the outputs."""
     at = len(theta_D)

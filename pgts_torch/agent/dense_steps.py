@@ -1,5 +1,7 @@
-"""Gradient steps of small networks of dense layers by compiled loops, a few microseconds each beside those of torch."""
+"""Gradient steps of small networks of dense layers by compiled loops, and their outputs: a few microseconds each
+beside those of torch."""
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -8,7 +10,8 @@ from typing import Any, final
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Tensor
 
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.optimisers import Optimiser, refuse
@@ -29,15 +32,9 @@ class DenseSteps:
     """
 
     def __init__(self, network: Network, optimiser: Optimiser, clip: tuple[float, float, float]) -> None:
-        from pgts_torch.agent import dense_kernels
-
-        self._kernels, self._network, self._optimiser, self._clip = dense_kernels, network, optimiser, clip
-        dense = [layer for layer in network.layers if isinstance(layer, nn.Linear)]
-        size_L = [dense[0].in_features, *(layer.out_features for layer in dense)]
-        products = max(a * b for a, b in itertools.pairwise(size_L))
-        self._rows, self._size_L = max(1, _MOST_PRODUCTS // products), np.array(size_L)
-        self._is_tanh = any(isinstance(layer, nn.Tanh) for layer in network.layers)
-        self._theta_D = torch.cat([weight.detach().reshape(-1) for weight in network.weights]).numpy()
+        self._network, self._optimiser, self._clip = network, optimiser, clip
+        self._kernels, self._theta_D = _kernels(), _theta(network)
+        *self._form, self._rows = _form(*network.dense_form)
         # the gradient, the loss and a divergence
         self._found_E = np.zeros(len(self._theta_D) + 2, np.float32)
 
@@ -72,7 +69,7 @@ class DenseSteps:
     def _step(
         self, form: int, given: tuple[Any, ...], count: int, name: str, of: str, ranks: Ranks, most: float | None
     ) -> tuple[float, float] | None:
-        shape = self._theta_D, self._size_L, self._is_tanh
+        shape = self._theta_D, *self._form
         self._kernels.gradient(*shape, form, given, count, self._clip, self._rows, self._found_E)
         if ranks.size > 1:
             self._found_E[:] = ranks.sum(f"the gradient of {of}", torch.from_numpy(self._found_E)).numpy()
@@ -100,6 +97,37 @@ class DenseSteps:
             torch._foreach_copy_(
                 weights, [piece.view_as(weight) for piece, weight in zip(pieces, weights, strict=True)]
             )
+
+
+def dense_outputs(network: Network, observation_N: Tensor) -> Float[Tensor, "N D"]:
+    """`Network.outputs` of a dense network on the CPU by a compiled loop: the same up to rounding."""
+    return network.outputs(observation_N, lambda input_NX: _outputs(network, input_NX))
+
+
+def _outputs(network: Network, input_NX: Tensor) -> Tensor:
+    size_L, is_tanh, rows = _form(*network.dense_form)
+    out_ND = torch.empty(input_NX.shape[0], network.dense_form[0][-1], dtype=torch.float32)
+    given, found = input_NX.contiguous().numpy(), out_ND.numpy()
+    _kernels().outputs(_theta(network), size_L, is_tanh, given, rows, found)
+    return out_ND
+
+
+def _kernels() -> Any:
+    from pgts_torch.agent import dense_kernels  # numba is imported with it
+
+    return dense_kernels
+
+
+@functools.cache
+def _form(sizes: tuple[int, ...], is_tanh: bool) -> tuple[np.ndarray, bool, int]:
+    """`Network.dense_form` as the loops read it, and how many rows are in a block."""
+    products = max(a * b for a, b in itertools.pairwise(sizes))
+    return np.array(sizes), is_tanh, max(1, _MOST_PRODUCTS // products)
+
+
+def _theta(network: Network) -> np.ndarray:
+    """A copy of all weights."""
+    return torch.cat([weight.detach().view(-1) for weight in network.weights]).numpy()
 
 
 def _arrays(part: Sequence[Tensor]) -> list[np.ndarray]:

@@ -190,6 +190,14 @@ class Network(nn.Module):
         return all(isinstance(layer, nn.Linear | nn.Tanh | nn.ReLU) for layer in self.layers)
 
     @cached_property
+    def dense_form(self) -> tuple[tuple[int, ...], bool]:
+        """Of a dense network: how many inputs there are and how many outputs each layer has; whether tanh follows
+        these."""
+        dense = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+        sizes = dense[0].in_features, *(layer.out_features for layer in dense)
+        return sizes, any(isinstance(layer, nn.Tanh) for layer in self.layers)
+
+    @cached_property
     def functions(self) -> list[Callable[[Tensor], Tensor]]:
         """The layers as plain functions, because calling a module costs as much as a small layer."""
         return [
@@ -214,11 +222,16 @@ class Network(nn.Module):
         return input_N
 
     @torch.no_grad()
-    def outputs(self, observation_N: Tensor) -> Float[Tensor, "N D"]:
-        """Return the outputs without gradient, computed in pieces so that memory is bounded."""
+    def outputs(self, observation_N: Tensor, forward: Callable[[Tensor], Tensor] | None = None) -> Float[Tensor, "N D"]:
+        """Return the outputs without gradient, computed in pieces so that memory is bounded.
+
+        Args:
+            forward: what makes outputs of inputs; by default torch.
+        """
+        forward = forward or self.forward
         if len(observation_N) <= self._most_rows:
-            return self.forward(self.encode(observation_N))
-        return torch.cat([self.forward(self.encode(piece)) for piece in observation_N.split(self._most_rows)])
+            return forward(self.encode(observation_N))
+        return torch.cat([forward(self.encode(piece)) for piece in observation_N.split(self._most_rows)])
 
     @torch.no_grad()
     def follow(self, other: "Network", rate: float) -> None:

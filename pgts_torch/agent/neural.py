@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from pgts_torch.agent.advantages import critic_targets
 from pgts_torch.agent.components import legal_only
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.dense_steps import dense_steps
+from pgts_torch.agent.dense_steps import dense_outputs, dense_steps
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.networks import Network, Scaled, Trunk, default_network, make_trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
@@ -273,8 +273,10 @@ class NetworkCritic(Critic):
         self._scale.fill_(state["scale"])
 
     def _values(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N D"]:
-        """The network's outputs in reward units."""
-        return self._mean + self._scale * network.outputs(observation_N)
+        """The network's outputs in reward units, by compiled loops where its steps are."""
+        loops = network.is_dense and self._optimiser.compiles_all_of(network.weights)
+        outputs_ND = dense_outputs(network, observation_N) if loops else network.outputs(observation_N)
+        return self._mean + self._scale * outputs_ND
 
     def _v(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N"]:
         if self.target == "v":

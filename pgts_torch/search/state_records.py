@@ -142,7 +142,7 @@ class StateRecords:
 
     def learn(self, leaves: Leaves, state_N: Int[np.ndarray, "N"]) -> Learned:
         """The outcomes of these wanted states, the critic's values of their children, and the prior."""
-        self.query(torch.from_numpy(state_N))
+        self._query(torch.from_numpy(state_N))
         states = self.state_S, state_N, len(state_N), 0, self._child_S
         _, children = self._kernels.reach(*self._table.arrays, *states)
         return self._learned(leaves, state_N, self._child_S[:children])
@@ -150,6 +150,9 @@ class StateRecords:
     def query(self, state_N: Int[Tensor, "N"]) -> None:
         """Have the outcomes of these states in the table, and room for the states that the model has met by then."""
         check_roots(state_N, self._model.num_states)
+        self._query(state_N)
+
+    def _query(self, state_N: Int[Tensor, "N"]) -> None:
         missing = self._table.missing(state_N)
         if missing.shape[0]:
             self.check_memory(state_N.shape[0], missing.shape[0])

@@ -265,20 +265,21 @@ class Topology:
                 return self.bytes(0, gathered=kept + own + others + looked_up, gathering=looked_up)
             return self.bytes(missing, looked_up=looked_up, kept=kept + own + others + looked_up)
 
-        def check() -> None:
+        def check(num_bytes: int) -> None:
             size = f"{looked_up} nodes, {self.model.num_actions} actions, {self._num_outcomes} outcomes of each"
-            check_memory(needed(), self.max_bytes, f"the outcomes of {which} of the lookahead ({size})")
+            check_memory(num_bytes, self.max_bytes, f"the outcomes of {which} of the lookahead ({size})")
 
-        # Levels of other roots only save time: they go first, the least recently used before the others.
-        if needed() > self.max_bytes:
+        if (num_bytes := needed()) > self.max_bytes:
+            # Levels of other roots only save time: they go first, the least recently used before the others.
             self.forest = None
-        while needed() > self.max_bytes and any(each is not levels for each in self._levels.values()):
-            self._levels.pop(next(key for key, each in self._levels.items() if each is not levels))
-        check()
+            spare = [key for key, each in self._levels.items() if each is not levels]
+            while (num_bytes := needed()) > self.max_bytes and spare:
+                self._levels.pop(spare.pop(0))
+        check(num_bytes)
         if missing > 1 and self.table.count == 0 and self.model.num_outcomes is None:
             # Only the answer of the model tells K: one state is queried alone, and the memory counted once more.
             self.table.query(state_N[:1])
-            check()
+            check(needed())
 
     @property
     def _num_outcomes(self) -> int:

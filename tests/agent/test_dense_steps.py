@@ -114,6 +114,35 @@ def test_compiled_fits_of_a_critic_are_those_of_torch_up_to_rounding(target, uni
     assert values[0][1:] == pytest.approx(values[1][1:], rel=1e-3)
 
 
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_values_of_a_critic_are_those_of_torch_up_to_rounding_and_compiled_as_its_steps_are(
+    network, target, monkeypatch
+):
+    rows, plain = list[int](), dense_kernels.outputs
+
+    def counted(*given: Any) -> None:
+        rows.append(len(given[3]))
+        plain(*given)
+
+    monkeypatch.setattr(dense_kernels, "outputs", counted)
+    critic = NetworkCritic(VECTORS, 4, NetworkValues(target=target, network=NETWORKS[network]), seed=1)
+    values = getattr(critic, target)
+    observation_N = torch.randn(70, 3, generator=stream(0, "rows"))
+    expected = values(observation_N)
+    assert rows == []  # it has not taken 200 steps
+    monkeypatch.setattr(optimisers, "_MANY", 0)
+    torch.testing.assert_close(values(observation_N), expected, atol=1e-6, rtol=1e-5)
+    assert rows == [70]
+    assert values(observation_N[:0]).shape == expected[:0].shape
+    with torch.no_grad():
+        critic.network.weights[-1].add_(1.0)  # the last bias: what was learned since counts
+    torch.testing.assert_close(values(observation_N), expected + 1, atol=1e-5, rtol=1e-5)
+    with torch_only():
+        assert not torch.equal(values(observation_N), expected)
+    assert rows == [70, 0, 70]
+
+
 @pytest.mark.parametrize("x", [0.0, 1e-30, 1e-3, 0.3, 1.0, 4.0, 7.8, 8.0, 1e30, math.inf])
 def test_tanh_is_right_to_a_few_roundings(x):
     for sign in (1, -1):
