@@ -38,12 +38,16 @@ class RunningNorm(nn.Module):
         self.register_buffer("square_D", torch.zeros(num_features, dtype=torch.float64))
 
     def forward(self, x: Tensor) -> Tensor:
-        if not bool(self.count):
-            return x
+        return _normalised(x, self.mean_D, self._std_D()) if bool(self.count) else x
+
+    def _std_D(self) -> Float[Tensor, "D"]:
         std_D = (self.square_D / self.count).sqrt()
         # a constant feature is not divided by its (rounding) deviation, so that it stays near 0
-        std_D = torch.where(std_D > 1e-6 * (1 + self.mean_D.abs()), std_D, 1.0)
-        return ((x - self.mean_D) / std_D).clamp(-_CLIP, _CLIP)
+        return torch.where(std_D > 1e-6 * (1 + self.mean_D.abs()), std_D, 1.0)
+
+    def fixed(self) -> "FixedNorm | None":
+        """The same function, with the statistics as they are; None: it is the identity."""
+        return FixedNorm(self.mean_D, self._std_D()) if bool(self.count) else None
 
     @torch.no_grad()
     def absorb(self, x: Tensor, ranks: Ranks = ALONE) -> None:
@@ -61,6 +65,26 @@ class RunningNorm(nn.Module):
 
 
 @final
+class FixedNorm(nn.Module):
+    """A `RunningNorm` whose statistics stay as they are, without a branch that depends on them."""
+
+    mean_D: Tensor
+    std_D: Tensor
+
+    def __init__(self, mean_D: Float[Tensor, "D"], std_D: Float[Tensor, "D"]) -> None:
+        super().__init__()
+        self.register_buffer("mean_D", mean_D)
+        self.register_buffer("std_D", std_D)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return _normalised(x, self.mean_D, self.std_D)
+
+
+def _normalised(x: Tensor, mean_D: Float[Tensor, "D"], std_D: Float[Tensor, "D"]) -> Tensor:
+    return ((x - mean_D) / std_D).clamp(-_CLIP, _CLIP)
+
+
+@final
 class OneHot(nn.Module):
     """Numbers [N, *shape] as float32 one-hot rows, those of several numbers one after the other: [N, sum of counts]."""
 
@@ -74,8 +98,8 @@ class OneHot(nn.Module):
         self.register_buffer("first", torch.from_numpy(each.cumsum() - each), persistent=False)
 
     def forward(self, number_N: Tensor) -> Float[Tensor, "N D"]:
-        column_NK = number_N.reshape(len(number_N), -1).long() + self.first
-        zeros_ND = torch.zeros(len(number_N), *self.shape, dtype=torch.float32, device=number_N.device)
+        column_NK = number_N.reshape(number_N.shape[0], -1).long() + self.first
+        zeros_ND = torch.zeros(number_N.shape[0], *self.shape, dtype=torch.float32, device=number_N.device)
         return zeros_ND.scatter_(1, column_NK, 1.0)
 
     def examples(self, count: int, generator: torch.Generator) -> Float[Tensor, "N D"]:
@@ -111,7 +135,7 @@ class Values(nn.Module):
         self._is_image, self._layout = image is not None, image or (shape if keeps_shape else (math.prod(shape),))
         self.shape = self._layout if image is None else (image[2], *image[:2])
         self.scale = _scale_of(component) if scale is None else scale
-        self.norm = RunningNorm(self._layout[-1]) if normalize else None
+        self.norm: RunningNorm | FixedNorm | None = RunningNorm(self._layout[-1]) if normalize else None
 
     def forward(self, x_N: Tensor) -> Float[Tensor, "N ..."]:
         x = self._scaled(x_N)
@@ -124,11 +148,15 @@ class Values(nn.Module):
 
     def absorb(self, x_N: Tensor, ranks: Ranks) -> None:
         """Add these to the running statistics, where there are any."""
-        if self.norm is not None:
+        if isinstance(self.norm, RunningNorm):
             self.norm.absorb(self._scaled(x_N), ranks)
 
+    def fix(self) -> None:
+        """Keep the statistics as they are, as constants."""
+        self.norm = self.norm.fixed() if isinstance(self.norm, RunningNorm) else self.norm
+
     def _scaled(self, x_N: Tensor) -> Tensor:
-        x = x_N.reshape(len(x_N), *self._layout)
+        x = x_N.reshape(x_N.shape[0], *self._layout)
         return x if self.scale == 1 else (x if x.is_floating_point() else x.float()) / self.scale
 
 
@@ -198,7 +226,8 @@ class Encoder(nn.Module):
     @property
     def norm(self) -> RunningNorm | None:
         """The first running statistics; None where there are none."""
-        return next((part.norm for part in self.parts if isinstance(part, Values) and part.norm is not None), None)
+        norms = (part.norm for part in self.parts if isinstance(part, Values))
+        return next((norm for norm in norms if isinstance(norm, RunningNorm)), None)
 
     @property
     def fresh(self) -> bool:

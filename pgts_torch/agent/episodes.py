@@ -21,6 +21,9 @@ from pgts_torch.models.steps import (
     rewards_of,
 )
 
+UNLIMITED_LENGTH = 1000
+"""The length at which episodes that are not trained on are cut off where the environment has no time limit."""
+
 
 @final
 class Episodes:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgts_torch.agent.collect import rollout
+from pgts_torch.agent.episodes import UNLIMITED_LENGTH
 from pgts_torch.agent.gaussian import GaussianPolicy, Mean
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import Policy
@@ -18,9 +19,6 @@ from pgts_torch.errors import check_count
 from pgts_torch.models.environments import EnvSource, close_environments
 from pgts_torch.options.rollouts import FixedHorizon
 from pgts_torch.seeding import SharedGenerators, stream
-
-UNLIMITED_LENGTH = 1000
-"""The length at which episodes are cut off where the environment has no time limit."""
 
 
 @dataclass(frozen=True)

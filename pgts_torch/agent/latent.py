@@ -63,6 +63,7 @@ class LatentModel(FittedModel):
     `step` is deterministic, `sample` samples the end. A tenth of the steps is held out to measure errors.
 
     space: of the vectors.
+    representation: the network h.
     replay: its columns "state" and "next_state" have the images, as they came.
 
     Args (others as of `FittedModel`):
@@ -98,7 +99,7 @@ class LatentModel(FittedModel):
         network = options.network if isinstance(options.network, CNN) else default_network(space)
         image_trunk = make_trunk(network, space, generator=generator)
         step_trunk = make_trunk(MLP(hidden=options.hidden, activation="relu"), inputs, generator=generator)
-        self._representation = Network(image_trunk, options.size, gain=1.0, generator=generator).to(device)
+        self.representation = Network(image_trunk, options.size, gain=1.0, generator=generator).to(device)
         # a small gain: at first nothing changes
         self._dynamics = Network(step_trunk, options.size + 3, gain=0.1, generator=generator).to(device)
         self._optimiser = Optimiser(learning_rate=options.learning_rate, max_grad_norm=None)
@@ -119,7 +120,7 @@ class LatentModel(FittedModel):
 
     def represent(self, image_N: Shaped[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
         """The vectors of images, without gradient; vectors are returned as they are."""
-        return image_N if image_N.ndim == 2 else _norm(self._representation.outputs(image_N.to(self.device)))
+        return image_N if image_N.ndim == 2 else standardised(self.representation.outputs(image_N.to(self.device)))
 
     @torch.inference_mode(False)
     @torch.enable_grad()
@@ -137,7 +138,7 @@ class LatentModel(FittedModel):
         """
         ends, ranks, is_first = self._ends(experience.discount_N), experience.ranks, self.replay.num_added == 0
         self._keep(experience)
-        self._representation.trunk.encoder.absorb(experience.observation_N.to(self.device), ranks)
+        self.representation.trunk.encoder.absorb(experience.observation_N.to(self.device), ranks)
         self._measure_rewards(ranks)
         held_out = held_out_rows(self.replay)
         count = self.options.updates_per_step * ranks.totals("steps", len(ends))[0]
@@ -162,7 +163,7 @@ class LatentModel(FittedModel):
         proportion to the steps that it keeps; losses compare all of it, so the vectors of all are exchanged."""
         trained = torch.nonzero(~held_out).flatten()
         ended = trained[self.replay.rows("end", trained) > 0]
-        weights, num_counted = self._representation.weights + self._dynamics.weights, 0
+        weights, num_counted = self.representation.weights + self._dynamics.weights, 0
 
         def sampled(rows: Tensor, number: int) -> Tensor:
             return rows[torch.randint(len(rows), (number,), generator=generator, device=generator.device).cpu()]
@@ -171,7 +172,7 @@ class LatentModel(FittedModel):
         extra = round(_ENDS * self.options.minibatch_size * self.options.unroll) if sum(ended_R) else 0
         own = ranks.portion(self.options.minibatch_size, trained_R)
         own_extra = ranks.portion(extra, ended_R) if extra else 0
-        with self._optimiser.attempt(self._representation.tensors + self._dynamics.tensors) as readings:
+        with self._optimiser.attempt(self.representation.tensors + self._dynamics.tensors) as readings:
             for _ in range(count):
                 starts = sampled(trained, own)
                 at_KN, counts_KN = sequences(self.replay, held_out, starts, self.options.unroll)
@@ -211,7 +212,7 @@ class LatentModel(FittedModel):
 
     def _represented(self, image_N: Shaped[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
         """The vectors of images, with gradient."""
-        return _norm(self._representation(self._representation.encode(image_N)))
+        return standardised(self.representation(self.representation.encode(image_N)))
 
     def _advanced(
         self, latent_ND: Float[Tensor, "N D"], action_N: Int[Tensor, "N"]
@@ -219,7 +220,7 @@ class LatentModel(FittedModel):
         """The next vectors; and (r_0, r_1, logit), with rewards in standard deviations from their mean."""
         action_NA = nn.functional.one_hot(action_N, self.num_actions).float()
         output_NO = self._dynamics(torch.cat([latent_ND, action_NA], -1))
-        return _norm(latent_ND + output_NO[:, :-3]), output_NO[:, -3:]
+        return standardised(latent_ND + output_NO[:, :-3]), output_NO[:, -3:]
 
     def _unrolled(
         self, at_KN: Int[Tensor, "K N"], counts_KN: Bool[Tensor, "K N"]
@@ -280,7 +281,7 @@ class LatentModel(FittedModel):
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimiser, moments of rewards, and replay."""
         return {
-            "representation": self._representation.plain_state(),
+            "representation": self.representation.plain_state(),
             "dynamics": self._dynamics.plain_state(),
             "optimiser": self._optimiser.state_dict(),
             "rewards": [self._reward_mean, self._reward_scale],
@@ -291,15 +292,15 @@ class LatentModel(FittedModel):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         check_count("generation", state["generation"], least=0)
-        self._representation.load_plain_state(state["representation"])
+        self.representation.load_plain_state(state["representation"])
         self._dynamics.load_plain_state(state["dynamics"])
         self._optimiser.load_state_dict(state["optimiser"])
-        self._optimiser.check_fits(self._representation.weights + self._dynamics.weights)
+        self._optimiser.check_fits(self.representation.weights + self._dynamics.weights)
         self.replay.load_state_dict(state["replay"])
         self._reward_mean, self._reward_scale = map(float, state["rewards"])
         self._log_odds_added, self.generation = float(state["log_odds_added"]), state["generation"]
 
 
-def _norm(x_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N D"]:
+def standardised(x_ND: Float[Tensor, "N D"]) -> Float[Tensor, "N D"]:
     """Rows of mean 0 and variance 1."""
     return nn.functional.layer_norm(x_ND, x_ND.shape[-1:])

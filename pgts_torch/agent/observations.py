@@ -1,6 +1,8 @@
 """Observations of an environment as tensors, the inputs of policies and critics."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
@@ -8,6 +10,7 @@ import torch
 from gymnasium import spaces
 from gymnasium.spaces import Space
 from gymnasium.vector import VectorEnv
+from jaxtyping import Bool
 from torch import Tensor
 
 from pgts_torch.agent.components import (
@@ -20,6 +23,7 @@ from pgts_torch.agent.components import (
     plainly,
     row_dtype,
     row_shape,
+    with_legal,
     with_mask,
 )
 from pgts_torch.errors import NotFinite, PgtsError
@@ -56,6 +60,26 @@ class _Part:
             return _from_zero(array, self.declared)
         array = _cast(array, self.declared)
         return np.moveaxis(array, -3, -1) if self.channels_first else array
+
+    @property
+    def name(self) -> str:
+        """The keys and indices that lead to it, as in "camera.left"."""
+        steps = self.path if self.path and isinstance(self.path[0], str) else ("observation", *self.path)
+        return ".".join(map(str, steps))
+
+    def example(self, count: int) -> Tensor:
+        """So many of them, as the environment declares them, in a dtype that torch has."""
+        number = np.int8 if isinstance(self.declared, spaces.MultiBinary) else np.int64
+        dtype = self.declared.dtype if isinstance(self.declared, spaces.Box) else number
+        dtype = self.seen.dtype if dtype == np.longdouble else dtype
+        return torch.from_numpy(np.zeros((count, *(self.declared.shape or ())), dtype))
+
+    def read_tensor(self, x_N: Tensor) -> Tensor:
+        """As `read`, without checks, of a tensor like `example`."""
+        if isinstance(self.declared, spaces.Box):
+            return x_N.movedim(-3, -1) if self.channels_first else x_N
+        first = 0 if isinstance(self.declared, spaces.MultiBinary) else torch.as_tensor(self.declared.start)
+        return x_N.long() - first
 
 
 @final
@@ -161,19 +185,58 @@ class Observations:
         flat = [array.reshape(*self._before(array, part), -1) for array, part in zip(found, self._parts, strict=True)]
         if len({array.shape[:-1] for array in flat}) > 1:
             raise PgtsError(f"the parts of an observation have the shapes {[array.shape for array in found]}")
-        return self._numbers(flat) if self.numbered else np.concatenate(flat, -1, dtype=self._dtype, casting="unsafe")
+        if self.numbered:
+            return np.asarray(self._numbers(flat))
+        return np.concatenate(flat, -1, dtype=self._dtype, casting="unsafe")
+
+    @cached_property
+    def examples(self) -> dict[str, Tensor]:
+        """Two observations as named tensors: those of each component, as the environment declares it, without those
+        that are not seen. The legal actions are not among them."""
+        named: dict[str, Tensor] = {}
+        for part in self._parts:
+            name = part.name
+            while name in named:
+                name += "_"
+            named[name] = part.example(2)
+        return named
+
+    def row_tensors(self, given: Mapping[str, Tensor], legal_NA: Bool[Tensor, "N A"] | None) -> Tensor:
+        """As `encode`, of N observations and their legal actions, as tensors like `examples` and in operations of torch
+        alone, so that they can be traced; nothing is checked.
+
+        Args:
+            legal_NA: None: there are no masks. Where none is legal, all count as such.
+        """
+        found = [part.read_tensor(given[name]) for part, name in zip(self._parts, self.examples, strict=True)]
+        flat = [x_N.reshape(x_N.shape[0], -1) for x_N in found]
+        if self.numbered:
+            row_N = self._numbers(flat)
+        elif len(found) == 1:
+            row_N = found[0].to(_torch_dtype(self._dtype))
+        else:
+            row_N = torch.cat([x_ND.to(_torch_dtype(self._dtype)) for x_ND in flat], 1)
+        if legal_NA is None:
+            return row_N
+        legal_NA = legal_NA | ~legal_NA.any(-1, keepdim=True)
+        row_ND = row_N.reshape(row_N.shape[0], -1).to(_torch_dtype(self._masked_dtype))
+        return with_legal(row_ND, legal_NA)
 
     @staticmethod
     def _before(array: np.ndarray, part: _Part) -> tuple[int, ...]:
         return array.shape[: array.ndim - len(part.seen.shape or ())]
 
-    def _numbers(self, flat: list[np.ndarray]) -> np.ndarray:
-        """The numbers of combinations, in mixed radix; the last entry counts fastest."""
-        number = np.zeros(flat[0].shape[:-1], np.int64)
+    def _numbers(self, flat: Sequence[Any]) -> Any:
+        """The numbers of combinations, in mixed radix; the last entry counts fastest. Arrays or tensors."""
+        number = 0 * flat[0][..., 0]
         for part, array in zip(self._parts, flat, strict=True):
             for k, count in enumerate(counts(part.seen).tolist()):
                 number = number * count + array[..., k]
-        return np.asarray(number)
+        return number
+
+
+def _torch_dtype(dtype: np.dtype[Any]) -> torch.dtype:
+    return torch.from_numpy(np.empty(0, dtype)).dtype
 
 
 def _from_zero(array: np.ndarray, space: spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary) -> np.ndarray:

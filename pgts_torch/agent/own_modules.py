@@ -47,14 +47,18 @@ class OwnLayers(nn.Module):
         assert self._num_outputs is not None
         return self._num_outputs
 
+    def pieces(self, input_N: Float[Tensor, "N ..."]) -> list[Tensor]:
+        """What the module is called with: the inputs of each component."""
+        if len(self._shapes) == 1:
+            return [input_N]
+        each = zip(input_N.split(self._sizes, 1), self._shapes, strict=True)
+        return [piece.reshape(-1, *shape) for piece, shape in each]
+
     def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
         """Raises PgtsError where the module fails, or does not return float32 of the shape (N, outputs)."""
         if not len(input_N):  # some modules cannot do without rows
             return input_N.new_zeros(0, self.num_outputs)
-        pieces = [input_N]
-        if len(self._shapes) > 1:
-            each = zip(input_N.split(self._sizes, 1), self._shapes, strict=True)
-            pieces = [piece.reshape(-1, *shape) for piece, shape in each]
+        pieces = self.pieces(input_N)
         try:
             output = self.module(*pieces)
         except Exception as error:

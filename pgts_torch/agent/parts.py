@@ -154,16 +154,24 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
     )
 
 
-def _lookahead(
-    world: ModelWorld, policy: Policy, critic: Critic, options: Training, ranks: Ranks, *, samples_starts: bool
-) -> tuple[Search, Certificates, DepthChoice]:
-    """Return the search for a policy, its certificates, and the choice of its depth."""
+def make_look(world: ModelWorld, policy: Policy, critic: Critic, options: Training) -> PolicyLookahead:
+    """Return a search for a policy that has seen nothing of the model; MissingModel where this does not take what the
+    policy does."""
     model: Model = world.model
     if isinstance(policy, GaussianPolicy):
         if not isinstance(model, FollowingModel) or model.num_actions:
             raise MissingModel(f"{type(model).__name__} does not take vectors as actions, as a gaussian policy needs")
         model = DrawnActions(model, options.search.filled("gaussian").actions)
     search = make_search(options.search, model)
+    return PolicyLookahead(world, policy, critic, search, scale=options.search.filled("gaussian").proposal_scale)
+
+
+def _lookahead(
+    world: ModelWorld, policy: Policy, critic: Critic, options: Training, ranks: Ranks, *, samples_starts: bool
+) -> tuple[Search, Certificates, DepthChoice]:
+    """Return the search for a policy, its certificates, and the choice of its depth."""
+    look = make_look(world, policy, critic, options)
+    search = look.search
     depths, stop_at = options.search.depths, options.search.stop_at
     certificates = Certificates(
         world, search, critic, num_depths=len(depths), ranks=ranks, samples_starts=samples_starts
@@ -177,7 +185,6 @@ def _lookahead(
         certificates.check(f"stop_at is {stop_at}")
     if options.search.depth == "adaptive":
         certificates.check("depth is adaptive")
-    look = PolicyLookahead(world, policy, critic, search, scale=options.search.filled("gaussian").proposal_scale)
     tolerance = options.search.filled("adaptive").tolerance
     return search, certificates, DepthChoice(look, certificates, depths=depths, tolerance=tolerance, stop_at=stop_at)
 

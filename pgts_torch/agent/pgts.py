@@ -2,9 +2,10 @@
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Self, final
+from typing import Any, Literal, Self, final, overload
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from tqdm import tqdm
 
-from pgts_torch.agent import saved, saving
+from pgts_torch.agent import exporting, recording, saved, saving
 from pgts_torch.agent.acting import Acting
 from pgts_torch.agent.build import Description, MakesModule, make_device, plain
 from pgts_torch.agent.critics import Critic
@@ -27,6 +28,7 @@ from pgts_torch.agent.price import Pricing
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
+from pgts_torch.agent.watching import Watching
 from pgts_torch.agent.world import SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import Model
@@ -301,6 +303,7 @@ class PGTS:
                     break
         return self
 
+    @overload
     def predict(
         self,
         observation: ArrayLike,
@@ -308,7 +311,25 @@ class PGTS:
         deterministic: bool = True,
         action_mask: ArrayLike | None = None,
         generator: torch.Generator | None = None,
-    ) -> np.ndarray | np.generic:
+        state: None = None,
+        episode_start: None = None,
+    ) -> np.ndarray | np.generic: ...
+
+    @overload
+    def predict(
+        self, observation: ArrayLike, *, state: Any, episode_start: ArrayLike, deterministic: bool = True
+    ) -> tuple[np.ndarray | np.generic, Any]: ...
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        *,
+        deterministic: bool = True,
+        action_mask: ArrayLike | None = None,
+        generator: torch.Generator | None = None,
+        state: Any = None,
+        episode_start: ArrayLike | None = None,
+    ) -> Any:
         """Return actions for observations, in the form of the environment; without search.
 
         Args:
@@ -317,12 +338,74 @@ class PGTS:
                 array of observations. It is needed where the environment has action masks.
             deterministic: take the most probable action, of a gaussian policy the mean; else sample from pi.
             generator: for sampling; default: one with this model's seed, which continues from call to call.
+            state, episode_start: given by `evaluate_policy` of stable-baselines3. With episode_start the pair (actions,
+                state) is returned, as by its models; neither changes the actions.
 
         Raises:
             PgtsError: an observation or a mask is none of the environment, or the mask is missing, or of no use.
         """
         generator = generator or self._generator
-        return self._act(self.policy, observation, action_mask, deterministic=deterministic, generator=generator)
+        actions = self._act(self.policy, observation, action_mask, deterministic=deterministic, generator=generator)
+        return actions if episode_start is None else (actions, state)
+
+    def record(
+        self,
+        path: str | Path,
+        *,
+        episodes: int = 1,
+        seed: int = 0,
+        fps: float | None = None,
+        deterministic: bool = True,
+        depth: int | None = None,
+        steps: int | None = None,
+    ) -> list[recording.Seen]:
+        """Write episodes as a film, beside each picture the lookahead's values and the policy's probabilities in that
+        state; as text where `path` ends in .txt. Training is not affected, but states of simulators and vectors that
+        an iteration has numbered lose their numbers.
+
+        Args:
+            path: a .gif, an .mp4 (with the extra `video`) or a .txt; a file of that kind is replaced.
+            episodes: how many.   seed: episode k begins with reset(seed=seed + k).
+            fps: pictures a second; default: as the environment says, or 10.
+            deterministic: take the most probable action, of a gaussian policy the mean; else sample from pi.
+            depth: m of the lookahead; default: that of the training, or the largest of an adaptive depth.
+            steps: the most steps of an episode; default: the time limit, or 1,000 where there is none.
+
+        Returns:
+            Of each episode the seed, the length, the return and how it ended.
+
+        Raises:
+            PgtsError: an argument out of range; there is another file at `path`; the environment cannot be drawn; or it
+                failed, naming step and seed.
+        """
+        suffix = recording.suffix_of(path)
+        chosen = {"seed": seed, "deterministic": deterministic, "depth": depth, "steps": steps}
+        with closing(self.watching(**chosen, mode="ansi" if suffix == ".txt" else "rgb_array")) as watching:
+            return recording.record(path, watching, episodes=episodes, fps=fps, name=self.source.name)
+
+    def watching(self, **options: Any) -> Watching:
+        """Episodes of the policy, to be looked at step by step; the arguments are those of `watching.Watching`."""
+        return Watching(self._parts, training_seed=self.seed, **options)
+
+    def export(self, path: str | Path, *, format: exporting.Format | None = None) -> dict[str, Any]:
+        """Write the policy as a program that acts without this package: from observations, as the environment gives
+        them, to probabilities (or mean and standard deviation) and to the action that `predict` returns. If several
+        processes train together all must call it, and the first one writes.
+
+        Args:
+            path: an earlier export there is replaced.
+            format: "torch" (read by torch.export.load) or "onnx"; default: by the end of `path`, .pt2 or .onnx.
+
+        Returns:
+            What the file says of itself: the environment, inputs and outputs by name.
+
+        Raises:
+            PgtsError: the policy is of a class of your own, or a module of it cannot be traced; a package is missing;
+                or there is another file at `path`.
+        """
+        notes = {"environment": self.source.name, "num_env_steps": self.num_env_steps}
+        parts: dict[str, Any] = {"world": self.world, "source": self.source, "policy": self.policy, "notes": notes}
+        return self.ranks.first("an exported policy", lambda: exporting.export(path, format, **parts))
 
     def save(self, path: str | Path) -> None:
         """Write arguments and state into one file with a checksum, without an environment that was given as an object.

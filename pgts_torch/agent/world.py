@@ -3,11 +3,12 @@
 Searches take states, which are integers; policies and critics take observations. A `ModelWorld` translates.
 """
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Literal, final
+from typing import Any, Literal, Self, final
 
 import numpy as np
 import torch
@@ -112,6 +113,12 @@ class World:
         world.warned, world.perceive, world.perceived_space = True, self.perceive, self.perceived_space
         world.legal_of = self.legal_of
         return world
+
+    def beside(self, env: VectorEnv) -> Self:
+        """This world, with its model, for other environments of the same kind, which step one by one."""
+        other = copy.copy(self)
+        other.env = env
+        return other
 
     def promise(self, reward_range: RewardRange) -> None:
         """Check rewards of episodes, table and model against a range, and bound values by it.
@@ -267,7 +274,6 @@ class SimulatedWorld(ModelWorld):
     def __init__(self, env: SyncVectorEnv, model: SimulatorModel | VectorSimulator, **options: Any) -> None:
         super().__init__(env, gamma=model.gamma, **options)
         self.model: SimulatorModel | VectorSimulator = model
-        self._envs = env.envs
 
     def read(self, observation: Any, encoded_B: Tensor) -> Int[Tensor, "B"]:
         """Take a snapshot of each environment and return their numbers."""
@@ -275,7 +281,7 @@ class SimulatedWorld(ModelWorld):
         if isinstance(observation, Masked):
             observation, legal_BA = observation
         each = iterate(self.env.observation_space, observation)
-        return self.model.roots(self._envs, each, legal_BA).to(self.device)
+        return self.model.roots(each_of(self.env), each, legal_BA).to(self.device)
 
     def numbers(self, read_N: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
         return read_N
@@ -334,10 +340,9 @@ class DynamicsWorld(VectorStates):
     def __init__(self, env: SyncVectorEnv, model: DynamicsModel, *, observed: Observed = Observed()) -> None:  # noqa: B008
         super().__init__(env, gamma=model.gamma, observed=observed, device=model.device)
         self.model: DynamicsModel = model
-        self._envs = env.envs
 
     def read(self, observation: Any, encoded_B: Tensor) -> Float[Tensor, "B D"]:
-        return self.model.vectors(self._envs)
+        return self.model.vectors(each_of(self.env))
 
     def observe(self, state_N: Int[Tensor, "N"]) -> Tensor:
         """The observations in these states, as the wrappers of the environment change them."""

@@ -128,12 +128,21 @@ def json_object(text: str) -> dict[str, Any]:
 
 def unit_interval(text: str) -> float:
     """An argparse type: a number in [0, 1]."""
+    return _real(text, lambda value: 0 <= value <= 1, "a number in [0, 1]")
+
+
+def positive(text: str) -> float:
+    """An argparse type: a number above 0."""
+    return _real(text, lambda value: 0 < value < math.inf, "a number above 0")
+
+
+def _real(text: str, is_fine: Callable[[float], bool], what: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number in [0, 1]")
+    if not is_fine(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
     return value
 
 
@@ -168,12 +177,26 @@ def output_folder(text: str) -> Path:
 
 def html_file(text: str) -> Path:
     """An argparse type: a path that ends in .html, in an existing folder."""
-    path = Path(text)
-    if path.suffix != ".html" or path_kind(text) == "folder":
+    if Path(text).suffix != ".html" or path_kind(text) == "folder":
         raise argparse.ArgumentTypeError(f"{text!r} is not a file that ends in .html")
+    return file_path(text)
+
+
+def file_path(text: str) -> Path:
+    """An argparse type: the path of a file, which need not exist yet, in an existing folder."""
+    path = Path(text)
+    if path_kind(text) == "folder":
+        raise argparse.ArgumentTypeError(f"{text!r} is a folder; it must be a file")
     if not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f"{text!r}: {str(path.parent)!r} is not a folder")
     return path
+
+
+def film_path(text: str) -> Path:
+    """An argparse type: a path that ends in .gif, .mp4 or .txt, in an existing folder."""
+    if Path(text).suffix.lower() not in (".gif", ".mp4", ".txt"):
+        raise argparse.ArgumentTypeError(f"{text!r} does not end in .gif, .mp4 or .txt")
+    return file_path(text)
 
 
 def run_folder(text: str) -> Path:

@@ -12,11 +12,14 @@ from pgts_torch.cli.arguments import (
     command_name,
     describe_options,
     env_scale,
+    file_path,
+    film_path,
     html_file,
     json_object,
     listed,
     output_folder,
     path_kind,
+    positive,
     print_values,
     run_folder,
     unit_interval,
@@ -154,6 +157,71 @@ def evaluate(arguments: Arguments) -> None:
     options = {"episodes": given.episodes, "seed": given.seed, "trust_imports": given.trust_imports}
     answer = evaluate_run(given.run_dir, **options)
     print_values({kind: asdict(evaluation) for kind, evaluation in answer.items()}, as_json=given.json)
+
+
+@command
+def watch(arguments: Arguments) -> None:
+    """Show episodes of a run, with what the lookahead says."""
+    parser = Parser(watch)
+    parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run")
+    parser.add_argument(
+        "--out", metavar="FILE", type=film_path, help="a .gif, .mp4 or .txt (default: text, in the terminal)"
+    )
+    _add_checkpoint(parser)
+    for name, kind, default, meaning in [
+        ("episodes", whole(1), 1, "how many (default: %(default)s)"),
+        ("seed", whole(0), 0, "episode k begins with reset(seed=N + k) (default: %(default)s)"),
+        ("steps", whole(1), None, "the most steps of an episode (default: its time limit, or 1,000)"),
+        ("depth", whole(0), None, "of the lookahead (default: that of the training)"),
+        ("fps", positive, None, "pictures, or steps of text, a second (default: as the environment says)"),
+    ]:
+        parser.add_argument(f"--{name}", metavar="N", type=kind, default=default, help=meaning)
+    parser.add_argument(
+        "--sampled", action="store_true", help="sample actions from the policy (default: the most probable ones)"
+    )
+    parser.add_argument("--json", action="store_true", help="print length and return of each episode as JSON, no text")
+    parser.epilog = WATCH_HELP
+    _add_trust(parser)
+    given = parser.parse_args(arguments)
+    from pgts_torch.experiment import watch as watching
+
+    options = {name: getattr(given, name) for name in ("checkpoint", "episodes", "seed", "steps", "depth", "fps")}
+    options |= {"deterministic": not given.sampled, "quiet": given.json, "trust_imports": given.trust_imports}
+    answer = watching.watch_run(given.run_dir, given.out, **options)
+    print(json.dumps(answer) if given.json else watching.describe(answer))
+
+
+WATCH_HELP = """\
+Each step has the probabilities of the actions by the policy and their values
+by the lookahead; > is the one taken. Text has what the environment renders as
+text, else the observation. .mp4 needs pip install 'pgts_torch[video]'."""
+
+
+@command
+def export(arguments: Arguments) -> None:
+    """Write the policy of a run as a program of torch or ONNX."""
+    parser = Parser(export)
+    parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run")
+    parser.add_argument("--format", choices=["torch", "onnx"], help="default: by the end of FILE, or torch")
+    parser.add_argument(
+        "--out", metavar="FILE", type=file_path, help="where to write (default: RUN_DIR/policy.pt2, or policy.onnx)"
+    )
+    _add_checkpoint(parser)
+    parser.add_argument("--json", action="store_true", help="print what the file says of itself as one JSON object")
+    parser.epilog = EXPORT_HELP
+    _add_trust(parser)
+    given = parser.parse_args(arguments)
+    from pgts_torch.experiment.export import export_run
+
+    options = {"format": given.format, "checkpoint": given.checkpoint, "trust_imports": given.trust_imports}
+    print_values(export_run(given.run_dir, given.out, **options), as_json=given.json)
+
+
+EXPORT_HELP = """\
+The program maps observations, as the environment gives them, to the
+probabilities of actions (or mean and std) and to the action that the policy
+takes, in the environment's own form. It needs torch, or an ONNX runtime, and
+not pgts_torch. ONNX needs pip install 'pgts_torch[onnx]'."""
 
 
 @command
@@ -326,6 +394,15 @@ def _add_trust(parser: Parser, when: str = "") -> None:
         "--trust-imports",
         action="store_true",
         help=f"{when}import the modules that the saved environment and model name, as MODULE:ID (see SECURITY.md)",
+    )
+
+
+def _add_checkpoint(parser: Parser) -> None:
+    parser.add_argument(
+        "--checkpoint",
+        choices=["last", "best"],
+        default="last",
+        help="the last one, or the best model by the evaluations of a run with eval.keep_best (default: %(default)s)",
     )
 
 

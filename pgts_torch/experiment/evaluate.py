@@ -4,11 +4,12 @@ from pathlib import Path
 
 import torch
 
+from pgts_torch import files
 from pgts_torch.agent.evaluate import Evaluation, Evaluator
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.checkpoint import newest
-from pgts_torch.experiment.ownership import is_earlier
+from pgts_torch.experiment.ownership import BEST_FILE, is_earlier
 
 KINDS = {"deterministic": True, "sampled": False}
 """The kinds of evaluation: with the most probable actions (True), or with sampled ones."""
@@ -20,6 +21,22 @@ def evaluate_run(run: str | Path, *, episodes: int, seed: int, trust_imports: bo
     loaded = PGTS.load(last_checkpoint(Path(run)), trust_imports=trust_imports)
     with loaded as algorithm, Evaluator(episodes) as evaluator:
         return {kind: evaluator(algorithm, deterministic=greedy, seed=seed) for kind, greedy in KINDS.items()}
+
+
+def checkpoint_of(run: Path, which: str) -> Path:
+    """Return the path of the best model of a run folder, or of its newest intact checkpoint; PgtsError if there is
+    none.
+
+    Args:
+        which: "best" or "last".
+    """
+    if which == "last":
+        return last_checkpoint(run)
+    if files.kind(run / BEST_FILE) != "file":
+        raise PgtsError(
+            f"{run} holds no {BEST_FILE}, which eval.every with eval.keep_best leave: take its last checkpoint"
+        )
+    return run / BEST_FILE
 
 
 def last_checkpoint(run: Path) -> Path:

@@ -26,10 +26,20 @@ VERSIONS_FILE = "versions.json"
 BEST_FILE = "best.pt"
 PICTURE_FILE = "policy.png"
 REPORT_FILE = "report.html"
+EXPORT_FILES = {"torch": "policy.pt2", "onnx": "policy.onnx"}
 CHECKPOINTS = "checkpoints"
 EVENTS_SUFFIX = ".pgts"
 
-_RESULTS = (SUMMARY_FILE, METRICS_FILE, FAILURE_FILE, VERSIONS_FILE, BEST_FILE, PICTURE_FILE, REPORT_FILE)
+_RESULTS = (
+    SUMMARY_FILE,
+    METRICS_FILE,
+    FAILURE_FILE,
+    VERSIONS_FILE,
+    BEST_FILE,
+    PICTURE_FILE,
+    REPORT_FILE,
+    *EXPORT_FILES.values(),
+)
 """In the order in which they are removed: a half cleared run is an unfinished one."""
 
 _OWN_FILES = (*_RESULTS, MARK_FILE, CONFIG_FILE)

@@ -182,9 +182,9 @@ class EnvSource:
             self._check_like(each_of(self.given), made.envs)
         return made
 
-    def like(self, k: int = 0) -> gymnasium.Env:
-        """A new environment, as environment k of those that `make` gives."""
-        made = self.make_one(k, max_episode_steps=-1)
+    def like(self, k: int = 0, **options: Any) -> gymnasium.Env:
+        """A new environment, as environment k of those that `make` gives, with further options as in `make_one`."""
+        made = self.make_one(k, max_episode_steps=-1, **options)
         return Squashed(made) if self.vectors else numbered(made, per_dimension=self.actions_per_dimension)
 
     def make_one(self, k: int = 0, **options: Any) -> gymnasium.Env:

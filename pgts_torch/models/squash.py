@@ -4,8 +4,10 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium import spaces
 from jaxtyping import Float
+from torch import Tensor
 
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.snapshots import env_name
@@ -53,6 +55,13 @@ class Squash:
         share_NX = (np.tanh(vector_NX) + 1) / 2
         action_NX = np.where(self._bounded, self._low + (self._high - self._low) * share_NX, vector_NX)
         return action_NX.astype(self._dtype).reshape(*vector_NX.shape[:-1], *self._shape)
+
+    def of_tensors(self, vector_NX: Float[Tensor, "N X"]) -> Tensor:
+        """The same in operations of torch, which can be traced."""
+        low_X, high_X, bounded_X = map(torch.as_tensor, (self._low, self._high, self._bounded))
+        vector_NX = vector_NX.double()
+        action_NX = torch.where(bounded_X, low_X + (high_X - low_X) * (vector_NX.tanh() + 1) / 2, vector_NX)
+        return action_NX.to(torch.from_numpy(np.empty(0, self._dtype)).dtype).reshape(-1, *self._shape)
 
 
 @final

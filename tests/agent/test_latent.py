@@ -262,7 +262,7 @@ def test_a_latent_model_learns_on_ranks_as_one_process_does_from_the_steps_of_al
     def fitted(ranks: Ranks, own: slice) -> tuple[torch.Tensor, dict[str, float]]:
         model = untrained(with_updates(5).model_copy(update={"minibatch_size": 16}))
         losses = model.learn(Experience(*(column[own] for column in columns), ranks), generator=stream(0, "learn"))
-        return torch.cat([x.flatten() for x in model._representation.tensors + model._dynamics.tensors]), losses
+        return torch.cat([x.flatten() for x in model.representation.tensors + model._dynamics.tensors]), losses
 
     monkeypatch.setattr(torch, "randint", sampled)
     halves = on_ranks(2, lambda: fitted(ranks := present_ranks(), slice(30 * ranks.rank, 30 * ranks.rank + 30)))
