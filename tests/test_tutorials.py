@@ -15,7 +15,7 @@ import pytest
 
 TUTORIALS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "docs/tutorials").glob("*.md"))}
 
-SHORT: dict[str, dict[str, Any]] = {}
+SHORT: dict[str, dict[str, Any]] = {"puzzle": {"steps": 200, "every": 100}}
 """Of the tutorials that take longer: the values that shorten their cell tagged `parameters`, as papermill has them."""
 
 
@@ -81,7 +81,21 @@ def paper(it: Any, out: str) -> None:
     assert it.reached == pytest.approx(it.best.J, rel=0.01)
 
 
-CLAIMS: dict[str, Callable[[Any, str], None]] = {"certificate": certificate, "inventory": inventory, "paper": paper}
+def puzzle(it: Any, out: str) -> None:
+    assert "can serve as a model" in out
+    at = {name: curve[-1] for name, curve in it.curves.items()}
+    assert at["PPO"][1] == 0
+    assert at["PGTS"][1] == 1
+    assert at["PGTS"][0] < it.steps
+    assert "moves, reward 1" in out
+
+
+CLAIMS: dict[str, Callable[[Any, str], None]] = {
+    "certificate": certificate,
+    "inventory": inventory,
+    "paper": paper,
+    "puzzle": puzzle,
+}
 
 
 def test_every_tutorial_is_short_and_ends_with_what_to_try_next():
