@@ -11,6 +11,9 @@ from pgts_torch.errors import PgtsError
 PARTIAL = ".partial"
 """The end of the name of a file, or a folder, that is being written."""
 
+EVENTS_PREFIX, EVENTS_SUFFIX = "events.out.tfevents.", ".pgts"
+"""How the names of TensorBoard's event files begin, and how those that we write end."""
+
 _NO_WAITING = getattr(os, "O_NONBLOCK", 0)
 _STREAMS = ("/dev/fd/", "/dev/stdin", "/proc/self/fd/")
 _KINDS = {

@@ -1,6 +1,7 @@
 """What README.md and the pages of docs/start say: their Python runs as printed, their commands are known, links lead
 somewhere."""
 
+import ast
 import contextlib
 import doctest
 import importlib
@@ -27,24 +28,27 @@ LINKED = PAGES | {str(path.relative_to(ROOT)): path for path in sorted((ROOT / "
 
 
 class Block(NamedTuple):
-    """A fenced block: its language, what it holds, and whether it takes longer than a test may."""
+    """A fenced block: its language, what it holds, and the comment before it: "long" where it takes longer than a test
+    may, "parsed" where it needs what is not installed."""
 
     language: str
     text: str
-    is_long: bool
+    mark: str
 
 
 def blocks(page: str) -> list[Block]:
-    found = re.findall(r"^(<!-- long -->\n)?```(\w*|\{code-cell\} python)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
-    return [Block(language, text, bool(long)) for long, language, text in found]
+    found = re.findall(r"^(?:<!-- (long|parsed) -->\n)?```(\w*|\{code-cell\} python)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    return [Block(language, text, mark) for mark, language, text in found]
 
 
 def printed(page: list[Block], *, long: bool) -> Iterator[tuple[str, str]]:
     """What the Python of a page prints, and what the page says, block by block; one namespace for all."""
     names = vars(module := types.ModuleType("page"))
     sys.modules["page"] = module  # where classes of the page are found by their names
-    for block, after in zip(page, [*page[1:], Block("", "", False)], strict=True):
-        if block.language == "python" and (long or not block.is_long):
+    for block, after in zip(page, [*page[1:], Block("", "", "")], strict=True):
+        if block.language == "python" and block.mark == "parsed":
+            ast.parse(block.text)
+        elif block.language == "python" and (long or not block.mark):
             out = io.StringIO()
             with contextlib.redirect_stdout(out):
                 exec(block.text, names)

@@ -83,11 +83,26 @@ class EvalCallback:
         )
         latest = Evaluated(now, evaluation)
         self.history.append(latest)
+        if algorithm.board is not None:
+            algorithm.board.evaluated(self.tags(now), every=self.every)
         if self.best is None or latest.mean > self.best.mean:
             self.best = latest
             if self.best_path is not None:
                 algorithm.save(self.best_path)
         return self.stop_at_return is None or latest.mean < self.stop_at_return
+
+    def tags(self, step: int) -> dict[str, float]:
+        """Return what is logged of the evaluation that was made at this step; nothing if there was none."""
+        if not self.history or self.history[-1].env_steps != step:
+            return {}
+        tags, kind = {}, "deterministic" if self.deterministic else "sampled"
+        for name in ("episodic_return", "episodic_length"):
+            score: Score = getattr(self.history[-1].evaluation, name)
+            short = name.removeprefix("episodic_")
+            tags[f"eval/{kind}_{short}"] = score.mean
+            if score.half_width is not None:
+                tags[f"eval/{kind}_{short}_half_width"] = score.half_width
+        return tags
 
     def reset(self) -> None:
         """Remove all evaluations so far, so that the next one is the best."""

@@ -1,8 +1,9 @@
 """Policy gradient with tree search, from rollouts.        [PGTS Alg. 1]"""
 
+import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self, final, overload
@@ -16,8 +17,10 @@ from tqdm import tqdm
 
 from pgts_torch.agent import exporting, recording, saved, saving
 from pgts_torch.agent.acting import Acting
+from pgts_torch.agent.board import Board, hyperparameters
 from pgts_torch.agent.build import Description, MakesModule, make_device, plain
 from pgts_torch.agent.critics import Critic
+from pgts_torch.agent.diagnostics import Counters
 from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.iteration import Iteration, PolicyBatch
@@ -138,7 +141,7 @@ class PGTS:
             if self.ranks.leads:
                 print(f"note: seed is None; this training has the seed {seed}", file=sys.stderr)
         self.seed = seed
-        parts = self._parts = make_parts(arguments, self.ranks)
+        parts = self.parts = make_parts(arguments, self.ranks)
         self.options, self.source, self.world = parts.options, parts.source, parts.world
         self.policy, self.critic, self.update = parts.policy, parts.critic, parts.update
         self.search, self.certificates, self.depth_choice = parts.search, parts.certificates, parts.depth_choice
@@ -146,6 +149,7 @@ class PGTS:
         self.episodes, self.dyna, self.posterior = parts.episodes, parts.dyna, parts.posterior
         self.gamma, self.horizon = self.world.gamma, self.options.rollout.horizon
         self.num_iterations = self.num_env_steps = self.num_model_calls = 0
+        self.board: Board | None = None
         self._lacks: str | None = None
         depth = self.options.search.depth
         levels = depth + (self.critic.target == "v") if isinstance(depth, int) else None
@@ -168,13 +172,13 @@ class PGTS:
 
     def _iterate(self) -> Iteration:
         draws = Draws.of(self.ranks, self.seed, self.num_iterations, self.device)
-        calls_before = self._parts.model_calls
+        calls_before = self.parts.model_calls
         self.pricing.begin()
-        self._parts.follow(self.num_env_steps)
+        self.parts.follow(self.num_env_steps)
 
         # Visit states by episodes of pi_k, or of an `Explorer` where the model has optimism: the states where d(s), an
         # estimate of the occupancy d^{pi_k}(s), is positive.
-        experience = visit(self.world, self._parts.visiting, self.episodes, self.horizon, draws, self.ranks)
+        experience = visit(self.world, self.parts.visiting, self.episodes, self.horizon, draws, self.ranks)
         if self.dyna is None:
             batch, losses = self._improve(experience, draws)
         else:
@@ -190,7 +194,7 @@ class PGTS:
             batch = replace(batch, is_enough=posterior <= target)
         self.num_iterations += 1
         self.num_env_steps += experience.share.total
-        model_calls = self.ranks.total(self._parts.model_calls - calls_before, self.policy.state_dict)
+        model_calls = self.ranks.total(self.parts.model_calls - calls_before, self.policy.state_dict)
         self.num_model_calls += model_calls
         self.pricing.end(model_calls)
         return Iteration(
@@ -274,7 +278,12 @@ class PGTS:
         return self.depth_choice.look(state_N, depth=depth, generator=draws.search())
 
     def learn(
-        self, total_steps: int, *, callback: Callback | Sequence[Callback] = (), progress: bool | None = None
+        self,
+        total_steps: int,
+        *,
+        callback: Callback | Sequence[Callback] = (),
+        progress: bool | None = None,
+        tensorboard: str | Path | None = None,
     ) -> Self:
         """Iterate until there are `total_steps` environment steps, including those before this call.
 
@@ -284,24 +293,55 @@ class PGTS:
             progress: show a progress bar, and say what an iteration costs; None: the bar alone, and only on a terminal.
                 From a second on the cost is always said, before it is spent where the lookahead takes long; from 30
                 seconds on with what makes it cheaper.
+            tensorboard: a folder for TensorBoard events, with the tags of `pgts train`: hyper-parameters and
+                configuration, the numbers of each iteration, histograms, pictures of tables where an `EvalCallback`
+                evaluates and at the end, and results. A training that goes on writes into the same folder.
 
         Raises:
-            PgtsError: a callback that cannot be called; or the environment failed, naming step and seeds.
+            PgtsError: a callback that cannot be called; the folder is none, or has events of another training; or the
+                environment failed, naming step and seeds.
         """
         callbacks = [callback] if callable(callback) else callback
         if not isinstance(callbacks, Sequence) or not all(map(callable, callbacks)):
             raise PgtsError(f"callback is {callback!r}; it must be a function of (model, iteration), or a list of such")
         hidden = True if not self.ranks.leads else None if progress is None else not progress
-        with tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=hidden) as bar:
+        with ExitStack() as held:
+            bar = held.enter_context(tqdm(total=total_steps, initial=self.num_env_steps, unit="step", disable=hidden))
+            if tensorboard is not None:
+                self.board = held.enter_context(self._opened(tensorboard, total_steps))
+                held.callback(setattr, self, "board", None)
             while self.num_env_steps < total_steps:
                 iteration = self.iterate()
                 bar.update(iteration.num_steps)
                 if progress:
                     self.pricing.say()
+                if self.board is not None:
+                    self.board.follow(iteration, self.counters)
                 goes_on = False not in [call(self, iteration) for call in callbacks]
                 if not all(self.ranks.gather("whether to go on", lambda: goes_on)) or iteration.is_enough:  # noqa: B023
                     break
+            if self.board is not None:
+                self.board.end()
         return self
+
+    @property
+    def counters(self) -> Counters:
+        """What it has done so far."""
+        return Counters(self.num_iterations, self.num_env_steps, self.num_model_calls)
+
+    def _opened(self, folder: str | Path, total_steps: int) -> Board:
+        env = {"id": self.source.name, "kwargs": dict(self._arguments["env_kwargs"] or {}), "gamma": self.gamma}
+        options = self.options.plain()
+        options["env"] |= env
+        return Board(
+            folder,
+            self.parts,
+            self.ranks,
+            options=hyperparameters(self.parts, env_kwargs=self._arguments["env_kwargs"], seed=self.seed),
+            text=f"{self!r}\n\n{json.dumps(options, indent=2, default=str)}",
+            total_steps=total_steps,
+            counters=self.counters,
+        )
 
     @overload
     def predict(
@@ -385,7 +425,7 @@ class PGTS:
 
     def watching(self, **options: Any) -> Watching:
         """Episodes of the policy, to be looked at step by step; the arguments are those of `watching.Watching`."""
-        return Watching(self._parts, training_seed=self.seed, **options)
+        return Watching(self.parts, training_seed=self.seed, **options)
 
     def export(self, path: str | Path, *, format: exporting.Format | None = None) -> dict[str, Any]:
         """Write the policy as a program that acts without this package: from observations, as the environment gives
@@ -449,7 +489,7 @@ class PGTS:
     def state_dict(self) -> dict[str, Any]:
         """Return the states of all parts, and the counters. If several processes train together all must call it."""
         self.check_complete()
-        return saved.state_of(self._parts, self.ranks) | {name: getattr(self, name) for name in saved.COUNTERS}
+        return saved.state_of(self.parts, self.ranks) | {name: getattr(self, name) for name in saved.COUNTERS}
 
     def check_complete(self) -> None:
         """PgtsError where training cannot go on, because several processes have saved this model and not as many have
@@ -459,5 +499,5 @@ class PGTS:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load what `state_dict` returned; PgtsError, and nothing is loaded, if it is no state of such a model."""
-        counters, self._lacks = saved.restore(self._parts, self.ranks, state)
+        counters, self._lacks = saved.restore(self.parts, self.ranks, state)
         self.num_iterations, self.num_env_steps, self.num_model_calls = counters

@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from pgts_torch import files
+from pgts_torch.agent.board import hyperparameters, tags_of_results
+from pgts_torch.agent.pgts import PGTS
 from pgts_torch.config import Config, dump, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
@@ -23,7 +25,7 @@ from pgts_torch.experiment.ownership import (
     Mark,
     check_folder,
     clear,
-    clear_events,
+    cut_events,
     digest,
     listing,
     write_mark,
@@ -104,8 +106,9 @@ def _is_edited(config: Config, run: Path, mark: Mark) -> bool:
     return True
 
 
-def opened(config: Config, lock: RunLock, start: Start | None) -> RunFolder:
-    """Write the configuration and the versions; files of earlier runs are removed, or kept where the run resumes."""
+def opened(config: Config, lock: RunLock, start: Start | None, algorithm: PGTS) -> RunFolder:
+    """Write the configuration and the versions; files of earlier runs are removed, or kept where the run resumes,
+    TensorBoard events up to the checkpoint."""
     path = lock.path
     lock.check()
     mark = check_folder(path)
@@ -121,8 +124,8 @@ def opened(config: Config, lock: RunLock, start: Start | None) -> RunFolder:
         print(f"going on from {start.path}", file=sys.stderr)
         if start.lost_best:
             (path / BEST_FILE).unlink(missing_ok=True)
-        if config.run.tensorboard and not start.has_events:
-            clear_events(path)
+        if config.run.tensorboard:
+            cut_events(path, start.notes.files if start.has_events else {})
     if config.critic.type == "exact":
         print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
     if not is_edited:
@@ -131,5 +134,11 @@ def opened(config: Config, lock: RunLock, start: Start | None) -> RunFolder:
     if start is not None:
         position = {"metrics_bytes": start.notes.files[METRICS_FILE][0], "after_step": start.notes.env_steps}
     folder = RunFolder(lock, tensorboard=config.run.tensorboard, **position)
+    if folder.events is not None and folder.events.is_new:
+        folder.events.begin(
+            hyperparameters(algorithm.parts, env_kwargs=config.env.kwargs, seed=algorithm.seed),
+            text.decode(),
+            results=(*tags_of_results(algorithm.parts), "final/deterministic_return", "final/sampled_return"),
+        )
     folder.json(VERSIONS_FILE, versions() | {"threads": config.threads})
     return folder

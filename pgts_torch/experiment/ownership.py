@@ -5,7 +5,9 @@ their names. A folder without a mark is not touched.
 """
 
 import hashlib
+import os
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +30,6 @@ PICTURE_FILE = "policy.png"
 REPORT_FILE = "report.html"
 EXPORT_FILES = {"torch": "policy.pt2", "onnx": "policy.onnx"}
 CHECKPOINTS = "checkpoints"
-EVENTS_SUFFIX = ".pgts"
 
 _RESULTS = (
     SUMMARY_FILE,
@@ -44,7 +45,7 @@ _RESULTS = (
 
 _OWN_FILES = (*_RESULTS, MARK_FILE, CONFIG_FILE)
 _CHECKPOINT = re.compile(r"\d{12,}\.pt")
-_EVENTS = re.compile(rf"events\.out\.tfevents\.\d+\..+{re.escape(EVENTS_SUFFIX)}")
+_EVENTS = re.compile(rf"{re.escape(files.EVENTS_PREFIX)}\d+\..+{re.escape(files.EVENTS_SUFFIX)}")
 _PARTIAL = re.compile(rf"\.(.+)\.\d+{re.escape(files.PARTIAL)}")
 
 
@@ -164,7 +165,7 @@ def clear(run: Path, mark: Mark) -> list[str]:
     remove_partial(run)
     for path in [run / name for name in _RESULTS] + checkpoints(run):
         _remove(path)
-    clear_events(run)
+    cut_events(run, {})
     with suppress(OSError):  # missing, or files of the user are in it
         (run / CHECKPOINTS).rmdir()
     config = run / CONFIG_FILE
@@ -173,10 +174,14 @@ def clear(run: Path, mark: Mark) -> list[str]:
     return [name for name in _names(run) if name not in (MARK_FILE, LOCK_FILE)]
 
 
-def clear_events(run: Path) -> None:
-    """Remove the event files of a run."""
+def cut_events(run: Path, noted: Mapping[str, tuple[int, str]]) -> None:
+    """Cut the event files of a run to the lengths that are noted of them, and remove the others."""
     for name in filter(is_events, _names(run)):
-        _remove(run / name)
+        if name not in noted:
+            _remove(run / name)
+        elif files.kind(run / name) == "file":
+            with files.named(f"{run / name} cannot be written to"):
+                os.truncate(run / name, noted[name][0])
 
 
 def remove_partial(run: Path) -> None:

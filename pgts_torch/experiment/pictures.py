@@ -10,19 +10,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
 
+from pgts_torch.envs.drawing import DIRECTIONS, MOST_OUTLINED
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
 
 FEW = 20
 """Up to so many states values are written in a large font, and all states are numbered."""
 
-MOST_OUTLINED = 20
-"""Start states are not outlined where there are more of them."""
-
 NUMBER_WIDTH = 0.45
 """The width of a probability in inches."""
-
-DIRECTIONS = {"left": (-1, 0), "right": (1, 0), "up": (0, 1), "down": (0, -1)}
 
 
 def policy_picture(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], *, title: str = "") -> Figure:
@@ -77,7 +73,7 @@ def _draw_arrows(axes: Axes, mdp: TabularMDP, pi_SA: Tensor, visited_S: Tensor) 
             "width": 0.004,
             "headwidth": 4,
         }
-        axes.quiver(state % columns, state // columns, dx * length, -dy * length, alpha=shade, **style)
+        axes.quiver(state % columns, state // columns, dx * length, dy * length, alpha=shade, **style)
     axes.set_xlim(-0.5, columns - 0.5)
     axes.set_ylim(rows - 0.5, -0.5)
     axes.set_aspect("equal")

@@ -3,21 +3,20 @@
 import copy
 import math
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
+from pgts_torch.agent.board import is_drawn
 from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.certificate import CONFIDENCE
-from pgts_torch.agent.evaluate import Evaluator, Score
+from pgts_torch.agent.diagnostics import Diagnostics
+from pgts_torch.agent.evaluate import Evaluator
 from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.states import load_checked
 from pgts_torch.config import Config
 from pgts_torch.config.config import EvalConfig
-from pgts_torch.experiment import checkpoint, diagnostics
+from pgts_torch.experiment import checkpoint
 from pgts_torch.experiment.advice import Movement, greedy_is_worse, learned_little, span_of
 from pgts_torch.experiment.checkpoint import Notes, Progress
 from pgts_torch.experiment.evaluate import KINDS
@@ -25,7 +24,7 @@ from pgts_torch.experiment.ownership import BEST_FILE
 from pgts_torch.experiment.progress import Reporter
 from pgts_torch.experiment.resume import Start, plain
 from pgts_torch.experiment.signals import StopFlag
-from pgts_torch.experiment.summary import Summary
+from pgts_torch.experiment.summary import Summary, results
 from pgts_torch.experiment.tracking import RunFolder, versions
 from pgts_torch.tabular import exact, stationary
 
@@ -56,13 +55,15 @@ class Recorder:
         self.movement = movement
         movement.before = copy.deepcopy(algorithm.policy)
         self.progress = Progress()
-        self.truth = None if algorithm.world.mdp is None else diagnostics.Truth(algorithm)
+        total_steps, log = config.total_steps, config.log
+        self.diagnostics = Diagnostics(
+            algorithm.parts, total_steps=total_steps, every=log.every, points=log.exact_points
+        )
         self.report = Reporter(config.total_steps, shown=folder is not None)
         self._last: Iteration | None = None
         self._clock = time.perf_counter()
         self._started = self._saved_clock = self._clock
         self._saved_at = -1
-        self._pi_SA = self._table()
         self._evaluator = Evaluator(config.eval.episodes)
         self._evaluations = _evaluations(config.eval, algorithm.seed, path, self._evaluator)
 
@@ -83,18 +84,20 @@ class Recorder:
         self._last = iteration
         algorithm.pricing.say()
         self.movement.follow(algorithm, iteration)
-        if k % self.config.log.every == 0:
-            tags = diagnostics.metrics(algorithm, iteration)
-            if self.truth is not None and self._pi_SA is not None and self._is_truth_due(step, iteration):
-                tags |= self.truth.metrics(self._pi_SA, iteration)
-            tags["charts/SPS"] = iteration.num_steps / seconds
-            if self.folder is not None:
-                self.folder.log(step, tags)
-                self.report.line(step, tags)
-        go_on = [evaluation(algorithm, iteration) for evaluation in self._evaluations.values()]
-        tags = {tag: value for kind in self._evaluations for tag, value in self._scores(kind, step)}
+        tags, spread = self.diagnostics(iteration, algorithm.counters, seconds)
+        events = None if self.folder is None else self.folder.events
         if self.folder is not None and tags:
             self.folder.log(step, tags)
+            self.report.line(step, tags)
+        if events is not None and spread is not None:
+            events.spread(step, spread)
+        go_on = [evaluation(algorithm, iteration) for evaluation in self._evaluations.values()]
+        scores = {tag: value for each in self._evaluations.values() for tag, value in each.tags(step).items()}
+        if self.folder is not None and scores:
+            self.folder.log(step, scores)
+            every, total = self.config.eval.every, self.config.total_steps
+            if events is not None and every and is_drawn(step, iteration.num_steps, every=every, total_steps=total):
+                events.policy(step, algorithm.world.mdp, self.diagnostics.policy_table())
         if iteration.is_enough:
             progress.ended_by = "certificate"
         elif not all(go_on):
@@ -105,17 +108,8 @@ class Recorder:
         is_due = every and (k % every == 0 or algorithm.ranks.first("the time", self._is_checkpoint_due))
         if is_due and not self.finished:  # the last one waits until the training has ended
             self.save()
-        self._pi_SA = self._table()
         self._clock = time.perf_counter()
         return not self.finished and self.stop.signal is None
-
-    def _is_truth_due(self, step: int, iteration: Iteration) -> bool:
-        """Whether this line of metrics is the first one, the last one or the first after one of `log.exact_points`."""
-        log, total, steps = self.config.log, self.config.total_steps, iteration.num_steps
-        every, before = max(1, total // log.exact_points), step - log.every * steps
-        # No other line follows if the training ends before as many iterations are made again.
-        is_last = step + (log.every - 1) * steps >= total
-        return before <= 0 or is_last or step // every > before // every
 
     def _is_checkpoint_due(self) -> bool:
         """Whether the last checkpoint is more than `MOST_SECONDS` old."""
@@ -158,37 +152,21 @@ class Recorder:
             assert best.best_path is not None
             self.algorithm.save(best.best_path)
 
-    def _scores(self, kind: str, step: int) -> Iterator[tuple[str, float]]:
-        """The tags of the evaluation made at this step, if there was one."""
-        history = self._evaluations[kind].history
-        if not history or history[-1].env_steps != step:
-            return
-        for name in ("episodic_return", "episodic_length"):
-            score: Score = getattr(history[-1].evaluation, name)
-            short = name.removeprefix("episodic_")
-            yield f"eval/{kind}_{short}", score.mean
-            if score.half_width is not None:
-                yield f"eval/{kind}_{short}_half_width", score.half_width
-
-    def _table(self) -> Tensor | None:
-        """The policy in all states, where there is an exact MDP."""
-        return None if self.truth is None else self.algorithm.policy_table()
-
     def finish(self) -> Summary:
         """Draw the policy and summarise the run."""
         seconds = time.perf_counter() - self._started
         config, algorithm, depth = self.config, self.algorithm, self.progress.depth
         J = J_optimal = gap = missing = stationary_gap = None
         assert self.progress.ended_by is not None
-        if self.truth is not None and self.folder is not None:
+        if (truth := self.diagnostics.truth) is not None and self.folder is not None:
             from pgts_torch.experiment.pictures import policy_picture  # matplotlib, a fifth of what a start takes
 
             pi_SA = algorithm.policy_table()
             title = f"{config.env.id}, depth {config.search.depth}, seed {config.seed}"
             self.folder.picture("policy", policy_picture(algorithm.mdp, pi_SA, title=title), algorithm.num_env_steps)
-            J, J_optimal = exact.evaluate(algorithm.mdp, pi_SA).J, self.truth.optimum.J
+            J, J_optimal = exact.evaluate(algorithm.mdp, pi_SA).J, truth.optimum.J
             gap = float(stationary.gap(algorithm.mdp, pi_SA, depth).max())
-            span = float(span_of(self.truth.optimum.q_SA.reshape(1, -1)))
+            span = float(span_of(truth.optimum.q_SA.reshape(1, -1)))
             missing, stationary_gap = ((J_optimal - J) / span, gap / span) if span > 0 else (0.0, 0.0)
         deterministic, sampled = (
             self._evaluator(algorithm, deterministic=kind, seed=algorithm.seed) for kind in KINDS.values()
@@ -200,7 +178,7 @@ class Recorder:
             ),
             greedy_is_worse(deterministic, sampled),
         ]
-        return Summary(
+        summary = Summary(
             run=str(self.path),
             seed=algorithm.seed,
             depth=depth,
@@ -219,6 +197,9 @@ class Recorder:
             parts=", ".join(type(part).__name__ for part in (algorithm.policy, algorithm.critic, algorithm.update)),
             notes=tuple(filter(None, advice)),
         )
+        if self.folder is not None and self.folder.events is not None:
+            self.folder.events.end(algorithm.num_env_steps, results(summary))
+        return summary
 
     def _certified(self) -> dict[str, Any]:
         """The certificate's fields of the summary. A proof, and one from counts, is made again for the policy after its

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from pgts_torch.agent.board import event_writer
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.config import Config
 from pgts_torch.errors import Failed, ModelMismatch, NotFinite, Stopped, failure
@@ -19,7 +20,6 @@ from pgts_torch.experiment.recorder import Recorder
 from pgts_torch.experiment.resume import Start, find, names_modules, resuming
 from pgts_torch.experiment.signals import StopFlag
 from pgts_torch.experiment.summary import Summary
-from pgts_torch.experiment.tracking import event_writer
 from pgts_torch.experiment.watchdog import Watchdog
 from pgts_torch.ranks import joined_ranks
 
@@ -82,7 +82,8 @@ def train(config: Config, *, strict_resume: bool = False, any_world_size: bool =
         if start is not None:
             ranks.together("the saved state", lambda: start.load(algorithm))
         folder = ranks.together(
-            "an open folder", lambda: held.enter_context(opened(config, locks[0], start)) if ranks.leads else None
+            "an open folder",
+            lambda: held.enter_context(opened(config, locks[0], start, algorithm)) if ranks.leads else None,
         )
         if ranks.leads and (why := _out_of_reach(config, algorithm)):
             print(f"note: {why}", file=sys.stderr)

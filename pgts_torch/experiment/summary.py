@@ -60,6 +60,23 @@ class Summary:
     parts: str = ""
 
 
+def results(summary: Summary) -> dict[str, float]:
+    """Return the results that TensorBoard shows beside the hyper-parameters, those that there are."""
+    gap = None if summary.J is None or summary.J_optimal is None else max(summary.J_optimal - summary.J, 0.0)
+    found = {
+        "deterministic_return": summary.deterministic.episodic_return.mean,
+        "sampled_return": summary.sampled.episodic_return.mean,
+        "J": summary.J,
+        "optimality_gap": gap,
+        "stationarity_gap": summary.stationarity_gap,
+        "certificate": summary.certificate,
+        "env_steps": summary.env_steps,
+        "model_calls": summary.model_calls,
+        "seconds": summary.seconds,
+    }
+    return {name: float(value) for name, value in found.items() if value is not None}
+
+
 _SUMMARY = TypeAdapter(Summary)
 
 

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import platform
-import threading
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from importlib import metadata
@@ -16,13 +15,13 @@ from typing import TYPE_CHECKING, Any, Self, final
 import numpy as np
 
 from pgts_torch import files
+from pgts_torch.agent.board import Events, event_files
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.locking import RunLock
-from pgts_torch.experiment.ownership import BEST_FILE, EVENTS_SUFFIX, FAILURE_FILE, METRICS_FILE, is_events
+from pgts_torch.experiment.ownership import BEST_FILE, FAILURE_FILE, METRICS_FILE, is_events
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from torch.utils.tensorboard import SummaryWriter
 
 PACKAGES = ("pgts_torch", "torch", "numpy", "scipy", "gymnasium", "tensorboard")
 
@@ -50,44 +49,25 @@ class RunFolder:
         self._metrics = (path / METRICS_FILE).open("ab", buffering=0)
         self._metrics.truncate(metrics_bytes)
         self._growing: dict[str, GrowingDigest] = {}
-        self._thread_hook = threading.excepthook
-        self._events: SummaryWriter | None = None
-        if tensorboard:
-            is_rebuilt = not self._event_files()
-            purge_step = None if after_step is None or is_rebuilt else after_step + 1
-            with self._writing("events"):
-                self._events = event_writer()(str(path), purge_step=purge_step, filename_suffix=EVENTS_SUFFIX)
-            for line in read_metrics(path) if is_rebuilt else ():
-                self._add_scalars(line.pop("step"), line)
+        self.events = Events(path, after_step=after_step, check=lock.check) if tensorboard else None
+        if self.events is not None and self.events.is_new:
+            for line in read_metrics(path):
+                self.events.scalars(line.pop("step"), line)
 
     def __enter__(self) -> Self:
-        threading.excepthook = self._on_thread_error
+        if self.events is not None:
+            self.events.__enter__()
         return self
 
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+    def __exit__(self, *raised: Any) -> None:
         self._metrics.close()
-        try:
-            if self._events is not None:
-                with self._writing("events"):
-                    self._events.close()
-        except PgtsError:
-            if error is None:
-                raise
-        finally:
-            threading.excepthook = self._thread_hook
-
-    def _on_thread_error(self, failed: threading.ExceptHookArgs) -> None:
-        """Ignore an OSError of TensorBoard's writer thread: it is raised again in ours, as one line."""
-        if not isinstance(failed.exc_value, OSError):
-            self._thread_hook(failed)
+        if self.events is not None:
+            self.events.__exit__(*raised)
 
     def _writing(self, what: str) -> AbstractContextManager[None]:
         """Check the lock, then turn an OSError into a PgtsError that names the file."""
         self._lock.check()
         return files.named(f"{self.path / what} cannot be written to")
-
-    def _event_files(self) -> list[str]:
-        return [path.name for path in self.path.iterdir() if is_events(path.name)]
 
     def log(self, step: int, tags: dict[str, float]) -> None:
         """Write one line of metrics.jsonl, and the same numbers as TensorBoard scalars."""
@@ -99,21 +79,15 @@ class RunFolder:
             is_written = False
         if not is_written:
             raise PgtsError(f"{self.path / METRICS_FILE} cannot be written to at step {step}; is the disk full?")
-        self._add_scalars(step, tags)
-
-    def _add_scalars(self, step: int, tags: Mapping[str, float | None]) -> None:
-        if self._events is not None:
-            with self._writing("events"):
-                for tag, value in tags.items():
-                    self._events.add_scalar(tag, math.nan if value is None else value, step)
+        if self.events is not None:
+            self.events.scalars(step, tags)
 
     def flush(self) -> dict[str, tuple[int, str]]:
         """Flush everything to the disk; the length and SHA-256 of the metrics, event files and best model, by name."""
         names = [METRICS_FILE]
-        if self._events is not None:
-            with self._writing("events"):
-                self._events.flush()
-            names += self._event_files()
+        if self.events is not None:
+            self.events.flush()
+            names += filter(is_events, event_files(self.path))
         with self._writing("its files"):
             os.fsync(self._metrics.fileno())
             states = {name: self._growing.setdefault(name, GrowingDigest(self.path / name)).now() for name in names}
@@ -138,9 +112,8 @@ class RunFolder:
         imsave(png, pixels, format="png", dpi=120)
         with self._writing(f"{name}.png"):
             files.replace(self.path / f"{name}.png", png.getvalue())
-        if self._events is not None:
-            with self._writing("events"):
-                self._events.add_image(name, pixels, step, dataformats="HWC")
+        if self.events is not None:
+            self.events.picture(name, pixels, step)
 
 
 @final
@@ -158,17 +131,6 @@ class GrowingDigest:
                 self._hash.update(chunk)
                 self._bytes += len(chunk)
         return self._bytes, self._hash.hexdigest()
-
-
-def event_writer() -> "type[SummaryWriter]":
-    """TensorBoard's SummaryWriter; PgtsError where TensorBoard is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise PgtsError(
-            f"TensorBoard cannot be imported ({error}): pip install tensorboard, or set run.tensorboard to false"
-        ) from error
-    return SummaryWriter
 
 
 def versions() -> dict[str, Any]:

@@ -10,10 +10,10 @@ from gymnasium import spaces, wrappers
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from pgts_torch import PGTS
+from pgts_torch.agent.diagnostics import Truth
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.envs.tabular import TabularEnv
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.diagnostics import Truth
 from pgts_torch.models.fidelity import check_model
 from tests.agent.masked import MAKERS, Turned
 from tests.tabular.test_illegal_actions import masked
@@ -137,7 +137,7 @@ def test_an_environment_with_masks_is_checked_as_a_model(says):
 def test_the_truth_of_a_table_counts_actions_that_are_allowed_only():
     training = PGTS(lambda: TabularEnv(masked()), critic="exact", depth=2, num_envs=2)
     pi_SA = training.policy_table()
-    tags = Truth(training).metrics(pi_SA, training.iterate())
+    tags = Truth(training.mdp, training.update).metrics(pi_SA, training.iterate())
     assert tags["exact/lookahead_error"] == pytest.approx(0, abs=1e-9)
     assert 0 < tags["exact/gradient_cosine"] <= 1 + 1e-9
 

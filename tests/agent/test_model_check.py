@@ -11,9 +11,9 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.classic_control import AcrobotEnv
 
+from pgts_torch.agent.diagnostics import metrics
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import ModelMismatch, PgtsError
-from pgts_torch.experiment.diagnostics import metrics
 from pgts_torch.models import SimulatorModel
 from pgts_torch.models.base import Model
 from tests.forks import on_ranks
@@ -291,7 +291,7 @@ def test_warn_counts_contradictions_and_warns_once_a_kind_and_off_checks_nothing
             warnings.simplefilter("always")
             iterations = [model.iterate() for _ in range(3)]
         assert len([w for w in caught if "contradicts its table" in str(w.message)]) == said
-        tags = metrics(model, iterations[-1])
+        tags = metrics(model.parts, iterations[-1], model.counters)
         if mode == "warn":
             assert tags["model/contradictions"] == sum(each.experience.num_steps for each in iterations)
         else:

@@ -109,7 +109,7 @@ def test_the_policy_that_explores_a_learned_table_follows_the_schedule_too():
     for _ in range(2):
         expected = 1 - model.num_env_steps / 20
         model.iterate()
-        critic, update = model._parts.dyna.explorer.learners
+        critic, update = model.parts.dyna.explorer.learners
         assert update is not model.update
         assert update.step_size == model.update.step_size == pytest.approx(expected)
         assert critic.num_env_steps == model.critic.num_env_steps

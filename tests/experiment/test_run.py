@@ -12,12 +12,13 @@ import torch
 from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from pgts_torch.agent import diagnostics
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.cli.main import main
 from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import diagnostics, pictures, run
+from pgts_torch.experiment import pictures, run
 from pgts_torch.experiment.evaluate import last_checkpoint
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.pictures import policy_picture  # before conftest.py puts a smaller one in its place
@@ -96,11 +97,11 @@ def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(name, tmp_pat
 def test_the_metrics_of_a_line_are_those_of_the_policy_that_made_its_episodes(tmp_path):
     config = few_iterations(tmp_path)
     algorithm = run.build(config)
-    truth = diagnostics.Truth(algorithm)
+    truth = diagnostics.Truth(algorithm.mdp, algorithm.update)
     algorithm.iterate()  # so that the critic knows something
     pi_SA = algorithm.policy.table()
     iteration = algorithm.iterate()
-    tags = diagnostics.metrics(algorithm, iteration) | truth.metrics(pi_SA, iteration)
+    tags = diagnostics.metrics(algorithm.parts, iteration, algorithm.counters) | truth.metrics(pi_SA, iteration)
     evaluation = exact.evaluate(algorithm.mdp, pi_SA)
     look_SA = exact.lookahead(algorithm.mdp, evaluation.q_SA, 4)
     assert tags["exact/J"] == evaluation.J
@@ -115,7 +116,7 @@ def test_the_metrics_of_a_line_are_those_of_the_policy_that_made_its_episodes(tm
 def test_with_the_exact_critic_the_lookahead_has_no_error_and_the_direction_is_nearly_exact(update, tmp_path):
     config = few_iterations(tmp_path, "--critic", "{type: exact}", "--update.type", update, "--rollout.num_envs", "400")
     algorithm = run.build(config)
-    truth = diagnostics.Truth(algorithm)
+    truth = diagnostics.Truth(algorithm.mdp, algorithm.update)
     pi_SA = algorithm.policy.table()
     tags = truth.metrics(pi_SA, algorithm.iterate())
     assert tags["exact/lookahead_error"] < 1e-12
@@ -140,7 +141,7 @@ def test_a_policy_is_compared_with_the_truth_at_so_many_points_and_in_the_first_
 def test_a_direction_of_zero_has_no_cosine():
     left = {"type": "softmax", "init": {"type": "biased", "action": 0, "probability": 0.9999}}
     algorithm = PGTS("pgts/Ladder-v0", depth=0, policy=left, num_envs=2, seed=0)
-    truth = diagnostics.Truth(algorithm)
+    truth = diagnostics.Truth(algorithm.mdp, algorithm.update)
     pi_SA = algorithm.policy.table()
     assert "exact/gradient_cosine" not in truth.metrics(pi_SA, algorithm.iterate())
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pgts_torch import PGTS
+from pgts_torch.agent.diagnostics import metrics
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.diagnostics import metrics
 from pgts_torch.models import CountsModel, FallibleModel, TabularModel
 from pgts_torch.models.base import Experience
 from pgts_torch.options import Counts, Expectimax
@@ -227,7 +227,7 @@ def test_a_training_logs_its_doubt_where_it_is_asked_for():
         counts = Counts(value_range=[0.0, 2.0], confidence=0.9)
         search = {"type": "expectimax", **search}
         agent = PGTS("pgts/Ladder-v0", model=counts, replay=FEW, depth=2, search=search)
-        return [metrics(agent, agent.iterate()).get("search/doubt") for _ in range(2)]
+        return [metrics(agent.parts, agent.iterate(), agent.counters).get("search/doubt") for _ in range(2)]
 
     assert doubts() == [None, None]
     assert all(0 < found <= 2 * (1 + 0.99 + 0.99**2) for found in doubts(doubt=True))

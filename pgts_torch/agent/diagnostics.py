@@ -1,23 +1,95 @@
-"""The logged metrics of an iteration. Nothing here draws a random number or feeds back into training."""
+"""What is logged of a training. Nothing here draws a random number or feeds back into it."""
 
 import math
 import statistics
+from typing import NamedTuple, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pgts_torch.agent.iteration import Iteration
-from pgts_torch.agent.pgts import PGTS
+from pgts_torch.agent.parts import Parts
+from pgts_torch.agent.policies import exact_probs
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.updates import SoftmaxUpdate
+from pgts_torch.agent.updates import SoftmaxUpdate, Update
 from pgts_torch.ranks import Ranks, Share
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.ascent import softmax_direction
+from pgts_torch.tabular.mdp import TabularMDP
 
 
-def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
-    """The tags of one iteration, all about the policy pi_k that collected its episodes. All processes must call it."""
+class Counters(NamedTuple):
+    """What a training has done so far: iterations, environment steps of all processes, model calls."""
+
+    iterations: int
+    env_steps: int
+    model_calls: int
+
+
+class Spread(NamedTuple):
+    """What is shown as histograms of an iteration.
+
+    gap_N: the stationarity gap in each visited state.
+    nodes_L: how many nodes of the lookahead lie on each level, from the visited states on.
+    """
+
+    gap_N: Float[Tensor, "N"]
+    nodes_L: tuple[int, ...]
+
+
+@final
+class Diagnostics:
+    """The numbers that are logged of a training, all about the policy pi_k that collected the episodes.
+
+    truth: what a policy is compared with; None: the exact MDP is not known.
+
+    Args:
+        total_steps: environment steps of the whole training.
+        every: iterations from one line of metrics to the next.
+        points: in how many lines, evenly over total_steps and in the first and the last, policies are compared with the
+            truth and histograms are made, which costs more than all others.
+    """
+
+    def __init__(self, parts: Parts, *, total_steps: int, every: int = 1, points: int = 20) -> None:
+        self._parts, self._total, self._every, self._points = parts, total_steps, every, points
+        self.truth = None if parts.world.mdp is None else Truth(parts.world.mdp, parts.update)
+        self._pi_SA = self.policy_table()
+
+    def policy_table(self) -> Float[Tensor, "S A"] | None:
+        """The policy in all states, where there is an exact MDP."""
+        if self.truth is None:
+            return None
+        return exact_probs(self._parts.policy, torch.arange(self.truth.mdp.num_states, device=self._parts.world.device))
+
+    def __call__(
+        self, iteration: Iteration, counters: Counters, seconds: float
+    ) -> tuple[dict[str, float], Spread | None]:
+        """The tags of an iteration that took so many seconds, none where no line is due, and what its histograms show,
+        where they are due. All processes must call it, once after each iteration."""
+        tags: dict[str, float] = {}
+        found = None
+        if counters.iterations % self._every == 0:
+            tags = metrics(self._parts, iteration, counters)
+            if self._is_point(counters.env_steps, iteration):
+                found = spread(iteration)
+                if self.truth is not None and self._pi_SA is not None:
+                    tags |= self.truth.metrics(self._pi_SA, iteration)
+            tags["charts/SPS"] = iteration.num_steps / seconds
+        self._pi_SA = self.policy_table()
+        return tags, found
+
+    def _is_point(self, step: int, iteration: Iteration) -> bool:
+        """Whether this line is the first one, the last one or the first after one of the points."""
+        total, steps = self._total, iteration.num_steps
+        every, before = max(1, total // self._points), step - self._every * steps
+        # No other line follows if the training ends before as many iterations are made again.
+        is_last = step + (self._every - 1) * steps >= total
+        return before <= 0 or is_last or step // every > before // every
+
+
+def metrics(parts: Parts, iteration: Iteration, counters: Counters) -> dict[str, float]:
+    """The tags of one iteration. All processes must call it."""
     ranks, depth = iteration.ranks, iteration.depth
     entropy_N = -torch.special.xlogy(iteration.pi_NA, iteration.pi_NA).sum(-1)
     entropy = ranks.share("rows", len(entropy_N)).mean("entropy", entropy_N)
@@ -26,23 +98,34 @@ def metrics(algorithm: PGTS, iteration: Iteration) -> dict[str, float]:
         "losses/entropy": float(entropy),
         **{_tag(name): value for name, value in iteration.losses.items()},
         "search/depth": float(depth),
-        "search/model_calls": float(algorithm.num_model_calls),
+        "search/model_calls": float(counters.model_calls),
     }
-    if algorithm.model_check.is_active:
-        tags["model/contradictions"] = float(algorithm.model_check.contradictions)
+    if parts.model_check.is_active:
+        tags["model/contradictions"] = float(parts.model_check.contradictions)
     if iteration.look is not None:
         tags |= {
             "search/nodes": ranks.totals("nodes", iteration.look.nodes)[0],
             "search/pruned": _largest(ranks, iteration.look.pruned_BA),
             "search/stationarity_gap": _largest(ranks, iteration.gap_N),
             "search/certificate": iteration.certificate,
-            "search/proved": float(algorithm.certificates is not None and algorithm.certificates.trust == "proved"),
+            "search/proved": float(parts.certificates is not None and parts.certificates.trust == "proved"),
         }
         if iteration.posterior is not None:
             tags["search/certificate_posterior"] = iteration.posterior
         if iteration.look.doubt_BA is not None:
             tags["search/doubt"] = _largest(ranks, iteration.look.doubt_BA)
     return tags
+
+
+def spread(iteration: Iteration) -> Spread | None:
+    """What the histograms of an iteration show; None without a lookahead. All processes must call it."""
+    if iteration.look is None:
+        return None
+    [gap_N] = iteration.ranks.rows("gaps", iteration.gap_N)
+    nodes_L = iteration.look.nodes_per_level
+    most = iteration.ranks.each("levels", len(nodes_L)).max()  # a process without states has none
+    filled = (*nodes_L, *[0] * (int(most) - len(nodes_L)))
+    return Spread(gap_N.cpu(), tuple(map(int, iteration.ranks.totals("nodes per level", *filled))))
 
 
 def _tag(name: str) -> str:
@@ -76,12 +159,11 @@ class Truth:
     """Compares a policy and its lookahead estimates with the exact values of the MDP.
 
     Args:
-        algorithm: whose `mdp` and `update` are used.
+        update: whose direction is compared.
     """
 
-    def __init__(self, algorithm: PGTS) -> None:
-        self.mdp = algorithm.mdp
-        self.update = algorithm.update
+    def __init__(self, mdp: TabularMDP, update: Update) -> None:
+        self.mdp, self.update = mdp, update
         self.optimum = exact.optimal(self.mdp)
 
     def metrics(self, pi_SA: Float[Tensor, "S A"], iteration: Iteration) -> dict[str, float]:
