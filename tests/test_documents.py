@@ -37,7 +37,9 @@ class Block(NamedTuple):
 
 
 def blocks(page: str) -> list[Block]:
-    found = re.findall(r"^(?:<!-- (long|parsed) -->\n)?```(\w*|\{code-cell\} python)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    found = re.findall(
+        r"^(?:<!-- (long|parsed) -->\n)?```(\w*|\{code-cell\} python)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE
+    )
     return [Block(language, text, mark) for mark, language, text in found]
 
 

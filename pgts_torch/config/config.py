@@ -38,8 +38,8 @@ class LogConfig(Part):
     """Iterations from one line of metrics to the next."""
 
     exact_points: Count = 20
-    """How often in a run the policy is compared with the exact values of a table, where there is one, and histograms are
-    written: in so many lines of metrics, evenly over total_steps, and in the first and the last."""
+    """How often in a run histograms are written, and the policy is compared with the exact values of a table, where
+    there is one: in so many lines of metrics, evenly over total_steps, and in the first and the last."""
 
     checkpoint_every: Natural = 20
     """Iterations from one checkpoint to the next, fewer where they take more than a minute; 0: only after the last, and
