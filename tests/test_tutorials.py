@@ -15,7 +15,10 @@ import pytest
 
 TUTORIALS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "docs/tutorials").glob("*.md"))}
 
-SHORT: dict[str, dict[str, Any]] = {"puzzle": {"steps": 200, "every": 100}}
+SHORT: dict[str, dict[str, Any]] = {
+    "learned_model": {"first": 60, "total": 70},
+    "puzzle": {"steps": 200, "every": 100},
+}
 """Of the tutorials that take longer: the values that shorten their cell tagged `parameters`, as papermill has them."""
 
 
@@ -66,6 +69,17 @@ def inventory(it: Any, out: str) -> None:
     assert it.J_sampled > 0.95 * it.best.J
 
 
+def learned_model(it: Any, out: str) -> None:
+    assert it.returns[-1] > 0.99 * it.best
+    assert it.dives < 2**it.N / 50
+    # Networks: errors add up along a path, which is balanced all the same.
+    last = it.losses[-1]
+    assert last["model_error_1"] < last["model_error_4"] < last["model_error_16"] < 0.5
+    assert it.before < 50 < 400 < it.after
+    off = [abs(float(state[0, 2]) - true[2]) for state, true in zip(it.imagined, it.true, strict=True)]
+    assert max(off[:5]) < max(off[-5:])
+
+
 def paper(it: Any, out: str) -> None:
     down, up = it.seen[3]
     assert down == up == 0 < it.seen[4][1] - it.seen[4][0]
@@ -93,6 +107,7 @@ def puzzle(it: Any, out: str) -> None:
 CLAIMS: dict[str, Callable[[Any, str], None]] = {
     "certificate": certificate,
     "inventory": inventory,
+    "learned_model": learned_model,
     "paper": paper,
     "puzzle": puzzle,
 }
