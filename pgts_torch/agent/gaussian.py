@@ -162,10 +162,10 @@ class MixtureProposal:
 
         beta(a|s) = 1/2 N(a; mean, std^2) + 1/2 N(a; mean, (scale std)^2)
 
-    The first half of the actions is drawn from the one, the rest from the other, each as a low-discrepancy sequence
-    (Kronecker's, by the generalised golden ratio) that is shifted at random in each state (Cranley and Patterson 1976):
-    every action has the density that it is drawn from, and together they cover it more evenly than independent ones.
-    For odd K the shares are those of the numbers drawn. Importance weights pi / beta are at most 2 K / (K + 1).
+    The actions are drawn from the one and the other by turns, each as a low-discrepancy sequence (Kronecker's, by the
+    generalised golden ratio) that is shifted at random in each state (Cranley and Patterson 1976): every action has the
+    density that it is drawn from, and the first few, or all together, cover it more evenly than independent ones. For
+    odd K the shares are those of the numbers drawn. Importance weights pi / beta are at most 2 K / (K + 1).
 
     The policy is copied, so that a state has the same actions after an update, until they are drawn again.
 
@@ -184,7 +184,7 @@ class MixtureProposal:
         self._policy.network = copy.deepcopy(policy.network)
         first = (num_actions + 1) // 2
         place_K = torch.arange(num_actions, device=key.device)
-        self._wide_K = place_K >= first
+        self._wide_K = place_K % 2 == 1
         self._scale_K1 = torch.where(self._wide_K, scale, 1.0)[:, None]
         self._share, self._scale = first / num_actions, scale
         # phi solves phi^(X+1) = phi + 1; multiples of its powers 1/phi, 1/phi^2, ... modulo 1 are evenly spread.
@@ -192,7 +192,7 @@ class MixtureProposal:
         for _ in range(60):
             phi = (1 + phi) ** (1 / (size + 1))
         power_X = phi ** -torch.arange(1, size + 1, dtype=torch.float64, device=key.device)
-        self._point_KX = torch.where(self._wide_K, place_K - first, place_K)[:, None] * power_X
+        self._point_KX = (place_K // 2)[:, None] * power_X
 
     def __call__(self, state_N: Int[Tensor, "N"]) -> Drawn:
         """Draw in these states, without gradient."""

@@ -27,6 +27,9 @@ from pgts_torch.options.updates import MPO, PPO, Gradient
 from pgts_torch.ranks import Ranks
 from pgts_torch.search.lookahead import check_finite
 
+_LEAST = 1e-6
+"""A variance, in that of the policy, below which there is none."""
+
 _HALVINGS, _WIDEST = 40, 1e6
 """How often an interval of temperatures is halved, from this factor below the scale of advantages to it above."""
 
@@ -120,12 +123,15 @@ class MPOUpdate(GaussianUpdate):
 
     Its moments, by differences to those of pi_hat, so that what is due to the draw alone cancels, are
 
-        mean' = mean + std x,    x = sum_k (q_k - pi_hat_k) z_k,                 z_k = (a_k - mean) / std
-        std' = std sqrt(1 + sum_k (q_k - pi_hat_k) z_k^2)
+        mean' = mean + std x,    x = sum_k (q_k - pi_hat_k) z_k,    z_k = (a_k - mean) / std
+        std'^2 = std^2 V(q) / V(pi_hat),    V(w) = [sum_k w_k z_k^2 - (sum_k w_k z_k)^2] / (1 - sum_k w_k^2)
 
-    They are those of the normal distribution that maximises sum_k q_k log pi(a_k|s), with the mean and the deviation
-    optimised apart, as K grows. Each moves no farther than a divergence allows: x is shortened to x^2 / 2 <= kl_mean,
-    and |log std' - log std| of each entry is at most sqrt(kl_std). The network is fitted to both:
+    They are those of q as K grows. V is a variance with Bessel's correction for weights, without which advantages that
+    have nothing to do with actions would narrow the policy in each iteration. Around the old mean, as if mean and
+    deviation were optimised apart, a mean that keeps moving would be taken for spread and widen it without end, under
+    tanh until it is a coin that is tossed between the bounds, whose mean says nothing. Each moves no farther than a
+    divergence allows: x is shortened to x^2 / 2 <= kl_mean, and |log std' - log std| of each entry is at most
+    sqrt(kl_std). The network is fitted to both:
 
         minimise  mean_s w(s) sum_x [ (mean' - mean_theta)^2 / (2 std^2) + log std_theta + std'^2 / (2 std_theta^2) ]
 
@@ -139,12 +145,12 @@ class MPOUpdate(GaussianUpdate):
 
     def aims(self, old: Normals, batch: Batch, weight_N: Float[Tensor, "N"]) -> tuple[Tensor, ...]:
         assert batch.drawn is not None
-        moved_NK = self.improved(batch, weight_N) - batch.drawn.prob_NK
+        q_NK, prob_NK = self.improved(batch, weight_N), batch.drawn.prob_NK
         z_NKX = old.standardised(batch.drawn.action_NKX)
-        shift_NX = (moved_NK[..., None] * z_NKX).sum(1)
+        shift_NX = ((q_NK - prob_NK)[..., None] * z_NKX).sum(1)
+        spread_NX = (_variance(q_NK, z_NKX) + _LEAST) / (_variance(prob_NK, z_NKX) + _LEAST)
         length_N1 = shift_NX.square().sum(-1, keepdim=True)
         shift_NX = shift_NX * (2 * self.options.kl_mean / length_N1).sqrt().clamp(max=1)  # inf where it is 0
-        spread_NX = (1 + (moved_NK[..., None] * z_NKX.square()).sum(1)).clamp(min=1e-6)
         most = math.sqrt(self.options.kl_std)
         log_ratio_NX = (spread_NX.log() / 2).clamp(-most, most)
         return old.mean_NX + old.std_NX * shift_NX, old.std_NX * log_ratio_NX.exp()
@@ -259,3 +265,10 @@ def _slopes(
     z_NKX = now.standardised(action_NKX)
     weighted_NKX = gain_NK[..., None] * z_NKX
     return weighted_NKX.sum(1) / now.std_NX, (weighted_NKX * z_NKX - gain_NK[..., None]).sum(1)
+
+
+def _variance(weight_NK: Float[Tensor, "N K"], z_NKX: Float[Tensor, "N K X"]) -> Float[Tensor, "N X"]:
+    """V(w); 0 where one draw has all the weight."""
+    mean_N1X = (weight_NK[..., None] * z_NKX).sum(1, keepdim=True)
+    square_NX = (weight_NK[..., None] * (z_NKX - mean_N1X).square()).sum(1)
+    return square_NX / (1 - weight_NK.square().sum(1, keepdim=True)).clamp(min=_LEAST)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.errors import PgtsError
-from pgts_torch.models.base import EnumeratingModel, FollowingModel
+from pgts_torch.models.base import EnumeratingModel, FollowingModel, Transitions
 
 
 class Drawn(NamedTuple):
@@ -74,6 +74,11 @@ class DrawnActions(EnumeratingModel):
         if self._propose is None:
             raise PgtsError("no actions are drawn yet: iterate first")
         return self._propose(state_N)
+
+    def follow(self, state_N: Int[Tensor, "N"], number_N: Int[Tensor, "N"]) -> Transitions:
+        """The one outcome of one of the drawn actions of each state, for which alone the base is queried."""
+        row_N = torch.arange(len(state_N), device=state_N.device)
+        return self.base.follow(state_N, self.drawn(state_N).action_NKX[row_N, number_N])
 
     def outcomes(self, state_N: Int[Tensor, "N"]) -> Outcomes:
         """The one outcome of each drawn action, K of them in each state."""

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from pydantic import ValidationInfo, field_validator
 
-from pgts_torch.options.fields import AtLeastOne, Count, Natural, NonNegative, Samples, conflict
+from pgts_torch.options.fields import AtLeastOne, Count, Natural, NonNegative, Samples, UnitInterval, conflict
 from pgts_torch.options.part import Part, null
 
 MAX_NODES = 10_000_000
@@ -104,10 +104,42 @@ class MCTS(Budget):
     """The number of sampled outcomes of each action, new ones in each search; null: all outcomes are enumerated, or 4
     sampled where the model cannot enumerate them."""
 
+    widening: AtLeastOne | None = None
+    """C of progressive widening: a node that was visited N times has the first C N^alpha of the actions that are drawn
+    for it, and the model is queried for these alone (Couetoux et al. 2011); null: all at once. Only with policy.type
+    gaussian."""
+
+    widening_power: UnitInterval | None = None
+    """alpha of progressive widening; null: 0.5."""
+
     @property
     def merges(self) -> bool:
         """Whether paths that meet in a state share one node, also where `merge` is null."""
-        return self.backup == "max" if self.merge is None else self.merge
+        return self.backup == "max" and self.widening is None if self.merge is None else self.merge
+
+    @field_validator("widening")
+    @classmethod
+    def _widens_trees_of_maxima(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None:
+            for name, allowed in (
+                ("wave", (None, 1)),
+                ("backup", ("max",)),
+                ("merge", (None, False)),
+                ("samples", (None,)),
+            ):
+                if (other := info.data.get(name)) not in allowed:
+                    raise conflict(
+                        f"search.widening is {value}, which needs search.{name} {allowed[-1]}; it is {other}: nodes "
+                        "get their actions one simulation after another, in trees with maxima"
+                    )
+        return value
+
+    @field_validator("widening_power")
+    @classmethod
+    def _is_of_widening(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None and info.data.get("widening", ...) is None:
+            raise conflict(f"search.widening_power is {value}, which only search.widening uses")
+        return value
 
     @field_validator("exploration")
     @classmethod

@@ -167,8 +167,8 @@ class Training(Part):
     def _draws_actions(cls, search: Any, info: ValidationInfo) -> Any:
         policy = info.data.get("policy")
         if not isinstance(policy, Gaussian):
-            for name in ("actions", "proposal_scale"):
-                if policy is not None and (value := getattr(search, name)) is not None:
+            for name in ("actions", "proposal_scale", "widening"):
+                if policy is not None and (value := getattr(search, name, None)) is not None:
                     raise conflict(
                         f"search.{name} is {value}, which only policy.type gaussian uses; policy.type is {policy.type}"
                     )

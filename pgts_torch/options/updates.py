@@ -123,8 +123,9 @@ class MPO(Epochs):
     kl_mean: Positive = 0.1
     """How far the mean may move in one iteration, in nats."""
 
-    kl_std: Positive = 0.01
-    """How far each standard deviation may move in one iteration, in nats."""
+    kl_std: Positive = 0.001
+    """How far each standard deviation may move in one iteration, in nats. What is looked for must be found before it
+    is small: a wide policy leaves a poor way of acting that a narrow one only improves."""
 
 
 class Mirror(Part):

@@ -18,7 +18,7 @@ from pgts_torch.readings import Readings
 from pgts_torch.search.empirical import FixedSamples
 from pgts_torch.search.expectimax import search_levels
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_finite
-from pgts_torch.search.mcts import search_tree
+from pgts_torch.search.mcts import drawn_actions, search_tree
 from pgts_torch.search.memory import tree_nodes
 from pgts_torch.search.price import Meter
 from pgts_torch.search.sampled import plan_levels, search_samples
@@ -241,6 +241,8 @@ class MCTSSearch(Search):
         super().__init__(model)
         self.options, self.uses_prior = options, options.prior == "policy"
         self._samples = options.samples or DEFAULT_SAMPLES
+        if options.widening is not None:
+            drawn_actions(model, options)
         if options.samples is None and isinstance(model, EnumeratingModel):
             self.topology = Topology(model, max_bytes=options.max_bytes)
         else:
@@ -273,6 +275,7 @@ class MCTSSearch(Search):
             "the policy as prior" * self.uses_prior,
             "mean backups" * (self.options.backup == "mean"),
             "merged" * self.options.merges,
+            f"nodes widened from {self.options.widening:g} actions" if self.options.widening else "",
             f"{self._samples} sampled outcomes of each action" * (self.topology is None),
         ]
         return ", ".join(filter(None, parts))

@@ -12,6 +12,7 @@ from torch import Tensor
 from pgts_torch.compiled import can_compile
 from pgts_torch.errors import PgtsError
 from pgts_torch.models.base import EnumeratingModel, Model
+from pgts_torch.models.drawn_actions import DrawnActions
 from pgts_torch.options.search import MAX_NODES, MCTS
 from pgts_torch.search.fixed_trees import FixedTrees
 from pgts_torch.search.forest import Forest
@@ -21,6 +22,7 @@ from pgts_torch.search.memory import check_memory, check_nodes, tree_nodes
 from pgts_torch.search.split import Rule, sigma
 from pgts_torch.search.topology import Topology, topology_of
 from pgts_torch.search.tree import Tree
+from pgts_torch.search.widening import WideningTrees
 from pgts_torch.seeding import mix, sample_keys, uniform
 
 _KEPT = 2**20
@@ -45,6 +47,8 @@ def mcts(
     prior: Leaf | None = None,
     backup: Literal["max", "mean"] = "max",
     merge: bool = False,
+    widening: float | None = None,
+    widening_power: float | None = None,
     topology: Topology | None = None,
     generator: torch.Generator | None = None,
     max_nodes: int = MAX_NODES,
@@ -90,6 +94,8 @@ def mcts(
             estimate q_0 and the returns G_i of simulations, which does not converge to T^m Q; its `pruned_BA` is inf.
         merge: a node is a (level, state), shared by all paths and roots. What a simulation could not update is
             backed up at the end.
+        widening, widening_power: C and alpha of progressive widening, over drawn actions (`WideningTrees`). Default: a
+            node has all its actions; alpha is 0.5.
         topology: as in `expectimax`. Its `max_bytes` is the most memory that the search may take.
         generator: of the Gumbel noise, one number a search. Default: no noise.
         max_nodes: the most nodes, summed over levels: those that the critic valued count too.
@@ -110,8 +116,12 @@ def mcts(
         prior="uniform" if prior is None else "policy",
         backup=backup,
         merge=merge,
+        widening=widening,
+        widening_power=widening_power,
         max_nodes=max_nodes,
     )
+    if widening is not None:
+        drawn_actions(model, options)
     if root == "rule" and generator is not None:
         raise PgtsError("only root='gumbel' uses a generator")
     return search_tree(
@@ -141,7 +151,7 @@ def search_tree(
 def _search_tree(
     leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], options: MCTS, generator: torch.Generator | None
 ) -> Lookahead:
-    compiled = _can_compile(topology.model, options)
+    compiled = options.widening is None and _can_compile(topology.model, options)
     if not compiled or root_B.shape != (1,) or root_B.dtype != torch.int64 or leaves.expansions == 0:
         check_roots(root_B, topology.model.num_states)  # compiled loops look at a single root themselves
     if leaves.expansions == 0:
@@ -153,6 +163,7 @@ def _search_tree(
     grow = _grow_compiled
     if not compiled:
         grow = _grow_fixed if _fits_arrays(topology.model, len(state_B), options) else _grow
+        grow = grow if options.widening is None else _grow_widening
     q_NA, pruned_NA, nodes_per_level = grow(leaves, topology, state_B, options, generator)
     return Lookahead.enumerated(
         q_NA if row_B is None else q_NA[row_B],
@@ -237,12 +248,40 @@ def _grow(
         return tree.nodes.q_NA[node_B], pruned_NA, tree.nodes.nodes_per_level()
 
 
-def _by_rule(tree: Tree, node_B: Tensor, options: MCTS) -> None:
+def _grow_widening(
+    leaves: Leaves, topology: Topology, state_B: Tensor, options: MCTS, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """The same over drawn actions, of which nodes get more as they are visited; one simulation after another."""
+    model, alone = drawn_actions(topology.model, options), options.model_copy(update={"wave": 1})
+    bounds = {"num_roots": len(state_B), "max_bytes": topology.max_bytes}
+    trees = WideningTrees(model, leaves, leaves.expansions, options, **bounds)
+    node_B = trees.add_roots(state_B)
+    if options.root == "rule":
+        _by_rule(trees, node_B, alone)
+    else:
+        _halve(trees, node_B, alone, _preference(leaves.prior(state_B).double(), state_B, generator))
+    topology.table.model_calls += trees.model_calls
+    q_BA, pruned_BA = (value_BA.to(model.dtype) for value_BA in (trees.q_NA[node_B], trees.pruned(node_B)))
+    return q_BA, pruned_BA, tuple(trees.nodes_per_level)
+
+
+def drawn_actions(model: Model, options: MCTS) -> DrawnActions:
+    """The model, if its actions are drawn; else PgtsError."""
+    if not isinstance(model, DrawnActions):
+        raise PgtsError(
+            f"search.widening is {options.widening}, which is for actions that are drawn (policy.type gaussian); those "
+            f"of {type(model).__name__} are numbered"
+        )
+    return model
+
+
+def _by_rule(tree: Tree | WideningTrees, node_B: Tensor, options: MCTS) -> None:
     """The tree rule at the root too. Without a given size a wave is as large as all waves before it together."""
     used_B = torch.zeros(len(node_B), dtype=torch.float64, device=node_B.device)
     place_A = torch.arange(tree.A, device=node_B.device)
     while True:
-        tree.back_up_shared(node_B)
+        if isinstance(tree, Tree):
+            tree.back_up_shared(node_B)
         # at_B: the roots that have a whole simulation left and something to expand.
         open_B = tree.nodes.open(node_B).any(1)
         budget_B = (options.simulations - 1 - used_B + _WHOLE).floor_()
@@ -256,7 +295,7 @@ def _by_rule(tree: Tree, node_B: Tensor, options: MCTS) -> None:
         used_B[at_B] += _send(tree, node_B[at_B], share_BA, place_A.expand_as(share_BA), options.wave)
 
 
-def _halve(tree: Tree, node_B: Tensor, options: MCTS, preference_BA: Tensor) -> None:
+def _halve(tree: Tree | WideningTrees, node_B: Tensor, options: MCTS, preference_BA: Tensor) -> None:
     """Sequential halving of the root's actions (Karnin, Koren and Somekh 2013; Danihelka et al. 2022, Sec. 3.2).
 
     The simulations of an exhausted action go to the next best one, also after the last round.
@@ -269,7 +308,8 @@ def _halve(tree: Tree, node_B: Tensor, options: MCTS, preference_BA: Tensor) -> 
     widths, width_B1 = list[int](), torch.zeros_like(allowed_B).unsqueeze(1)
     rounds = [_rounds(allowed, simulations, options.wave) for allowed in range(1, tree.A + 1)]
     while True:
-        tree.back_up_shared(node_B)
+        if isinstance(tree, Tree):
+            tree.back_up_shared(node_B)
         # Each root has the rounds of as many actions as are allowed there.
         of_count = [next(each) for each in rounds]
         before_B1, (width_B1, most_B1) = (
@@ -297,12 +337,14 @@ def _halve(tree: Tree, node_B: Tensor, options: MCTS, preference_BA: Tensor) -> 
         used_B[at_B] += _send(tree, node_B[at_B], share_BA, order_BA, options.wave)
 
 
-def _send(tree: Tree, node_B: Tensor, share_BA: Tensor, order_BA: Tensor, wave: int | None) -> Float[Tensor, "B"]:
+def _send(
+    tree: Tree | WideningTrees, node_B: Tensor, share_BA: Tensor, order_BA: Tensor, wave: int | None
+) -> Float[Tensor, "B"]:
     """A wave of so many simulations below each action of these roots; how many of each root could be used.
 
     Below roots of one graph waves of 1 are sent one after another, root by root, in this order of actions.
     """
-    if not (tree.merge and wave == 1):
+    if not (isinstance(tree, Tree) and tree.merge and wave == 1):
         return tree.wave(node_B, share_BA)
     used_B = torch.zeros_like(share_BA[:, 0])
     for b, a in ((b, a) for b, order in enumerate(order_BA.tolist()) for a in order if share_BA[b, a] > 0):
@@ -329,7 +371,7 @@ def _rounds(actions: int, simulations: int, wave: int | None) -> Iterator[tuple[
         yield width, wave or simulations
 
 
-def _order(tree: Tree, node_B: Tensor, preference_BA: Tensor, alive_BA: Tensor) -> Int[Tensor, "B A"]:
+def _order(tree: Tree | WideningTrees, node_B: Tensor, preference_BA: Tensor, alive_BA: Tensor) -> Int[Tensor, "B A"]:
     """The actions of each root, best first: survivors before the others, exhausted ones last."""
     score_BA = preference_BA + sigma(tree.nodes.q_NA[node_B], tree.nodes.visits_NA[node_B])
     by_score_BA = score_BA.argsort(dim=1, descending=True, stable=True)

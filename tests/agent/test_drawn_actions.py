@@ -93,11 +93,11 @@ def test_every_draw_has_the_distribution_that_it_is_drawn_from():
     normals = policy.normals(model.states(state_N).float())
     action_NKX = drawing(model, policy, 5, scale=2.5).drawn(state_N).action_NKX
     z_NKX = normals.standardised(action_NKX).double()
-    for k, scale in enumerate([1.0, 1.0, 1.0, 2.5, 2.5]):
+    for k, scale in enumerate([1.0, 2.5, 1.0, 2.5, 1.0]):
         for x in range(2):
             # 10 tests; each of a right sampler falls below this once in 10^5.
             assert stats.kstest(z_NKX[:, k, x].numpy(), "norm", args=(0, scale)).pvalue > 1e-5
-    assert stats.kstest(z_NKX[:, 4, 0].numpy(), "norm").pvalue < 1e-5
+    assert stats.kstest(z_NKX[:, 1, 0].numpy(), "norm").pvalue < 1e-5
 
 
 def test_a_state_has_the_same_actions_until_they_are_drawn_again_also_after_an_update():

@@ -130,10 +130,55 @@ def test_with_quadratic_advantages_the_improved_policy_has_the_moments_of_the_no
     there, deviation, _ = improved(high)
     mean_NX, std_NX = MPOUpdate(MPO(kl=kl, kl_mean=9.0, kl_std=9.0)).aims(old, given, torch.ones(1))
     assert float(mean_NX) == pytest.approx(there, abs=2e-3)
-    assert float(std_NX) == pytest.approx(math.hypot(deviation, there - mean), abs=2e-3)  # around the old mean
+    assert float(std_NX) == pytest.approx(deviation, abs=2e-3)
     bounded = MPOUpdate(MPO(kl=kl, kl_mean=1e-4, kl_std=1e-6)).aims(old, given, torch.ones(1))
     assert abs(float(bounded[0]) - mean) / std == pytest.approx(math.sqrt(2e-4), rel=1e-3)
     assert abs(math.log(float(bounded[1]) / std)) == pytest.approx(1e-3, rel=1e-2)
+
+
+def ratios(given: Batch, **options) -> torch.Tensor:
+    """std' / std of each row, with nothing that holds it."""
+    old = gaussian().normals(given.observation_N)
+    weight_N = (given.weight_N / given.weight_N.mean()).float()
+    return MPOUpdate(MPO(kl_std=9.0, **options)).aims(old, given, weight_N)[1] / old.std_NX
+
+
+def test_a_mean_that_moves_is_not_taken_for_spread():
+    given = batch(gaussian(), count=2000, advantage=lambda drawn: drawn.action_NKX[..., 0])
+    old = gaussian().normals(given.observation_N)
+    moved_NX = (MPOUpdate(MPO(kl_mean=9.0)).aims(old, given, torch.ones(8))[0] - old.mean_NX) / old.std_NX
+    assert float(moved_NX.min()) > 0.4  # around the old mean the spread would be larger by 1.08 and more
+    assert torch.allclose(ratios(given), torch.ones(8, 1), atol=0.01)
+
+
+@pytest.mark.parametrize("count", [4, 16])
+def test_advantages_that_are_noise_make_the_policy_neither_wider_nor_narrower(count):
+    given = batch(gaussian(), count=count, states=4000)
+    moved_NX = ratios(given, kl=0.5).log().clamp(-0.1, 0.1)
+    # The standard error is 0.0016.
+    assert float(moved_NX.mean()) == pytest.approx(0, abs=0.007)
+    # Without the correction the policy narrows.
+    drawn, z_NKX = given.drawn, gaussian().normals(given.observation_N).standardised(given.drawn.action_NKX)
+    q_NK = MPOUpdate(MPO(kl=0.5)).improved(given, (given.weight_N / given.weight_N.mean()).float())
+
+    def spread(weight_NK):
+        mean_NX = (weight_NK[..., None] * z_NKX).sum(1)
+        return (weight_NK[..., None] * z_NKX.square()).sum(1) - mean_NX.square()
+
+    uncorrected_NX = (spread(q_NK) / spread(drawn.prob_NK)).log() / 2
+    assert float(uncorrected_NX.clamp(-0.1, 0.1).mean()) < -0.02
+
+
+def test_a_policy_whose_mean_keeps_moving_stays_as_wide_as_it_was():
+    policy = gaussian(spread=0.01)
+    start = batch(policy).observation_N
+    first = policy.normals(start)
+    for _ in range(25):
+        given = batch(policy, count=16, advantage=lambda drawn: drawn.action_NKX[..., 0])
+        MPOUpdate(MPO(learning_rate=0.02, num_epochs=5))(policy, given, generator=stream(0, "update"))
+    now = policy.normals(start)
+    assert float((now.mean_NX - first.mean_NX).mean()) > 2
+    assert float((now.std_NX / first.std_NX).mean()) < 1.5  # around the old mean up to 1.1^25 = 10.8
 
 
 def test_the_divergence_of_the_improved_policy_is_the_one_that_was_asked_for():

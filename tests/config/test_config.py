@@ -259,6 +259,7 @@ def configurations(draw: st.DrawFn) -> Config:
         given |= {"search.samples": None} if types["search.kind"] == "mcts" else {}
     else:
         given |= {"search.actions": None, "search.proposal_scale": None}
+        given |= {"search.widening": None} if types["search.kind"] == "mcts" else {}
     if given["search.depth"] != "adaptive":
         given["search.max_depth"] = given["search.tolerance"] = None
     if types["critic.type"] == "network" and (given["critic.polyak"] < 1 or given["critic.target_period"] > 1):
@@ -266,6 +267,10 @@ def configurations(draw: st.DrawFn) -> Config:
     if given["search.kind"] == "mcts":
         given |= {"search.exploration": None} if given["search.rule"] == "gumbel" else {"search.prior": "uniform"}
         given |= {"search.merge": False} if given["search.backup"] == "mean" else {}
+        if given["search.widening"] is None:
+            given["search.widening_power"] = None
+        else:
+            given |= {"search.wave": 1, "search.backup": "max", "search.merge": None}
     given |= {key: "mine:made" for key in given if key.endswith(".make")}
     if policy == "module" and types["critic.network.type"] == "shared":
         given["policy.head"] = True
