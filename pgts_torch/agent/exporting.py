@@ -45,23 +45,24 @@ def export(
         notes: plain values for the file.
 
     Returns:
-        The notes, with the names of inputs, their dtypes and shapes, and those of outputs.
+        The notes, with the dtypes and shapes of inputs and outputs by their names.
     """
     kind = _format(path, format)
     place = files.target(path, lambda raw: _MARK.encode() in raw, "a policy that pgts_torch has exported")
     acts, name = Exported(world, source, policy), source.name
     inputs = acts.examples()
-    described = {"inputs": {key: describe(value) for key, value in inputs.items()}, "outputs": acts.outputs}
-    content = json.dumps(notes | described | {"version": version("pgts_torch")})
     with _silent(), torch.no_grad():
         try:
             batch = {"given": {key: {0: torch.export.Dim("batch")} for key in inputs}}
             program = torch.export.export(acts, (inputs,), dynamic_shapes=batch, strict=False)
+            named = {"inputs": inputs, "outputs": acts(inputs)}
         except Exception as error:
             raise _failure(f"the policy of {name} cannot be traced by torch.export", error) from error
+        notes = notes | {what: {name: describe(x) for name, x in each.items()} for what, each in named.items()}
+        content = json.dumps(notes | {"version": version("pgts_torch")})
         raw = _torch_bytes(program, content) if kind == "torch" else _onnx_bytes(program, acts, content, name)
     files.replace(place, raw)
-    return notes | described
+    return notes
 
 
 def describe(example: Tensor) -> str:

@@ -72,7 +72,8 @@ class _Part:
         number = np.int8 if isinstance(self.declared, spaces.MultiBinary) else np.int64
         dtype = self.declared.dtype if isinstance(self.declared, spaces.Box) else number
         dtype = self.seen.dtype if dtype == np.longdouble else dtype
-        return torch.from_numpy(np.zeros((count, *(self.declared.shape or ())), dtype))
+        first = getattr(self.declared, "start", 0)
+        return torch.from_numpy(np.full((count, *(self.declared.shape or ())), first, dtype))
 
     def read_tensor(self, x_N: Tensor) -> Tensor:
         """As `read`, without checks, of a tensor like `example`."""

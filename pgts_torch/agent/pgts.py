@@ -412,7 +412,8 @@ class PGTS:
             steps: the most steps of an episode; default: the time limit, or 1,000 where there is none.
 
         Returns:
-            Of each episode the seed, the length, the return and how it ended.
+            Of each episode the seed, the length, the return and how it ended. If several processes train together all
+            must call it, and the first one watches.
 
         Raises:
             PgtsError: an argument out of range; there is another file at `path`; the environment cannot be drawn; or it
@@ -420,8 +421,12 @@ class PGTS:
         """
         suffix = recording.suffix_of(path)
         chosen = {"seed": seed, "deterministic": deterministic, "depth": depth, "steps": steps}
-        with closing(self.watching(**chosen, mode="ansi" if suffix == ".txt" else "rgb_array")) as watching:
-            return recording.record(path, watching, episodes=episodes, fps=fps, name=self.source.name)
+
+        def record() -> list[recording.Seen]:
+            with closing(self.watching(**chosen, mode="ansi" if suffix == ".txt" else "rgb_array")) as watching:
+                return recording.record(path, watching, episodes=episodes, fps=fps, name=self.source.name)
+
+        return self.ranks.first("a recording", record)
 
     def watching(self, **options: Any) -> Watching:
         """Episodes of the policy, to be looked at step by step; the arguments are those of `watching.Watching`."""

@@ -116,10 +116,9 @@ def _plain(rendered: str) -> str:
 
 # Pictures
 
-_HEIGHT = 360
-"""Smaller renderings are enlarged to about this height."""
+_SIDE, _LONGEST_SIDE = 360, 640
+"""Smaller renderings are enlarged to about this height, and larger ones than this are made smaller."""
 
-_MOST_HEIGHT = 640
 _PANEL, _LINE, _MARGIN = 440, 24, 16
 _INK, _PALE, _PAPER = (31, 35, 40), (110, 118, 129), (255, 255, 255)
 _POLICY, _VALUE, _TAKEN = (84, 130, 196), (221, 132, 82), (214, 224, 238)
@@ -148,9 +147,10 @@ def picture(moment: Moment, name: str, num_choices: int) -> Image.Image:
 
 def _scaled(rendered: Image.Image) -> Image.Image:
     """A small picture enlarged by a whole number, a large one made smaller."""
-    if rendered.height > _MOST_HEIGHT:
-        return rendered.resize((round(rendered.width * _MOST_HEIGHT / rendered.height), _MOST_HEIGHT))
-    factor = max(1, round(_HEIGHT / rendered.height))
+    if (longest := max(rendered.size)) > _LONGEST_SIDE:
+        width, height = (max(1, round(side * _LONGEST_SIDE / longest)) for side in rendered.size)
+        return rendered.resize((width, height))
+    factor = max(1, min(round(_SIDE / rendered.height), _LONGEST_SIDE // rendered.width))
     return rendered.resize((rendered.width * factor, rendered.height * factor), Image.Resampling.NEAREST)
 
 

@@ -173,7 +173,7 @@ def watch(arguments: Arguments) -> None:
         ("seed", whole(0), 0, "episode k begins with reset(seed=N + k) (default: %(default)s)"),
         ("steps", whole(1), None, "the most steps of an episode (default: its time limit, or 1,000)"),
         ("depth", whole(0), None, "of the lookahead (default: that of the training)"),
-        ("fps", positive, None, "pictures, or steps of text, a second (default: as the environment says)"),
+        ("fps", positive, None, "pictures a second (default: as the environment says); of text, the most steps"),
     ]:
         parser.add_argument(f"--{name}", metavar="N", type=kind, default=default, help=meaning)
     parser.add_argument(

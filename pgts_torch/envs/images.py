@@ -20,16 +20,17 @@ class Catch(gymnasium.Env[np.ndarray, np.int64]):
 
     Args:
         rows, columns: at least 2 and 1.
+        render_mode: "rgb_array", the same image in three colours; None: it is not drawn.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's type)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's type)
 
-    def __init__(self, rows: int = 10, columns: int = 5) -> None:
+    def __init__(self, rows: int = 10, columns: int = 5, render_mode: str | None = None) -> None:
         check_count("rows", rows, least=2)
         check_count("columns", columns)
         self.action_space = spaces.Discrete(3)
         self.observation_space = spaces.Box(0, 255, (rows, columns, 1), np.uint8)
-        self._shape, self._ball, self._paddle = (rows, columns), (0, 0), 0
+        self._shape, self._ball, self._paddle, self.render_mode = (rows, columns), (0, 0), 0, render_mode
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -47,6 +48,10 @@ class Catch(gymnasium.Env[np.ndarray, np.int64]):
         self._ball = self._ball[0] + 1, self._ball[1]
         over, caught = self._ball[0] == rows - 1, self._ball[1] == self._paddle
         return self._image(), (1.0 if caught else -1.0) if over else 0.0, over, False, {}
+
+    def render(self) -> np.ndarray | None:
+        """What an observation shows; None without a render mode."""
+        return None if self.render_mode is None else self._image().repeat(3, -1)
 
     def _image(self) -> np.ndarray:
         image = np.zeros((*self._shape, 1), np.uint8)

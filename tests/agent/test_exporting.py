@@ -206,9 +206,9 @@ ONNX: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("case", ONNX)
+@pytest.mark.parametrize("case", [*ONNX, *(pytest.param(kind, marks=pytest.mark.long) for kind in KINDS)])
 def test_onnx_computes_what_torch_does(case, tmp_path):
-    model, seen, masks = ONNX[case]()
+    model, seen, masks = ONNX[case]() if case in ONNX else (corridor(case, "module"), observed(case), None)
     given = inputs_of(model, seen, masks)
     found = in_onnx(model, tmp_path, given)
     wanted = exporting.Exported(model.world, model.source, model.policy)(given)
@@ -244,7 +244,7 @@ def test_a_file_says_what_it_takes_and_gives(tmp_path):
         [name] = [name for name in archive.namelist() if name.endswith("exported by pgts_torch")]
         content = json.loads(archive.read(name))
     assert content["inputs"] == said["inputs"]
-    assert content["outputs"] == ["probs", "action"]
+    assert content["outputs"] == said["outputs"] == {"probs": "float32 (batch, 3)", "action": "int64 (batch)"}
 
 
 # What is refused

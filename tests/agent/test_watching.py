@@ -190,6 +190,22 @@ def test_sampled_actions_are_sampled():
     assert len(set(taken)) > 1
 
 
+def test_a_model_with_images_as_vectors_can_be_watched():
+    model = PGTS(
+        "images/Catch-v0",
+        depth=1,
+        policy="mlp",
+        model={"type": "latent", "size": 4, "hidden": [8], "first_updates": 3, "updates_per_step": 0.1, "unroll": 2},
+        horizon={"type": "steps", "length": 10, "first": 60},
+        replay={"updates_per_step": 0.05, "starts": 4, "length": 4},
+    )
+    model.iterate()
+    found = moments(model, mode="rgb_array")
+    for moment in found:
+        assert (moment.picture[..., :1] == moment.observation).all()
+    assert len(found) == 10
+
+
 # Files
 
 
@@ -266,9 +282,11 @@ def test_long_names_large_numbers_and_large_observations_fit(scale):
     assert max(map(len, shown.splitlines())) <= 80
     assert "uint8 (9, 9, 3)" in shown
     assert "'go there'" in shown
-    picture = showing.picture(moment(choices, picture=np.zeros((2000, 9, 3), np.uint8)), "name " * 50, 1)
-    assert picture.height <= 640
-    assert picture.width % 2 == picture.height % 2 == 0
+    for size in [(2000, 9), (9, 2000), (1, 1), (3, 9)]:
+        picture = showing.picture(moment(choices, picture=np.zeros((*size, 3), np.uint8)), "name " * 50, 1)
+        assert picture.height <= 640
+        assert picture.width <= 640 + 442
+        assert picture.width % 2 == picture.height % 2 == 0
 
 
 # What cannot be drawn
@@ -312,6 +330,24 @@ def test_an_environment_that_does_not_repeat_itself_is_not_drawn(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+class Shared(Drawn):
+    """Its chance is that of the generator of the whole process."""
+
+    def step(self, action):
+        self.cell += 1 if np.random.random() < 0.5 else -1  # noqa: NPY002
+        return self._seen(), 0.0, self.cell in (0, 6), False, {}
+
+
+def test_chance_of_the_whole_process_is_the_same_for_what_acts_and_what_is_drawn(tmp_path):
+    make = {"policy": "mlp", "depth": 0, "estimator": "sampled", "update": "ppo"}
+    model = PGTS(lambda: TimeLimit(Shared("rgb_array"), 30), **make, **SHORT)
+    before = np.random.get_state()[1].tolist()  # noqa: NPY002
+    first, again = (model.record(tmp_path / "film.gif", episodes=3) for _ in range(2))
+    assert first == again
+    assert len({seen.length for seen in model.record(tmp_path / "film.gif", episodes=12)}) > 1
+    assert np.random.get_state()[1].tolist() == before  # noqa: NPY002
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -343,14 +379,24 @@ def test_without_what_writes_videos_the_extra_is_named(monkeypatch, tmp_path):
         table().record(tmp_path / "film.mp4")
 
 
-def test_policies_are_evaluated_by_stable_baselines3_as_its_own_are():
+@pytest.mark.parametrize("kind", ["a table", "a simulator without chance", "a gaussian policy"])
+def test_policies_are_evaluated_by_stable_baselines3_as_its_own_are(kind):
     evaluation = pytest.importorskip("stable_baselines3.common.evaluation")
     monitor = pytest.importorskip("stable_baselines3.common.monitor")
-    model = MODELS["a simulator"]()
-    env = monitor.Monitor(gymnasium.make("tests/Drawn-v0"))
-    returns, lengths = evaluation.evaluate_policy(model, env, n_eval_episodes=4, return_episode_rewards=True)
-    assert len(returns) == len(lengths) == 4
-    assert set(returns) <= {0.0, 1.0}
-    actions, state = model.predict(np.array([[3.0]], np.float32), state=None, episode_start=np.array([True]))
-    assert state is None
-    assert actions.shape == (1,)
+    model = MODELS[kind]()
+    env, other = (TimeLimit(model.source.make_one(), 20) for _ in range(2))
+    env.reset(seed=8)  # the generator goes on from here, when it is reset without a seed
+    other.reset(seed=8)
+    returns, lengths = evaluation.evaluate_policy(
+        model, monitor.Monitor(env), n_eval_episodes=1, return_episode_rewards=True
+    )
+    observation, _ = other.reset()
+    total, length, over = 0.0, 0, False
+    while not over:
+        observation, reward, terminated, truncated, _ = other.step(model.predict(observation))
+        total, length, over = total + float(reward), length + 1, terminated or truncated
+    assert lengths == [length]
+    np.testing.assert_allclose(returns, [total], rtol=1e-5)
+    actions, state = model.predict(np.asarray(observation)[None], state="kept", episode_start=np.array([True]))
+    assert state == "kept"
+    assert len(actions) == 1
