@@ -152,6 +152,7 @@ FAULTS: dict[str, dict[str, str]] = {
     },
     "Processes": {
         "kill at any moment": "started again, the run ends with the bits of one that was never killed",
+        "tuning killed at any moment": "the same command ends as if it had not been; no trial counts twice",
         "SIGTERM": "the iteration is finished and saved, exit code 143",
         "Ctrl-C": "the iteration is finished and saved, exit code 130",
         "second Ctrl-C": "the process ends at once, exit code 130; the last checkpoint leads to the same bits",

@@ -22,26 +22,27 @@ class RunLock:
 
     Args:
         path: the folder; made here, with all parents.
+        name: which option names it.
 
     Raises:
         PgtsError: it cannot be made or written to; or another process, named by its id, holds it; or the lock file
             was not made by a run.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, *, name: str = "run.dir") -> None:
+        self.path, self._name = path, name
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-        with files.named(f"run.dir {path} cannot be written to"):
+        with files.named(f"{name} {path} cannot be written to"):
             path.mkdir(parents=True, exist_ok=True)
             self._file = os.fdopen(os.open(path / LOCK_FILE, flags, 0o644), "r+b", buffering=0)
         try:
-            with files.named(f"run.dir {path} cannot be locked"):
+            with files.named(f"{name} {path} cannot be locked"):
                 is_taken = self._take()
                 self._file.seek(0)
                 if not is_lock(content := self._file.read(64)):
                     raise PgtsError(f"{path / LOCK_FILE} is not the lock of a run; choose another folder")
                 if not is_taken:
-                    raise PgtsError(f"run.dir {path} is in use by the process {content.decode().strip() or 'unknown'}")
+                    raise PgtsError(f"{name} {path} is in use by the process {content.decode().strip() or 'unknown'}")
                 self._file.seek(0)
                 self._file.truncate()
                 self._file.write(f"{os.getpid()}\n".encode())
@@ -70,7 +71,9 @@ class RunLock:
         except OSError:
             now = None
         if now is None or not os.path.samestat(now, os.fstat(self._file.fileno())):
-            raise PgtsError(f"run.dir {self.path} was moved or replaced while this run had it; nothing more is written")
+            raise PgtsError(
+                f"{self._name} {self.path} was moved or replaced while this run had it; nothing more is written"
+            )
 
     def __enter__(self) -> Self:
         return self

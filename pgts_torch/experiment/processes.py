@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import final
 
 from pgts_torch.errors import Stopped
@@ -20,11 +20,18 @@ _STOPPED = (128 + signal.SIGTERM, -signal.SIGTERM)
 """Exit codes of a training that was terminated: it has saved, or had not begun."""
 
 
-def train_all(trainings: Mapping[str, Sequence[str]], *, jobs: int) -> dict[str, str]:
+def train_all(
+    trainings: Mapping[str, Sequence[str]],
+    *,
+    jobs: int,
+    is_over: Callable[[Mapping[str, str]], bool] = lambda failures: False,
+) -> dict[str, str]:
     """Run `pgts train` with each of these arguments, `jobs` at once.
 
     Args:
         trainings: the arguments, by the name of the training.
+        is_over: whether none of them is wanted any more, given the failures so far. It is looked at all the time; then
+            those that run save and end, which is no failure, and no other begins.
 
     Returns:
         The last line on stderr of each training that failed, by name.
@@ -37,16 +44,19 @@ def train_all(trainings: Mapping[str, Sequence[str]], *, jobs: int) -> dict[str,
     waiting, running, finished = deque(trainings.items()), list[_Training](), 0
     with StopFlag(at_once=lambda: _kill(running)) as stop:
         try:
-            while running or (waiting and stop.signal is None):
-                while waiting and len(running) < jobs and stop.signal is None:
+            over = False
+            while running or (waiting and stop.signal is None and not over):
+                over = over or is_over(failures)
+                stops = over or stop.signal is not None
+                while waiting and len(running) < jobs and not stops:
                     running.append(_Training(*waiting.popleft()))
-                for training in [each for each in running if each.ended(terminate=stop.signal is not None)]:
+                for training in [each for each in running if each.ended(terminate=stops)]:
                     running.remove(training)
                     code, seconds, last = training.outcome()
                     if code == 0:
                         ending = f"done in {seconds:.0f} s"
                         finished += 1
-                    elif stop.signal is not None and code in _STOPPED:
+                    elif stops and code in _STOPPED:
                         ending = f"stopped after {seconds:.0f} s"
                     else:
                         ending, failures[training.name] = f"FAILED: {last}", last

@@ -94,9 +94,7 @@ def plan(
             configuration, or a table or a picture that no sweep has made.
     """
     _targets(out)
-    for key in (override.removeprefix("--").partition("=")[0] for override in overrides if override.startswith("--")):
-        if key in SET_BY_SWEEP:
-            raise PgtsError(f"--{key} is set by the sweep: {SET_BY_SWEEP[key]}")
+    check_overrides(overrides, SET_BY_SWEEP, "sweep")
     shared = ["--config", path] if path is not None else []
     runs = []
     for depth in depths or [load(path, overrides).search.depth]:
@@ -106,11 +104,18 @@ def plan(
             arguments = [*overrides, *(f"--{key}={value}" for key, value in own.items())]
             runs.append(Run(depth, seed, load(path, arguments), (*shared, *arguments)))
     for run in runs:
-        _summary(run)
+        summary_in(run.folder)
         earlier = run.folder / CONFIG_FILE
         if earlier.is_file() and load(earlier).model_copy(update={"run": run.config.run}) != run.config:
             raise PgtsError(f"{run.folder} holds a run of another configuration; choose another --out")
     return runs
+
+
+def check_overrides(overrides: Sequence[str], set_here: Mapping[str, str], what: str) -> None:
+    """PgtsError where an override is of a key that is set here: which option to use instead, by key."""
+    for key in (override.removeprefix("--").partition("=")[0] for override in overrides if override.startswith("--")):
+        if key in set_here:
+            raise PgtsError(f"--{key} is set by the {what}: {set_here[key]}")
 
 
 def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
@@ -127,11 +132,11 @@ def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
     from pgts_torch.experiment.compare.drawing import figure, png
     from pgts_torch.experiment.run import build
 
-    waiting = [run for run in runs if _summary(run) is None]
+    waiting = [run for run in runs if summary_in(run.folder) is None]
     for config in {run.depth: run.config for run in waiting}.values():
         build(config)
     failures = train_all({run.name: run.arguments for run in waiting}, jobs=jobs)
-    finished = [(run, summary) for run in runs if (summary := _summary(run)) is not None]
+    finished = [(run, summary) for run in runs if (summary := summary_in(run.folder)) is not None]
     score_is = "return" if any(summary.J is None for _, summary in finished) else "J"
     answer = Sweep(tuple(_rows(finished, score_is)), score_is, failures, str(out))
     with files.named(f"--out {out} cannot be written to"):
@@ -174,9 +179,9 @@ def _is_table(raw: bytes) -> bool:
         return False
 
 
-def _summary(run: Run) -> "Summary | None":
+def summary_in(folder: Path) -> "Summary | None":
     """What a finished run came to; None if it is not finished; PgtsError where that is damaged."""
-    path = run.folder / SUMMARY_FILE
+    path = folder / SUMMARY_FILE
     if files.kind(path) is None:
         return None
     from pgts_torch.experiment.summary import from_json  # torch waits until the arguments have proved themselves

@@ -5,6 +5,7 @@ import itertools
 import math
 from pathlib import Path
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -31,7 +32,8 @@ def figure(comparison: Comparison) -> Figure:
     rows = math.ceil(len(panels) / columns)
     colours = _colours(comparison)
     labels = {
-        group.letter: f"{group.letter}  {_short(group.label, 70 if columns > 1 else 45)}" for group in comparison.groups
+        group.letter: f"{group.letter}  {shortened(group.label, 70 if columns > 1 else 45)}"
+        for group in comparison.groups
     }
     height = 0.19 * (len(colours) + 1)
     drawn = Figure(figsize=(7 if columns == 1 else 4.4 * columns, 3.6 * rows + height), layout="constrained")
@@ -54,9 +56,9 @@ def _alone(panel: Panel, colours: dict[str, str], x: str) -> Figure:
 
 
 def _draw(axes: Axes, panel: Panel, colours: dict[str, str], x: str) -> None:
+    widths = dict(zip(colours, np.linspace(2.8, 1.4, len(colours)), strict=True))  # those that coincide stay visible
     for curve in sorted(panel.curves, key=lambda curve: curve.letter in colours):
-        colour = colours.get(curve.letter, GREY)
-        width = 1.8 if curve.letter in colours else 0.8
+        colour, width = colours.get(curve.letter, GREY), widths.get(curve.letter, 0.8)
         marker = "o" if len(curve.x) == 1 else ""
         axes.plot(curve.x, curve.mean, color=colour, linewidth=width, marker=marker, markersize=4)
         if curve.low is not None and curve.high is not None and curve.letter in colours:
@@ -65,7 +67,7 @@ def _draw(axes: Axes, panel: Panel, colours: dict[str, str], x: str) -> None:
         axes.axvline(panel.at, color=GREY, linewidth=0.8, linestyle=":")
     style(axes, AXES[x])
     axes.set_ylabel(WORDS.get(panel.tag, panel.tag), color=INK)
-    axes.set_title(_short(panel.env, 48), color=INK, fontsize=11)
+    axes.set_title(shortened(panel.env, 48), color=INK, fontsize=11)
 
 
 def _colours(comparison: Comparison) -> dict[str, str]:
@@ -78,12 +80,13 @@ def _colours(comparison: Comparison) -> dict[str, str]:
     return dict(zip(letters, COLOURS, strict=False))
 
 
-def _short(text: str, most: int) -> str:
+def shortened(text: str, most: int) -> str:
+    """A text of at most so many characters."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def png(drawn: Figure) -> bytes:
-    """A picture as PNG, which says that it is ours."""
+    """A picture as PNG, by which it is recognised as ours."""
     raw = io.BytesIO()
     drawn.savefig(raw, dpi=120, metadata={"Software": SIGN})
     return raw.getvalue()
