@@ -146,7 +146,7 @@ code is 1. SIGTERM or Ctrl-C lets the runs finish their iterations and save."""
 @command
 def tune(arguments: Arguments) -> None:
     """Look for good values of options, over several seeds."""
-    parser = Parser(tune, usage="%(prog)s --out DIR --option KEY=VALUES [--config FILE] [--KEY VALUE ...]")
+    parser = Parser(tune, usage="%(prog)s --out DIR --option KEY=VALUES ... [--KEY VALUE ...]")
     parser.add_argument("--out", metavar="DIR", type=output_folder, help="for DIR/trial-N/seed-S and the results")
     parser.add_argument(
         "--option",
@@ -221,11 +221,11 @@ def tune(arguments: Arguments) -> None:
 TUNED_METRICS = ("eval/deterministic_return", "eval/sampled_return", "exact/J")
 
 TUNE_HELP = """\
-Keys of the configuration are those of pgts train; so are the keys of --option.
-Trials that are done are kept and others go on from their last checkpoint, so a
-tuning that was cut off goes on when it is started again, and more trials can be
-added. Every run has one thread. A trial that fails is named and the others go
-on. Written are tune.json, tune.png and best.yaml, which pgts train takes."""
+Keys of the configuration and of --option are those of pgts train. Trials that
+are done are kept and others go on from their last checkpoint, so a tuning that
+was cut off goes on when it is started again, and more trials can be added.
+Every run has one thread. A trial that fails is named and the others go on.
+tune.json, tune.png and best.yaml are written; pgts train takes the last one."""
 
 
 @command
