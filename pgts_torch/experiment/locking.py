@@ -17,6 +17,10 @@ _BEYOND = 2**30
 """Where Windows locks a byte: far behind the content, which other processes may then still read."""
 
 
+class InUse(PgtsError):
+    """Another process has the folder."""
+
+
 class RunLock:
     """Locks a run folder against other processes until this one ends. Use it as a context.
 
@@ -25,8 +29,8 @@ class RunLock:
         name: which option names it.
 
     Raises:
-        PgtsError: it cannot be made or written to; or another process, named by its id, holds it; or the lock file
-            was not made by a run.
+        InUse: another process, named by its id, holds it.
+        PgtsError: it cannot be made or written to, or the lock file was not made by a run.
     """
 
     def __init__(self, path: Path, *, name: str = "run.dir") -> None:
@@ -42,7 +46,7 @@ class RunLock:
                 if not is_lock(content := self._file.read(64)):
                     raise PgtsError(f"{path / LOCK_FILE} is not the lock of a run; choose another folder")
                 if not is_taken:
-                    raise PgtsError(f"{name} {path} is in use by the process {content.decode().strip() or 'unknown'}")
+                    raise InUse(f"{name} {path} is in use by the process {content.decode().strip() or 'unknown'}")
                 self._file.seek(0)
                 self._file.truncate()
                 self._file.write(f"{os.getpid()}\n".encode())

@@ -37,7 +37,7 @@ def summary(config: Config, *, J: float | None, env_steps: int, greedy: float = 
 
 def leave(folder: Path, config: Config, lines: Sequence[Line], what: Summary | None = None) -> Path:
     """Write the files of a run, unfinished where there is no summary."""
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(dump(config))
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     if what is not None:

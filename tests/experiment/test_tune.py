@@ -18,6 +18,7 @@ from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.compare.comparison import compare
 from pgts_torch.experiment.compare.text import to_json
+from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.statistics import estimate
 from pgts_torch.experiment.tune import result, space
 from tests.experiment import finished
@@ -76,7 +77,7 @@ class Trainer:
                     points = [(at, worth * at / 1000) for at in range(250, step + 1, 250)]
                     lines = [{"step": at, "eval/deterministic_return": value} for at, value in points]
                     place = Path(str(config.run.dir))
-                    if not place.exists():
+                    if not (place / "config.yaml").exists():
                         finished.leave(place, config, lines)
                     (place / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
                     self.evaluations += 1
@@ -234,6 +235,23 @@ def test_a_tuning_that_is_killed_goes_on_with_the_same_trial_and_ends_as_if_it_h
     assert without(answer, "out") == without(whole, "out")
 
 
+@pytest.mark.fault("tuning killed at any moment")
+def test_trainings_that_outlive_a_tuning_are_waited_for(trainer, monkeypatch, capsys):
+    whole = tuned("--trials=3", out="whole")
+    left, waits = RunLock(Path("out/trial-0001/seed-1")), list[float]()
+
+    def sleep(seconds: float) -> None:
+        waits.append(seconds)
+        if len(waits) == 3:
+            left.__exit__()
+
+    monkeypatch.setattr(studies.time, "sleep", sleep)
+    assert without(tuned("--trials=3"), "out") == without(whole, "out")
+    assert len(waits) == 3
+    waiting = f"waiting: run.dir out/trial-0001/seed-1 is in use by the process {os.getpid()}"
+    assert capsys.readouterr().err.splitlines().count(waiting) == 1
+
+
 def test_a_tuning_that_is_done_trains_nothing_and_more_trials_are_added(trainer):
     first = tuned("--trials=6")
     count = len(trainer.trained)
@@ -383,7 +401,7 @@ def test_one_storage_holds_several_tunings_by_their_folders(trainer):
 
 
 def test_two_processes_do_not_tune_in_one_folder(trainer, capsys):
-    with result.RunLock(Path("out")):
+    with RunLock(Path("out")):
         assert main(["tune", "--out", "out", "--option", STEP, "--update.type=mirror", *LADDER]) == 2
     assert f"error: --out out is in use by the process {os.getpid()}" in capsys.readouterr().err
 

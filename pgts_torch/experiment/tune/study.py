@@ -7,7 +7,7 @@ of seeds and steps, however many runs there are at once. A trial that was cut of
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,8 @@ from pgts_torch import files
 from pgts_torch.config import ConfigError
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.compare.runs import GREEDY, SAMPLED, J
+from pgts_torch.experiment.locking import InUse, RunLock
+from pgts_torch.experiment.ownership import LOCK_FILE
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.report.facts import metrics
 from pgts_torch.experiment.resume import flat, plain
@@ -193,6 +195,7 @@ def _train(study: "optuna.Study", trial: "optuna.Trial", plan: Plan, jobs: int) 
     failures: Mapping[str, str] = {}
     try:
         plan.config(values)
+        _wait_for(folders.values())
         failures = train_all(trainings(plan, values, folders), jobs=jobs, is_over=watch)
     except ConfigError as error:
         failures = {"the values do not go together": error.mistakes[0]}
@@ -212,6 +215,21 @@ def _train(study: "optuna.Study", trial: "optuna.Trial", plan: Plan, jobs: int) 
         f"pruned at step {told.last_step:,}" if told.state == states.PRUNED else f"{told.value:.4g}"
     )
     print(f"trial {trial.number}: {worth}", file=sys.stderr, flush=True)
+
+
+def _wait_for(folders: Iterable[Path]) -> None:
+    """Wait for trainings that have outlived a tuning that was killed: what they come to counts."""
+    for place in folders:
+        is_said = False
+        while files.kind(place / LOCK_FILE) is not None:
+            try:
+                with RunLock(place):
+                    break
+            except InUse as error:
+                if not is_said:
+                    print(f"waiting: {error}", file=sys.stderr, flush=True)
+                is_said = True
+                time.sleep(1)
 
 
 @final
