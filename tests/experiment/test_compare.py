@@ -244,15 +244,19 @@ def test_the_page_escapes_what_it_is_given(here):
 
 
 def test_many_groups_are_told_from_the_best(here):
-    for step in range(1, 14):
+    for step in range(1, 23):
         run(Path(f"runs/{step}"), f"--update.step_size={step}", score=step)
     comparison = compare([Path("runs")])
     text = describe(comparison)
-    assert "update.step_size 13" in text
+    assert "update.step_size 22" in text
     assert max(map(len, text.splitlines())) < 80
-    assert len(comparison.pairs) == 78
-    assert "and 66 more, in --json" in text
-    assert Page(page(comparison).decode()).text.count("update.step_size 13") >= 2
+    assert [(pair.better, pair.worse) for pair in comparison.pairs] == [("V", chr(ord("A") + at)) for at in range(21)]
+    read = Page(page(comparison).decode()).text
+    assert read.count("update.step_size 22") >= 2
+    assert "V > U" in read
+    some = compare([Path(f"runs/{step}") for step in range(1, 13)])
+    assert len(some.pairs) == 66
+    assert "and 55 more, in --json" in describe(some)
 
 
 @pytest.mark.parametrize(
