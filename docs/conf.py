@@ -4,7 +4,7 @@ Pages are the files of docs/, which are also read as they are; the reference is 
 """
 
 import re
-from importlib.metadata import version as version_of
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,10 @@ from pgts_torch.options.schema import schema_of
 HERE = Path(__file__).parent
 
 project, author = "pgts_torch", "the authors of pgts_torch"
-version = release = version_of("pgts_torch")
+version = release = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+html_static_path, html_css_files, html_show_copyright = ["_static"], ["site.css"], False
+highlight_language = "text"  # of blocks without a language: formulas, what a program prints
 exclude_patterns = ["_build", "figures"]
 # Tutorials are run where they have changed; a cell that fails ends the build.
 nb_execution_mode, nb_execution_cache_path = "cache", str(HERE / "_build/.jupyter_cache")

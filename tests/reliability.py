@@ -140,7 +140,7 @@ FAULTS: dict[str, dict[str, str]] = {
     "Folders": {
         "project folder as run folder": "left as it is, also with `--run.overwrite`; nothing written, exit code 2",
         "files of the user in a run folder": "never touched; one line names them where a run starts from the beginning",
-        "run of version 0.1": "refused by version and left as it is; its saved models load",
+        "run of version 0.1": "refused by version and left as it is; so are its saved models",
         "something else under the name of a file of the run": NAMED + "; links and pipes are not followed",
         "something else in place of a run folder": NAMED,
         "run folder replaced meanwhile": "the run ends with one line, nothing is written there, exit code 2",

@@ -9,6 +9,7 @@ import io
 import re
 import shlex
 import sys
+import tomllib
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -124,3 +125,9 @@ def test_every_public_name_is_in_the_reference(package):
     whole = zoo if "zoo" in named else set()
     assert set(importlib.import_module(f"pgts_torch.{package}").__all__) <= named | whole
     assert {"PGTS", "EvalCallback", "evaluate"} <= named
+
+
+def test_the_version_is_the_same_everywhere():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.search(r"^## \[(.*?)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)[1] == version

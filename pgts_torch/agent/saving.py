@@ -3,7 +3,6 @@
 import hashlib
 import io
 import re
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -55,15 +54,15 @@ def read(path: str | Path) -> dict[str, Any]:
         raise Damaged(f"{path} is not a file saved by pgts_torch")
     number, start = int(header[1]), header.end()
     payload = raw[start + _DIGEST :]
+    if number == _FORMAT_0_1:  # whose checksum was another one
+        raise PgtsError(
+            f"{path} was saved by version 0.1, which this version does not read: use that one, or train again"
+        )
     if _seal(number, payload) != raw[start : start + _DIGEST]:
         raise Damaged(f"{path} is damaged: its checksum does not fit its content")
-    if number not in (_FORMAT, _FORMAT_0_1):
+    if number != _FORMAT:
         raise PgtsError(f"{path} has the format {number}; this version of pgts_torch reads {_FORMAT}")
-    content = _parse(payload, path)
-    if number == _FORMAT_0_1:
-        warnings.warn(f"{path} was saved by version 0.1; trained on, it follows the defaults of this one", stacklevel=2)
-        _upgrade(content)
-    return content
+    return _parse(payload, path)
 
 
 def sealed(payload: bytes, number: int = _FORMAT) -> bytes:
@@ -72,22 +71,10 @@ def sealed(payload: bytes, number: int = _FORMAT) -> bytes:
 
 
 def _seal(number: int, payload: bytes) -> bytes:
-    """The SHA-256 of a file: of its format too, but not in version 0.1."""
-    start = b"" if number == _FORMAT_0_1 else _NAME + b"%d\n" % number
-    seal = hashlib.sha256(start)
+    """The SHA-256 of a file, of its format too."""
+    seal = hashlib.sha256(_NAME + b"%d\n" % number)
     seal.update(payload)
     return seal.digest()
-
-
-def _upgrade(content: dict[str, Any]) -> None:
-    """Add what version 0.1 did not save, as in a model that has not seen anything yet, and rename what it did."""
-    state = content.get("state")
-    if isinstance(state, dict):
-        state["model_check"] = {"contradictions": 0, "model_calls": 0, "warned": [], "frequencies": {}}
-        searches = state.get("searches")
-        for search in searches.values() if isinstance(searches, dict) else ():
-            if isinstance(search, dict) and {"choices", "asked", "lists"} <= search.keys():
-                search |= {"upper": {}, "queried": search.pop("asked"), "enumerates": search.pop("lists")}
 
 
 def _parse(payload: bytes, path: str | Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 
 from pgts_torch import files
 from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.ownership import is_earlier
 from pgts_torch.options.fields import INT64_MAX
 from pgts_torch.options.schema import Option
 
@@ -206,6 +207,10 @@ def run_folder(text: str) -> Path:
         raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
     if not (path / "config.yaml").is_file():
         raise argparse.ArgumentTypeError(f"{text!r} is not the folder of a run: it has no config.yaml")
+    if is_earlier(path):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is the folder of a run of version 0.1: read it with that, or train again"
+        )
     return path
 
 

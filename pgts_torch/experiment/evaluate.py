@@ -43,7 +43,7 @@ def last_checkpoint(run: Path) -> Path:
     """Return the path of the newest intact checkpoint of a run folder; PgtsError if there is none."""
     found = newest(run)
     if found is None and is_earlier(run):
-        raise PgtsError(f"{run} is the folder of a run of version 0.1; PGTS.load reads its checkpoints/*/model.pt")
+        raise PgtsError(f"{run} is the folder of a run of version 0.1, which this version does not read: train again")
     if found is None:
         raise PgtsError(f"{run} holds no checkpoint; it must be the folder of a run")
     return found[0]

@@ -23,7 +23,7 @@ SOLVE_TOLERANCE = 1e-12
 """Largest residual of the iterative solve, relative to the right-hand side, in the maximum norm."""
 
 UNDISCOUNTED = 1 - 1e-12
-"""A discount from here on counts as 1: a policy must terminate to have a value that float64 can tell."""
+"""A discount from here on counts as 1, so that a policy must terminate to have a value that float64 can tell."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,10 +22,10 @@ MAX_POLICIES = 2**20
 """Most deterministic policies that are enumerated."""
 
 BATCH_ENTRIES = 2**18
-"""Values that are worked on at once: more leave the processor's cache."""
+"""Values that are worked on at once. More leave the processor's cache."""
 
 NEVER = -1
-"""Escape depth of a policy that no depth escapes: it is optimal."""
+"""Escape depth of a policy that no depth escapes, which is optimal."""
 
 
 @dataclass(frozen=True, eq=False)

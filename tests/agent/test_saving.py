@@ -3,6 +3,7 @@
 import functools
 import pickle
 from fractions import Fraction
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -176,6 +177,13 @@ def test_a_whole_file_with_foreign_content_is_refused(payload, tmp_path):
     path.write_bytes(sealed(payload))
     with pytest.raises(PgtsError, match=r"model.pt holds"):
         PGTS.load(path)
+
+
+def test_a_model_that_version_0_1_has_saved_is_refused_by_its_version():
+    # `PGTS("pgts/Ladder-v0", depth=4, seed=3, num_envs=4)` of that version, after two iterations.
+    with pytest.raises(PgtsError, match=r"was saved by version 0\.1, which this version does not read") as raised:
+        PGTS.load(Path(__file__).parents[1] / "golden/saved_by_0_1.pt")
+    assert not isinstance(raised.value, saving.Damaged)
 
 
 def test_other_files_and_no_file_are_refused_by_name(tmp_path):

@@ -112,7 +112,12 @@ def test_a_run_that_is_overwritten_leaves_nothing_of_the_one_before(here, capsys
 def test_a_run_of_version_0_1_is_named_and_left_as_it_is(here, capsys):
     put(here, run__config_yaml="seed: 1\n", run__checkpoints__000000000005__manifest_json="{}")
     before = tree(here)
-    for command in (["train", *SHORT, "--run.dir=run", "--run.overwrite"], ["evaluate", "run"]):
+    for command in (
+        ["train", *SHORT, "--run.dir=run", "--run.overwrite"],
+        ["train", "--resume", "run"],
+        ["evaluate", "run"],
+        ["report", "run"],
+    ):
         assert main(command) == 2
         assert "a run of version 0.1" in capsys.readouterr().err
     assert tree(here) == before
