@@ -16,7 +16,7 @@ from pgts_torch.agent.episodes import UNLIMITED_LENGTH, Episodes
 from pgts_torch.agent.gaussian import GaussianPolicy, Mean
 from pgts_torch.agent.parts import Parts, make_look
 from pgts_torch.agent.world import ModelWorld, World
-from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.errors import PgtsError, check_count, failure
 from pgts_torch.models.environments import EnvSource, close_environments
 from pgts_torch.models.masks import Masked
 from pgts_torch.models.wrappers import wrappers_of
@@ -252,11 +252,13 @@ class _Twin:
             )
 
     def picture(self) -> Any:
-        """What the environment renders; NoPicture where it cannot."""
+        """What the environment renders; NoPicture where it cannot, and PgtsError where it fails."""
         try:
             made: Any = self.env.render()
         except (gymnasium.error.Error, ImportError) as error:
             raise NoPicture(f"{self._name} cannot be drawn: {error}") from error
+        except Exception as error:
+            raise failure(f"{self._name} failed in render", error) from error
         if isinstance(made, list) and made:
             made = made[-1]
         if self._mode == "ansi":

@@ -307,6 +307,19 @@ def test_an_environment_that_cannot_be_drawn_is_refused_in_a_sentence_and_leaves
     assert (tmp_path / "film.gif").read_bytes()[:4] == b"GIF8"
 
 
+class Broken(Drawn):
+    """It cannot render."""
+
+    def render(self):
+        raise ZeroDivisionError("no pixels")
+
+
+def test_an_error_of_render_names_the_environment(tmp_path):
+    model = PGTS(lambda: TimeLimit(Broken("rgb_array"), 10), policy="mlp", depth=1, **SHORT)
+    with pytest.raises(PgtsError, match=r"failed in render: ZeroDivisionError: no pixels"):
+        model.record(tmp_path / "film.gif")
+
+
 class Fickle(Drawn):
     """Two instances of it do not do the same."""
 
