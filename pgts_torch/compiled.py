@@ -26,7 +26,7 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 SWITCH = "PGTS_COMPILED"
 """The environment variable that is 0 where nothing is to be compiled; a process reads it once."""
 
-_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 _LITTLE = 256
 """Work on fewer numbers takes less time than loading numba."""
@@ -79,7 +79,7 @@ def inlined(function: _Function) -> _Function:
     """The function, which becomes a part of those that call it: they are marked with `jit`, see there."""
     import numba
 
-    inside = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, **_OPTIONS)
+    inside = numba.njit(forceinline=True, no_cpython_wrapper=True, _nrt=False, **_OPTIONS)
     machine_code: _Function = inside(inspect.unwrap(function))
     return machine_code
 
