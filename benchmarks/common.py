@@ -74,22 +74,24 @@ def unmerged_nodes(mdp: TabularMDP, root: int, expansions: int) -> float:
     return nodes
 
 
-def take_turns(
-    forms: dict[str, Form], repeats: int, clock: Callable[[], float] = time.perf_counter
-) -> dict[str, list[float]]:
+def take_turns(forms: dict[str, Form], repeats: int) -> dict[str, list[float]]:
     """Milliseconds of each form in each repeat; a first repeat, in which caches fill, does not count."""
-    rounds = [{name: milliseconds(form, clock) for name, form in forms.items()} for _ in range(repeats + 1)]
+    rounds = [{name: milliseconds(form) for name, form in forms.items()} for _ in range(repeats + 1)]
     return {name: [times[name] for times in rounds[1:]] for name in forms}
 
 
-def milliseconds(form: Form, clock: Callable[[], float] = time.perf_counter) -> float:
-    """One call of the form, the mean of as many as fill `SECONDS`."""
+def milliseconds(form: Form) -> float:
+    """CPU time of one call of the form, which other work of the machine hardly changes, or with a GPU wall time; the
+    mean of as many as fill `SECONDS`."""
+    clock = time.perf_counter if torch.cuda.is_initialized() else time.process_time
     calls, begin, end = 0, clock(), 0.0
     while end < begin + SECONDS:
-        form()
+        for _ in range(max(1, calls)):  # to read the clock takes a while too
+            form()
+            calls += 1
         if torch.cuda.is_initialized():
             torch.cuda.synchronize()
-        calls, end = calls + 1, clock()
+        end = clock()
     return (end - begin) / calls * 1e3
 
 

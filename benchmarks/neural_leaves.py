@@ -14,7 +14,6 @@ CPU time of one thread on one core for both sides, all forms in turns.
 import functools
 import math
 import statistics
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -132,7 +131,7 @@ def neural_leaves(repeats: int) -> dict[str, Any]:
     }
     peers = {f"mctx, {policy}": peer_search(critic, root_BD, policy) for policy in POLICIES}
     forms |= {name: peer for name, peer in peers.items() if peer}
-    times = take_turns(forms, repeats, time.process_time)
+    times = take_turns(forms, repeats)
     return {
         "critic_calls": found.critic_calls,
         "critic_rows": rows,

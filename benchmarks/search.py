@@ -11,13 +11,18 @@
 5. Depth 1 to 64 from one root: nodes, model calls and time with merging, and without it as far as that fits.
 6. DeepSea(50): deeper and deeper from the start until another action looks best than at depth 0.
 7. One sweep over 10^6 nodes, on a GPU also over 10^7: which share of the memory bandwidth it reaches.
+8. The first search of a process, numba imported: where loops are compiled, and where they are found on disk.
 
-One thread on one core for both sides, and with --device cuda one GPU; there a tree search of fixed shape is also held
-by a CUDA graph. Each time is the median of several repeats in which all forms take turns, and a
-ratio is the median of theirs. Without mctx (the extra `bench`) the peer's lines are missing.
+CPU time of one thread on one core for both sides, and with --device cuda wall time with one GPU; there a tree search of
+fixed shape is also held by a CUDA graph. Each time is the median of several repeats in which all forms take turns, and
+a ratio is the median of theirs. Without mctx (the extra `bench`) the peer's lines are missing.
 """
 
+import os
 import statistics
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -239,6 +244,40 @@ def print_bandwidth(rows: list[dict[str, Any]]) -> None:
     print("MB: what a sweep must move at least. share: time of a copy that moves as much to this.")
 
 
+FIRST = """
+import time, torch, numba
+from pgts_torch.models import TabularModel
+from pgts_torch.search import expectimax, mcts
+from pgts_torch.tabular import grid
+model, v_S = TabularModel(grid()), torch.zeros(100, dtype=torch.float64)
+begin = time.process_time()
+{search}(model, torch.arange(100), depth=8, v_leaf=lambda state_N: v_S[state_N]{options})
+print(time.process_time() - begin)
+"""
+
+
+def first_searches() -> dict[str, list[float]]:
+    """CPU seconds of the first search of a process that compiles, and of the next process."""
+    kinds = {
+        "expectimax": ("expectimax", ""),
+        "mcts, tree": ("mcts", ", simulations=64"),
+        "mcts, merged": ("mcts", ", simulations=64, merge=True"),
+    }
+    answer = {}
+    for kind, (search, options) in kinds.items():
+        with tempfile.TemporaryDirectory() as folder:
+            command = sys.executable, "-c", FIRST.format(search=search, options=options)
+            given: dict[str, Any] = {"env": os.environ | {"NUMBA_CACHE_DIR": folder}, "text": True}
+            answer[kind] = [float(subprocess.check_output(command, **given)) for _ in range(2)]
+    return answer
+
+
+def print_first_searches(rows: dict[str, list[float]]) -> None:
+    print(f"\n{'The first search of a process':<32}{'compiles, s':>12}{'from disk, s':>14}")
+    for kind, (compiles, reads) in rows.items():
+        print(f"{kind:<32}{compiles:>12.2f}{reads:>14.2f}")
+
+
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("--repeats", type=int, help="turns that each form takes; default 15")
@@ -264,6 +303,9 @@ def main() -> None:
     sizes = (10**5,) if args.quick else (10**6, 10**7) if device.startswith("cuda") else (10**6,)
     report["bandwidth"] = [row for num_nodes in sizes for row in bandwidth(few, device, num_nodes)]
     print_bandwidth(report["bandwidth"])
+    if device == "cpu":
+        report["first_searches"] = first_searches()
+        print_first_searches(report["first_searches"])
     write(report, args.json)
 
 
