@@ -11,6 +11,7 @@ from pgts_torch.tabular.zoo import (
     mirage,
     random_mdp,
     river_swim,
+    roundabout,
     tightrope,
 )
 
@@ -26,6 +27,7 @@ __all__ = [
     "mirage",
     "random_mdp",
     "river_swim",
+    "roundabout",
     "stationary",
     "stationary_sets",
     "tightrope",

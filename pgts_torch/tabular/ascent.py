@@ -13,6 +13,9 @@ from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
 
+_RECORD = 1e-9
+"""By how much, beside 1 or its size, a return must exceed all before it to count as larger."""
+
 
 def centred(
     q_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"], *, rounding: Float[Tensor, ""] | float = 0.0
@@ -132,10 +135,11 @@ def softmax_step(
 
 @dataclass(frozen=True, eq=False)
 class Ascent:
-    """What Algorithm 1 did in K iterations: the return of pi_0 .. pi_K, and pi_K."""
+    """What Algorithm 1 did in K iterations: the return of pi_0 .. pi_K, pi_K, and the depth m at the end."""
 
     J_K: Float[Tensor, "K"]
     pi_SA: Float[Tensor, "S A"]
+    depth: int
 
 
 def ascend(
@@ -146,6 +150,7 @@ def ascend(
     step_size: float,
     iterations: int,
     step: Callable[[Tensor, Tensor, Tensor, float], Tensor] = projected_step,
+    patience: int | None = None,
 ) -> Ascent:
     """Algorithm 1 with exact quantities: only states with d^pi(s) > 0 move.        [PGTS Alg. 1]
 
@@ -156,18 +161,27 @@ def ascend(
         step_size: eta, finite and at least 0; the same in every iteration.
         iterations: how many updates.
         step: `projected_step` (the paper's, default), `softmax_step` or `mirror_step`.
+        patience: m grows by 1 after so many iterations without a new largest return. With a fixed m the iteration may
+            go round for ever (`zoo.roundabout`); with growing m its returns converge to J*, by projected and by mirror
+            steps, whatever the step size (docs/theory.md, Prop. 18). None: m is fixed.
     """
     if not 0 <= step_size < math.inf:
         raise PgtsError(f"step_size is {step_size}; it must be finite and at least 0")
     check_count("depth", depth, least=0)
+    if patience is not None:
+        check_count("patience", patience)
     pi_SA = exact.check_policy(mdp, pi_SA)
-    returns = []
+    returns, largest, waited = [], -math.inf, 0
     for _ in range(iterations):
         evaluation = exact.evaluate(mdp, pi_SA)
         returns.append(evaluation.J)
+        is_record = evaluation.J > largest + _RECORD * max(1.0, abs(largest))
+        largest, waited = (evaluation.J, 0) if is_record else (largest, waited + 1)
+        if patience is not None and waited >= patience:
+            depth, waited = depth + 1, 0
         look_SA = exact.lookahead(mdp, evaluation.q_SA, depth)
         visited = evaluation.d_S > 0
         pi_SA = pi_SA.clone()
         pi_SA[visited] = step(pi_SA[visited], look_SA[visited], evaluation.d_S[visited], step_size)
     returns.append(exact.evaluate(mdp, pi_SA).J)
-    return Ascent(torch.tensor(returns, dtype=torch.float64), pi_SA)
+    return Ascent(torch.tensor(returns, dtype=torch.float64), pi_SA, depth)

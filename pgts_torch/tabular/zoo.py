@@ -3,6 +3,8 @@
 `start` is a state, a distribution over states, or None for the uniform start distribution.
 """
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Int
@@ -153,6 +155,43 @@ def mirage(width: int = 10, *, delta: float = 0.05, gamma: float = 0.9, start: S
     scattered = [(1 / width, 2 + i, 0.0, False) for i in range(width)]
     P: list[list[list[Transition]]] = [[scattered, [(1.0, 1, 0.0, False)]], [[(1.0, 1, 1.0, False)]] * 2]
     P += [[[(1.0, s, 0.0, False)], [(1.0, s, 1 - delta, False)]] for s in range(2, width + 2)]
+    return TabularMDP.from_transitions(P, gamma, start=start, action_names=LEFT_RIGHT)
+
+
+def roundabout(depth: int = 1, *, cost: float | None = None, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
+    """m + 2 states on which a lookahead of m = depth goes round for ever, though a policy in sight earns 1 a step.
+
+    In state 0 both actions cost `cost`: 'left' leads to state 1, where nothing is earned any more, 'right' to state 2.
+    There 'right' stays and earns 1, and 'left' leads back to state 0, which takes m steps.
+
+    J* = gamma / (1 - gamma) - cost from state 0, by 'right' in every state. To the policy that always goes left state 2
+    looks good; to the one that goes right in state 0 only, and so visits state 2, it looks best there to go back and then
+    left. Each sees the other in state 0, and neither changes state 2 (docs/theory.md, Prop. 16).
+
+    Args:
+        cost: between (1 - gamma^{m+1})^2 / ((1 - gamma) gamma^m (2 gamma^{m+1} - 1)) and
+            (1 - gamma^m) / ((1 - gamma) gamma^{2m}). Default: the middle.
+
+    Raises:
+        PgtsError: there is no such cost, because gamma is too small for the depth, or it is not between the two.
+    """
+    m = check_count("depth", depth)
+    check_gamma(gamma)
+    spare = 2 * gamma ** (m + 1) - 1
+    low = (1 - gamma ** (m + 1)) ** 2 / ((1 - gamma) * gamma**m * spare) if spare > 0 and gamma < 1 else math.inf
+    high = (1 - gamma**m) / ((1 - gamma) * gamma ** (2 * m)) if 0 < gamma < 1 else 0.0
+    if not low < high:
+        raise PgtsError(f"gamma is {gamma}; with depth {m} nothing goes round there: take one nearer to 1")
+    cost = (low + high) / 2 if cost is None else cost
+    if not low < cost < high:
+        raise PgtsError(f"cost is {cost}; with depth {m} and gamma {gamma} it must be above {low:.6g} and below {high:.6g}")
+    chain = [*range(3, m + 2), 0]
+    P: list[list[list[Transition]]] = [
+        [[(1.0, 1, -cost, False)], [(1.0, 2, -cost, False)]],
+        [[(1.0, 1, 0.0, False)]] * 2,
+        [[(1.0, chain[0], 0.0, False)], [(1.0, 2, 1.0, False)]],
+        *([[(1.0, s, 0.0, False)]] * 2 for s in chain[1:]),
+    ]
     return TabularMDP.from_transitions(P, gamma, start=start, action_names=LEFT_RIGHT)
 
 
