@@ -46,7 +46,7 @@ def is_stationary(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int, *, t
     return bool((gap(mdp, pi_SA, depth) <= tolerance).all())
 
 
-# How bad a stationary policy can be: bounds on J* - J^pi that hold forevery pi in Pi^m
+# How bad a stationary policy can be: bounds on J* - J^pi that hold for every pi in Pi^m
 
 
 def closed_form_bound(mdp: TabularMDP, depth: int) -> float:
@@ -103,7 +103,32 @@ def worst_case_bound(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int) -
     of `worst_policy` it bounds every policy in Pi^m.
     """
     lack_S = (exact.optimal(mdp).v_S - exact.policy_values(mdp, pi_SA)).clamp(min=0)
-    free = replace(mdp.outcomes, reward_NA=torch.zeros_like(mdp.outcomes.reward_NA))
+    return _behind(mdp, lack_S, depth)
+
+
+def gap_bound(
+    mdp: TabularMDP, pi_SA: Float[Tensor, "S A"], depth: int, *, lack_S: Float[Tensor, "S"] | None = None
+) -> float:
+    """An upper bound on J* - J^pi, for any pi, from its gap at the start states (docs/theory.md, Prop. 12).
+
+        J* - J^pi <= mu^T g_m + mu^T U^{m+1} x,        x >= v* - v^pi
+
+    What a lookahead of m = depth sees, and what may lie behind it. `worst_case_bound` is the second term with x = v* -
+    v^pi; it is all for pi in Pi^m.
+
+    Args:
+        lack_S: x. Default: what is known without v*, w - v^pi with w = `highest_value`; then `certificate` is no larger.
+    """
+    v_S = exact.policy_values(mdp, pi_SA)
+    if lack_S is None:
+        lack_S = highest_value(mdp.outcomes) - v_S
+    return float(mdp.start_S @ gap(mdp, pi_SA, depth)) + _behind(mdp, lack_S, depth)
+
+
+def _behind(mdp: TabularMDP, lack_S: Float[Tensor, "S"], depth: int) -> float:
+    """mu^T U^{m+1} x, with x what is lacking after m + 1 steps."""
+    legal_NA = mdp.outcomes.legal_NA
+    free = replace(mdp.outcomes, reward_NA=torch.where(legal_NA, 0.0, -math.inf).to(mdp.outcomes.reward_NA))
     return float(mdp.start_S @ sweep(free, lack_S, check_count("depth", depth, least=0) + 1))
 
 

@@ -165,8 +165,8 @@ def roundabout(depth: int = 1, *, cost: float | None = None, gamma: float = 0.9,
     There 'right' stays and earns 1, and 'left' leads back to state 0, which takes m steps.
 
     J* = gamma / (1 - gamma) - cost from state 0, by 'right' in every state. To the policy that always goes left state 2
-    looks good; to the one that goes right in state 0 only, and so visits state 2, it looks best there to go back and then
-    left. Each sees the other in state 0, and neither changes state 2 (docs/theory.md, Prop. 16).
+    looks good; to the one that goes right in state 0 only, and so visits state 2, it looks best there to go back and
+    then left. Each prefers the other in state 0, and neither changes state 2 (docs/theory.md, Prop. 16).
 
     Args:
         cost: between (1 - gamma^{m+1})^2 / ((1 - gamma) gamma^m (2 gamma^{m+1} - 1)) and
@@ -184,7 +184,9 @@ def roundabout(depth: int = 1, *, cost: float | None = None, gamma: float = 0.9,
         raise PgtsError(f"gamma is {gamma}; with depth {m} nothing goes round there: take one nearer to 1")
     cost = (low + high) / 2 if cost is None else cost
     if not low < cost < high:
-        raise PgtsError(f"cost is {cost}; with depth {m} and gamma {gamma} it must be above {low:.6g} and below {high:.6g}")
+        raise PgtsError(
+            f"cost is {cost}; with depth {m} and gamma {gamma} it must be above {low:.6g} and below {high:.6g}"
+        )
     chain = [*range(3, m + 2), 0]
     P: list[list[list[Transition]]] = [
         [[(1.0, 1, -cost, False)], [(1.0, 2, -cost, False)]],

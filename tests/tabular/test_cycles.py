@@ -1,4 +1,4 @@
-"""Whether Algorithm 1 comes to rest: MDPs on which it goes round for ever, in exact fractions, and what excludes that."""
+"""Whether Algorithm 1 comes to rest: MDPs on which it goes round for ever, in fractions, and what excludes that."""
 
 import itertools
 from fractions import Fraction
@@ -15,6 +15,8 @@ from tests.support import always, random_policy
 from tests.tabular.brute import EXACT, family
 
 LEFT, RIGHT = 0, 1
+
+
 def floored_mirror_step(pi_NA, q_NA, weight_N, step_size):
     """A mirror step as training takes it: no probability falls below about exp(-12), and so none is rounded to 0."""
     best_NA = q_NA - q_NA.amax(-1, keepdim=True)
@@ -171,16 +173,14 @@ def test_at_depth_0_no_step_of_any_size_lowers_the_value_of_any_state():
         for step, step_size in itertools.product((projected_step, mirror_step), (0.1, 10.0)):
             before, policy_SA = exact.policy_values(case.mdp, pi_SA), pi_SA
             for _ in range(5):
-                policy_SA = ascend(
-                    case.mdp, policy_SA, depth=0, step_size=step_size, iterations=1, step=step
-                ).pi_SA
+                policy_SA = ascend(case.mdp, policy_SA, depth=0, step_size=step_size, iterations=1, step=step).pi_SA
                 after = exact.policy_values(case.mdp, policy_SA)
                 assert bool((after >= before - 1e-9).all())
                 before = after
 
 
 def deep_enough(case) -> int:
-    """The first m with gamma^{m+1} max_s (v* - v_min)(s) < Delta, the smallest lack of an action that is not optimal."""
+    """The first m with gamma^{m+1} max_s (v* - v_min)(s) < Delta: what the best action lacks that is not optimal."""
     v_S, low_S = case.v_PS.max(0), case.v_PS.min(0)
     optimum = exact.optimal(case.mdp)
     lack_SA = (optimum.v_S[:, None] - optimum.q_SA).numpy()
@@ -199,7 +199,9 @@ def test_from_some_depth_on_as_many_iterations_as_states_suffice():
         start_SA = case.pi_SA(int(numpy_stream(seed, "start").integers(len(case.J_P))))
         end = ascend(case.mdp, start_SA, depth=depth, step_size=1e12, iterations=S)
         assert float(end.J_K[-1]) >= case.J_P.max() - 1e-7
-        slower += float(ascend(case.mdp, start_SA, depth=0, step_size=1e12, iterations=S).J_K[-1]) < case.J_P.max() - 1e-7
+        slower += (
+            float(ascend(case.mdp, start_SA, depth=0, step_size=1e12, iterations=S).J_K[-1]) < case.J_P.max() - 1e-7
+        )
         depths.append(depth)
     assert slower > 5, "at depth 0 they do not"
     assert max(depths) > 20
