@@ -105,19 +105,18 @@ def rounds(
     is_weighted: bool,
 ) -> bool:
     """Whether the return still rises and falls in the second half; `right_S` is moved."""
-    rises = falls = 0
-    edge, last = 0.0, 0.0
+    turns, edge, direction = 0, 0.0, 0
     for k in range(ITERATIONS):
         v_S, d_S = evaluate(child_SA, reward_SA, right_S, gamma)
         J = v_S[0]
+        # `edge` is the best return of a rise so far, or the worst of a fall, from which a turn is measured.
         if k == ITERATIONS // 2:
-            edge = last = J
-        if k > ITERATIONS // 2:  # `edge` is the last turn, from which a rise or a fall is measured
-            if J > edge + LEAST and J > last:
-                rises, edge = rises + 1, J
-            elif J < edge - LEAST and J < last:
-                falls, edge = falls + 1, J
-            last = J
+            edge = J
+        elif k > ITERATIONS // 2:
+            if direction * (J - edge) > 0:
+                edge = J
+            elif abs(J - edge) > LEAST:
+                turns, edge, direction = turns + 1, J, 1 if J > edge else -1
         q_SA = look_ahead(child_SA, reward_SA, v_S, gamma, depth)
         moved = 0.0
         for s in range(len(right_S)):
@@ -135,7 +134,7 @@ def rounds(
             moved = max(moved, abs(right_S[s] - before))
         if moved < 1e-9:
             return False
-    return rises >= 2 and falls >= 2
+    return turns >= 4
 
 
 Tables = Iterator[tuple[np.ndarray, np.ndarray]]

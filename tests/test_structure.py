@@ -214,6 +214,7 @@ def documented(tree: ast.Module, prefix: str) -> Iterator[tuple[str, str | None]
 
 
 def rows_of(text: str) -> list[Row]:
+    """The rows of the one table of a text."""
     table = [line for line in text.splitlines() if line.startswith("|")]
     cells = [[cell.strip().strip("`") for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in table]
     return [Row(*line) for line in cells[2:]]
@@ -228,8 +229,14 @@ def cited_in_docstrings() -> set[tuple[str, str]]:
     return {(citation, name) for name, text in docstrings().items() for citation in citations(text)}
 
 
+def tables() -> tuple[str, str]:
+    """What is cited from the paper, and results of our own."""
+    paper, own = (ROOT / "docs" / "equations.md").read_text().split("## Results of our own")
+    return paper, own
+
+
 def listed_rows() -> list[Row]:
-    return rows_of((ROOT / "docs" / "equations.md").read_text())
+    return rows_of(tables()[0])
 
 
 def test_every_citation_in_a_docstring_is_in_the_list():
@@ -240,8 +247,19 @@ def test_every_row_of_the_list_names_a_function_that_carries_the_citation():
     assert {(row.citation, row.function) for row in listed_rows()} - cited_in_docstrings() == set()
 
 
-def test_every_row_of_the_list_names_a_test_that_exists():
-    for row in listed_rows():
+def test_every_result_of_our_own_names_a_function_that_cites_its_proof():
+    proved = set(
+        re.findall(r"^\*\*(?:Proposition|Corollary) (\d+)", (ROOT / "docs/theory.md").read_text(), re.MULTILINE)
+    )
+    for row in rows_of(tables()[1]):
+        kind, number = row.citation.split()
+        assert number in proved, row
+        text = re.sub(r"\s+", " ", docstrings()[row.function] or "")
+        assert re.search(rf"docs/theory\.md, {re.escape(kind)} {number}\b", text), row
+
+
+def test_every_row_of_the_lists_names_a_test_that_exists():
+    for row in [*listed_rows(), *rows_of(tables()[1])]:
         file, _, test = row.test.partition("::")
         tree = ast.parse((ROOT / file).read_text())
         assert test in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, row

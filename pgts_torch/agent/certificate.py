@@ -235,6 +235,35 @@ class Certificates:
         certificate = self._sum(prob_N @ (swept_N - v_N).abs()) + width
         return Bound(certificate if certificate < span else math.inf, gap)
 
+    def gap_bound(self, starts: _Starts, roots: Roots, look: Lookahead, depth: int, number: int) -> float:
+        """An estimate of an upper bound on J* - J^pi for any search, from the gap alone [docs/theory.md, Prop. 13]
+
+            sum_s mu(s) min( max_a [ upper end of q(s, a) ] + (gamma^n + pruned(s)) (w - l) - v(s),  w - v(s) )
+
+        with the upper end of `Lookahead.interval`; w - v(s) where this iteration has not looked ahead from s. It is
+        what is seen, and what may lie behind the n expanded levels or what was pruned. It leaves out by how much v
+        exceeds v^pi, which a run does not know, and adds the confidence term where starts are sampled. Infinite where
+        values have no known range, and where it is no smaller than the mean of w - v(s).
+
+        Args: those of `bound`.
+        """
+        state_N, prob_N, v_N, num_episodes = starts
+        model, is_known = self._search.model, self._world.start_S is not None
+        w, span = model.highest_value, model.highest_value - model.lowest_value
+        if v_N is None or not math.isfinite(span) or not (is_known or self._samples_starts):
+            return math.inf
+        upper_N = torch.full_like(v_N, w)
+        if len(roots.state_N):
+            pruned_BA = torch.where(look.q_BA > -math.inf, look.pruned_BA, 0.0)
+            unseen_B = self._world.gamma ** (depth + (self._critic.target == "v")) + pruned_BA.amax(-1).double()
+            most_B = (look.interval()[1].amax(-1).double() + unseen_B * span).nan_to_num(math.inf).clamp(max=w)
+            row_N = torch.searchsorted(roots.state_N, state_N).clamp(max=len(roots.state_N) - 1)
+            upper_N = torch.where(roots.state_N[row_N] == state_N, most_B[row_N], upper_N)
+        if self._world.keeps_numbers:
+            upper_N = self._ranks.least("upper ends", upper_N)
+        bound = self._sum(prob_N @ (upper_N - v_N)) + (0.0 if is_known else self.width(num_episodes, number))
+        return bound if bound < self._sum(prob_N @ (w - v_N)) else math.inf
+
     def _sum(self, missing: Tensor) -> float:
         """What is missing at all start states, from that at those of this process."""
         return float(missing) if self._world.keeps_numbers else self._ranks.totals("starts", missing)[0]

@@ -1,5 +1,6 @@
 """The choice of the lookahead's depth in an iteration: fixed, or the smallest that improves the policy enough."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, final
 
@@ -23,6 +24,7 @@ class Chosen(NamedTuple):
     look: (T^m Q)(s, .) at the visited states.
     gap_N: max_a (T^m Q)(s, a) - v(s) >= 0 there.
     certificate: an upper bound on J* - J^pi.
+    gap_bound: an estimate of one from the gap, where there is no certificate; else infinite.
     is_enough: whether the certificate is at most `stop_at`, so that the policy needs no further update.
     """
 
@@ -30,6 +32,7 @@ class Chosen(NamedTuple):
     look: Lookahead
     gap_N: Float[Tensor, "N"]
     certificate: float
+    gap_bound: float
     is_enough: bool
 
 
@@ -93,4 +96,7 @@ class DepthChoice:
             [gap] = ranks.totals("gap", gap_N.double() @ roots.occupancy_N)
             if gap > self.tolerance * bound.visited:
                 break
-        return Chosen(depth, look, gap_N, bound.certificate, is_enough)
+        estimate = math.inf
+        if math.isinf(bound.certificate):
+            estimate = self._certificates.gap_bound(starts, roots, look, depth, draws.number + 1)
+        return Chosen(depth, look, gap_N, bound.certificate, estimate, is_enough)

@@ -110,6 +110,8 @@ def metrics(parts: Parts, iteration: Iteration, counters: Counters) -> dict[str,
             "search/certificate": iteration.certificate,
             "search/proved": float(parts.certificates is not None and parts.certificates.trust == "proved"),
         }
+        if iteration.gap_bound < math.inf:
+            tags["search/gap_bound"] = iteration.gap_bound
         if iteration.posterior is not None:
             tags["search/certificate_posterior"] = iteration.posterior
         if iteration.look.doubt_BA is not None:

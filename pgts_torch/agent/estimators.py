@@ -152,5 +152,6 @@ class SampledEstimator(Estimator):
             look=None,
             gap_N=torch.full_like(weight_N, torch.nan),
             certificate=math.inf,
+            gap_bound=math.inf,
             is_enough=False,
         )

@@ -52,6 +52,8 @@ class PolicyBatch(Batch):
         proof only if the start distribution is known, the critic exact and the model the environment; else it holds up
         to the critic's error at the start states, and with 95 % confidence where these are sampled. Infinite where the
         model has no `highest_value`, the search samples outcomes, or there are too few episodes.
+    gap_bound: an estimate of an upper bound from the gap (`Certificates.gap_bound`), where there is no certificate;
+        else infinite.
     is_enough: whether the certificate is at most `stop_at`: then pi_k is not updated, and training ends.
     """
 
@@ -61,6 +63,7 @@ class PolicyBatch(Batch):
     look: Lookahead | None
     gap_N: Float[Tensor, "N"]
     certificate: float
+    gap_bound: float
     is_enough: bool
 
 

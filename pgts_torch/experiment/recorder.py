@@ -187,6 +187,7 @@ class Recorder:
             J_optimal=J_optimal,
             stationarity_gap=gap,
             **self._certified(),
+            gap_bound=None if self._last is None or math.isinf(self._last.gap_bound) else self._last.gap_bound,
             ended_by=self.progress.ended_by,
             iterations=algorithm.num_iterations,
             env_steps=algorithm.num_env_steps,

@@ -33,6 +33,8 @@ class Summary:
     certificate_confidence: 1 where all start states are known; else the probability that all certificates of the run
         hold, over the sampled start states and up to the critic's error; from counts, the posterior probability that
         this one holds. None: there is no certificate.
+    gap_bound: an estimate of an upper bound on J* - J^pi from the gap of the last iteration, where there is no
+        certificate (`Certificates.gap_bound`); None: there is none.
     ended_by: why training ended: the certificate is at most `search.stop_at`, greedy episodes return at least
         `eval.stop_at_return`, or `total_steps` are done.
     notes: advice to the user where the run learned little (`experiment.advice`).
@@ -56,6 +58,7 @@ class Summary:
     certificate: float | None = None
     certificate_trust: Trust | None = None
     certificate_confidence: float | None = None
+    gap_bound: float | None = None
     notes: tuple[str, ...] = ()
     parts: str = ""
 
@@ -116,6 +119,8 @@ def rows(summary: Summary) -> dict[str, str]:
         }
     if summary.certificate is not None:
         rows["certificate, J* - J <="] = f"{summary.certificate:.3g} ({_trust_text(summary)})"
+    elif summary.gap_bound is not None:
+        rows["from the gap, J* - J <="] = f"{summary.gap_bound:.3g} (an estimate, no certificate)"
     ended = _ENDINGS[summary.ended_by]
     if summary.ended_by == "certificate" and summary.certificate_trust != "proved":
         ended = "an estimated certificate: it is at search.stop_at"

@@ -117,7 +117,8 @@ def gap_bound(
     v^pi; it is all for pi in Pi^m.
 
     Args:
-        lack_S: x. Default: what is known without v*, w - v^pi with w = `highest_value`; then `certificate` is no larger.
+        lack_S: x. Default: w - v^pi with w = `highest_value`, for which v* need not be known; `certificate` is no
+            larger then.
     """
     v_S = exact.policy_values(mdp, pi_SA)
     if lack_S is None:

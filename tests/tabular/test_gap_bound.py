@@ -163,7 +163,7 @@ def test_what_was_pruned_is_lacking_where_it_was_pruned():
 @fast
 def test_a_sampled_lookahead_bounds_what_is_lacking_as_often_as_it_says():
     missed, idle, samples, low, high = 0, 0, 8, 0.0, 2.0
-    for seed in range(200):
+    for seed in range(80):
         mdp = random_mdp(5, 2, branching=2, reward_share=0.5, gamma=0.5, seed=seed)
         v_S, best_S, depth = exact.policy_values(mdp, random_policy(mdp, seed)), exact.optimal(mdp).v_S, 2
         look = sampled(
@@ -172,7 +172,7 @@ def test_a_sampled_lookahead_bounds_what_is_lacking_as_often_as_it_says():
             depth=depth,
             v_leaf=lambda s: v_S[s],  # noqa: B023
             samples=samples,
-            replicates=1,
+            replicates=2,
             generator=stream(seed, "sampled"),
         )
         pairs = 2 * sum(look.nodes_per_level[:-1])
@@ -180,5 +180,5 @@ def test_a_sampled_lookahead_bounds_what_is_lacking_as_often_as_it_says():
         seen = float(look.q_BA.max()) + 0.5 ** (depth + 1) * float((best_S - v_S).max())
         missed += float(best_S[0]) > seen + error * (1 + 0.5 + 0.25) + 1e-9
         idle += float(best_S[0]) > seen + 1e-9
-    assert missed <= 100
-    assert idle > 5, "without the error of samples it is no bound"
+    assert missed <= 40
+    assert idle > 2, "without the error of samples it is no bound"

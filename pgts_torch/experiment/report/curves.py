@@ -14,6 +14,7 @@ SHARED = {
     MISSING: {
         "exact/optimality_gap": "J* \N{MINUS SIGN} J, exact",
         "search/certificate": "certificate",
+        "search/gap_bound": "estimate from the gap",
         "search/stationarity_gap": "stationarity gap",
     },
     "Return of episodes": {
@@ -36,7 +37,7 @@ INTERVAL = "_half_width"
 INK, GREY = "#010203", "#8a8a8a"
 """The colours of text, replaced by a light one on dark pages, and of axes and grid."""
 
-COLOURS, WIDTHS = ("#2b7bba", "#e07b18", "#3a9a5b"), (2.8, 1.8, 1.2)
+COLOURS, WIDTHS = ("#2b7bba", "#e07b18", "#3a9a5b", "#8e5aa8"), (3.8, 2.8, 1.8, 1.2)
 """Later curves are thinner and on top, so that curves that coincide stay visible."""
 
 

@@ -22,6 +22,7 @@ PROGRESS = {
     "exact/J": "return of the policy, J",
     "search/stationarity_gap": "stationarity gap",
     "search/certificate": "certificate, J* - J <=",
+    "search/gap_bound": "estimate from the gap, J* - J <=",
     "charts/episodic_return": "return of episodes",
 }
 """The values of the last iteration that are reported for an unfinished run."""
