@@ -5,5 +5,5 @@
 Each part computes plain data; pictures and the document are made from the data alone.
 """
 
-PARTS = ("ladder", "random", "tightrope", "grid", "stationary", "depth")
+PARTS = ("ladder", "random", "tightrope", "grid", "stationary", "depth", "bounds")
 """In the order of the document."""

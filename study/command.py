@@ -13,7 +13,7 @@ import torch
 
 from pgts_torch import files
 from pgts_torch.errors import PgtsError
-from study import PARTS, depth, figure, grid, ladder, random_mdp, sets, tightrope
+from study import PARTS, bounds, depth, figure, grid, ladder, random_mdp, sets, tightrope
 from study.document import claim_rows, document, is_document
 from study.drawing import pictures
 from study.figure import Effort, Report
@@ -25,7 +25,7 @@ DOTS_PER_INCH = 110
 WIDTH = 79
 
 CURVES = {one.FIGURE.name: one.FIGURE for one in (ladder, random_mdp, tightrope, grid)}
-OTHERS = {"stationary": sets.compute, "depth": depth.compute}
+OTHERS = {"stationary": sets.compute, "depth": depth.compute, "bounds": bounds.compute}
 
 
 def run(*, only: str | None, effort: Effort, out: Path) -> dict[str, Any]:

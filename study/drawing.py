@@ -28,6 +28,7 @@ UPDATE_TITLES = {"projected": "simplex policy, projected update", "softmax": "so
 def pictures(part: str) -> Mapping[str, Callable[[Data], Figure]]:
     """What draws the pictures of a part from its data, by file name without its ending."""
     several = {"depth": {"depth": depth_maps, "mirage": mirage_curves}, "stationary": {"stationary": sufficient_depths}}
+    several["bounds"] = {"bounds": bounds_over_training}
     return several.get(part, {part: curves})
 
 
@@ -144,6 +145,40 @@ def mirage_curves(data: Data) -> Figure:
     right.legend(frameon=False, fontsize=9)
     for ax in (left, right):
         ax.grid(alpha=0.25)
+    return figure
+
+
+def bounds_over_training(data: Data) -> Figure:
+    """For each MDP: what is lacking and the measured bounds over the training, and bounds over depth at its end."""
+    figure = Figure(figsize=(11, 3.1 * len(data["mdps"])), layout="constrained")
+    axes = figure.subplots(len(data["mdps"]), 2, squeeze=False)
+    colours = depth_colours(data["shown"])
+    kinds = {"true": "true values behind it", "known": "range of values", "measured": "and with errors"}
+    for (name, found), (left, right) in zip(data["mdps"].items(), axes, strict=True):
+        rows, last = found["rows"], found["rows"][-1]
+        iterations = [row["iteration"] for row in rows]
+        left.plot(iterations, [row["lacks"] for row in rows], color="k", linewidth=2.2, label="J* \N{MINUS SIGN} J")
+        for depth, colour in colours.items():
+            place = data["depths"].index(depth)
+            values = [row["measured"][place] for row in rows]
+            left.plot(iterations, values, color=colour, linewidth=1.6, label=f"bound, m = {depth}")
+        left.set_title(f"{name}: bounds with errors, over a training", fontsize=10)
+        left.set_xlabel(f"iteration (depth {found['training_depth']})")
+        for (kind, label), colour in zip(kinds.items(), ("#3a9a5b", "#2b7bba", "#e07b18"), strict=True):
+            values = last[kind]
+            right.plot(data["depths"], values, color=colour, linewidth=1.6, label=label)
+            best = found["best"][kind]
+            right.plot(best, values[data["depths"].index(best)], "o", color=colour, markersize=5)
+        right.axhline(last["lacks"], color="k", linestyle=":", linewidth=1.2, label="J* \N{MINUS SIGN} J")
+        right.set_title(f"{name}: bounds on the last policy, over depth", fontsize=10)
+        right.set_xlabel("depth m")
+        for ax in (left, right):
+            ax.set_yscale("symlog", linthresh=1e-2 * max(last["known"]))
+            ax.set_ylim(bottom=0)
+            ax.set_ylabel("return")
+            ax.grid(alpha=0.25)
+    for ax, place in zip(axes[0], ("lower right", "upper right"), strict=True):
+        ax.legend(frameon=False, fontsize=8, ncols=2, loc=place)  # for all rows
     return figure
 
 
