@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.experiment.diagnostics import metrics
+from pgts_torch.agent.diagnostics import metrics
 from pgts_torch.tabular import exact, ladder, stationary
 from tests.agent.helpers import vector_env
 from tests.agent.test_certificate import random_case
@@ -54,7 +54,7 @@ def test_the_estimate_is_what_the_formula_says(target):
     iteration = model.iterate()
     unseen = 0.9 ** (3 + (target == "v"))
     assert iteration.gap_bound == pytest.approx(unseen * 10)
-    assert metrics(model, iteration)["search/gap_bound"] == iteration.gap_bound
+    assert metrics(model.parts, iteration, model.counters)["search/gap_bound"] == iteration.gap_bound
     assert iteration.gap_bound >= exact.optimal(ladder(5)).J
 
 
@@ -63,7 +63,7 @@ def test_a_certificate_leaves_no_room_for_an_estimate():
     iteration = model.iterate()
     assert iteration.certificate < math.inf
     assert math.isinf(iteration.gap_bound)
-    assert "search/gap_bound" not in metrics(model, iteration)
+    assert "search/gap_bound" not in metrics(model.parts, iteration, model.counters)
 
 
 def test_without_a_range_of_rewards_there_is_no_estimate():
