@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.diagnostics import metrics
+from pgts_torch.agent.pgts import PGTS
 from pgts_torch.tabular import exact, ladder, stationary
 from tests.agent.helpers import vector_env
 from tests.agent.test_certificate import random_case
