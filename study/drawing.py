@@ -164,11 +164,11 @@ def bounds_over_training(data: Data) -> Figure:
             left.plot(iterations, values, color=colour, linewidth=1.6, label=f"bound, m = {depth}")
         left.set_title(f"{name}: bounds with errors, over a training", fontsize=10)
         left.set_xlabel(f"iteration (depth {found['training_depth']})")
-        for (kind, label), colour in zip(kinds.items(), ("#3a9a5b", "#2b7bba", "#e07b18"), strict=True):
+        for (kind, label), ink in zip(kinds.items(), ("#3a9a5b", "#2b7bba", "#e07b18"), strict=True):
             values = last[kind]
-            right.plot(data["depths"], values, color=colour, linewidth=1.6, label=label)
+            right.plot(data["depths"], values, color=ink, linewidth=1.6, label=label)
             best = found["best"][kind]
-            right.plot(best, values[data["depths"].index(best)], "o", color=colour, markersize=5)
+            right.plot(best, values[data["depths"].index(best)], "o", color=ink, markersize=5)
         right.axhline(last["lacks"], color="k", linestyle=":", linewidth=1.2, label="J* \N{MINUS SIGN} J")
         right.set_title(f"{name}: bounds on the last policy, over depth", fontsize=10)
         right.set_xlabel("depth m")
