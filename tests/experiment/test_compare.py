@@ -56,6 +56,22 @@ def test_runs_of_one_configuration_up_to_the_seed_are_one_group_and_labels_say_w
     assert answer["groups"][0]["settings"] == {"search.depth": 0, "update.step_size": None}
 
 
+def test_a_label_has_all_keys_that_differ_where_they_are_few_and_else_those_that_tell_apart(here):
+    own = ("--rollout.num_envs=2", "--search.max_nodes=5", "--search.max_bytes=7")
+    run(Path("runs/a"), "--update.step_size=0.12345", "--update.type=mirror", *own, "--critic.type=exact")
+    run(Path("runs/b"), "--update.step_size=0.12346", "--update.type=mirror", *own)
+    assert [*groups(compared())] == [
+        "critic.type auto, update.step_size 0.1235",
+        "critic.type exact, critic.target v, update.step_size 0.1235",
+    ]
+    run(Path("runs/c"), "--update.step_size=0.12346", "--update.type=mirror")
+    assert [*groups(compared())] == [
+        "critic.type auto, rollout.num_envs 2",
+        "critic.type auto, rollout.num_envs null",
+        "critic.type exact, rollout.num_envs 2",
+    ]
+
+
 def test_what_bears_no_bit_of_a_training_makes_no_group_of_its_own(here):
     run(Path("runs/a"), "--name=a", "--threads=2", "--log.every=2", "--eval.episodes=3", seed=0)
     run(Path("runs/b"), "--name=b", seed=1)

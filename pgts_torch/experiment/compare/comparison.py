@@ -18,6 +18,7 @@ from pgts_torch.experiment.statistics import Mean, bootstrap_interval, estimate,
 from pgts_torch.experiment.statistics import probability_of_improvement as improvement
 
 CURVE_POINTS = 100
+FEW_KEYS = 4
 MOST_GROUPS = 20
 """Of more groups, each is compared with the best one only."""
 
@@ -203,17 +204,21 @@ def _differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _labels(runs: Sequence[Trained]) -> list[str]:
-    """A name for each of several configurations: the first keys by which they can be told apart."""
+    """A name for each of several configurations: the keys in which they differ where these are few, else the first by
+    which they can be told apart."""
     settings = [run.settings for run in runs]
+    differing = sorted(_differing(settings), key=lambda key: key.rpartition(".")[2] not in ("type", "kind"))
     keys: list[str] = []
     told = 1
-    for key in sorted(_differing(settings), key=lambda key: key.rpartition(".")[2] not in ("type", "kind")):
+    for key in differing:
         apart = len({json.dumps([each.get(name, "no such key") for name in (*keys, key)]) for each in settings})
         if apart > told:
             keys, told = [*keys, key], apart
     if not keys:
         return [run.config.name for run in runs]
-    for digits in (4, 17):  # the fewer where they suffice
+    if len(differing) <= FEW_KEYS:
+        keys = differing
+    for digits in (4, 6, 17):  # the fewer where they suffice
         labels = [
             ", ".join(f"{key} {_shown(each[key], digits)}" for key in keys if key in each) or "others"
             for each in settings

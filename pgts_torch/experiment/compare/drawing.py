@@ -32,7 +32,7 @@ def figure(comparison: Comparison) -> Figure:
     rows = math.ceil(len(panels) / columns)
     colours = _colours(comparison)
     labels = {
-        group.letter: f"{group.letter}  {shortened(group.label, 70 if columns > 1 else 45)}"
+        group.letter: f"{group.letter}  {shortened(group.label, 110 if columns > 1 else 92)}"
         for group in comparison.groups
     }
     height = 0.19 * (len(colours) + 1)
