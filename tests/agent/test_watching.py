@@ -21,6 +21,7 @@ from pgts_torch.errors import PgtsError
 from tests.agent.kinds import Corridor
 from tests.agent.masked import LEGAL_SA, ByMethod
 from tests.support import same_values
+from tests.test_documents import PAGES, blocks
 
 SHORT: dict[str, Any] = {"num_envs": 2, "horizon": {"type": "fixed", "length": 6}}
 
@@ -413,3 +414,12 @@ def test_policies_are_evaluated_by_stable_baselines3_as_its_own_are(kind):
     actions, state = model.predict(np.asarray(observation)[None], state="kept", episode_start=np.array([True]))
     assert state == "kept"
     assert len(actions) == 1
+
+
+def test_the_page_evaluates_a_model_by_stable_baselines3_as_printed():
+    pytest.importorskip("stable_baselines3")
+    text = PAGES["docs/start/after_training.md"].read_text(encoding="utf-8")
+    [script] = [block.text for block in blocks(text) if "import evaluate_policy" in block.text]
+    names: dict[str, Any] = {"model": MODELS["dynamics"]()}
+    exec(script, names)
+    assert 5 < names["mean"] <= 500
