@@ -179,7 +179,7 @@ def picture(
             mine = [r for r in records if r["task"] == task and r["method"] == method]
             if not mine:
                 continue
-            x = np.geomspace(FIRST_LOOK, tasks[task].budget, 100)
+            x = np.geomspace(tasks[task].first_look, tasks[task].budget, 100)
             # A run that has ended early stays where it was.
             y = [np.interp(x, *np.array(r["curve"], dtype=float).T) for r in mine]
             axes.plot(x, np.median(y, axis=0), label=name)
@@ -187,7 +187,7 @@ def picture(
         axes.set(title=task, xscale="log")
         if axes.get_ylim()[0] < -1000:  # whoever never falls off the cliff and never arrives
             axes.set_yscale("symlog", linthresh=10)
-    panels[0].legend()
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(methods))
     for axes in panels[len(seen) :]:
         axes.remove()
     figure.supxlabel("environment steps")

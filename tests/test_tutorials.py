@@ -11,12 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 import pytest
 
 TUTORIALS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "docs/tutorials").glob("*.md"))}
 
 SHORT: dict[str, dict[str, Any]] = {
+    "continuous": {"steps": 60, "every": 30, "first": 40},
     "learned_model": {"first": 60, "total": 70},
+    "machines": {"processes": 1, "total_steps": 3_000},
     "puzzle": {"steps": 200, "every": 100},
 }
 """Of the tutorials that take longer: the values that shorten their cell tagged `parameters`, as papermill has them."""
@@ -53,6 +56,19 @@ def certificate(it: Any, out: str) -> None:
     assert len(it.computed) < len(it.bounds)
 
 
+def continuous(it: Any, out: str) -> None:
+    first, *_, last = (each.mean for each in it.watch.history)
+    assert first < last
+    assert last > -400
+    assert it.model.num_model_calls > 1000 * it.model.num_env_steps
+    # Hanging down it pushes with the speed, upright against the angle.
+    slow, down = np.abs(it.speed) < 2, np.abs(it.angle) > 3
+    assert np.corrcoef(it.speed[slow & down], it.torque[slow & down])[0, 1] > 0.3
+    near = (np.abs(it.angle) < 0.5) & (np.abs(it.speed) < 0.5)
+    assert np.corrcoef(it.angle[near], it.torque[near])[0, 1] < -0.3
+    assert np.abs(it.angles[-50:]).mean() < 0.5
+
+
 def inventory(it: Any, out: str) -> None:
     *closed, shop = re.findall(r"rest +(-?[\d.]+) +warm up +(-?[\d.]+)", out)[:2]
     assert all(float(warm) < float(rest) for rest, warm in closed)
@@ -78,6 +94,12 @@ def learned_model(it: Any, out: str) -> None:
     assert it.before < 50 < 400 < it.after
     off = [abs(float(state[0, 2]) - true[2]) for state, true in zip(it.imagined, it.true, strict=True)]
     assert max(off[:5]) < max(off[-5:])
+
+
+def machines(it: Any, out: str) -> None:
+    assert re.findall(r"exit code (\d+)", out) == ["0", "143", "0"]
+    assert it.whole[0]["charts/discounted_return"] < 1 < 6 < it.whole[-1]["charts/discounted_return"]
+    assert it.same is True
 
 
 def paper(it: Any, out: str) -> None:
@@ -106,8 +128,10 @@ def puzzle(it: Any, out: str) -> None:
 
 CLAIMS: dict[str, Callable[[Any, str], None]] = {
     "certificate": certificate,
+    "continuous": continuous,
     "inventory": inventory,
     "learned_model": learned_model,
+    "machines": machines,
     "paper": paper,
     "puzzle": puzzle,
 }
