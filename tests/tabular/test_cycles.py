@@ -248,3 +248,28 @@ def test_patience_leaves_alone_what_still_improves():
     with pytest.raises(PgtsError, match="patience is 0"):
         ascend(ladder(5), always(ladder(5), LEFT), depth=1, step_size=1.0, iterations=1, patience=0)
     assert stationary.is_stationary(ladder(5), always(ladder(5), RIGHT), 4)
+
+
+# Small steps
+
+
+def turns(J_K: torch.Tensor, least: float = 1e-3) -> int:
+    """How often the returns turn from rising to falling or back, each time by more than this."""
+    count, edge, direction = 0, float(J_K[0]), 0
+    for J in J_K.tolist():
+        if direction * (J - edge) > 0:
+            edge = J
+        elif abs(J - edge) > least:
+            count, edge, direction = count + 1, J, 1 if J > edge else -1
+    return count
+
+
+@fast
+def test_by_small_steps_nothing_goes_round_where_two_states_have_a_choice():
+    for depth, gamma in ((1, 0.9), (2, 0.9), (6, 0.97)):
+        mdp = roundabout(depth, gamma=gamma)
+        for seed in range(3):
+            J_K = ascend(mdp, random_policy(mdp, seed), depth=depth, step_size=0.05, iterations=300).J_K
+            assert turns(J_K[100:]) <= 1
+        large = ascend(mdp, always(mdp, LEFT), depth=depth, step_size=100.0, iterations=40).J_K
+        assert turns(large) >= 38, "by large ones it does"
