@@ -83,14 +83,15 @@ def take_turns(forms: dict[str, Form], repeats: int) -> dict[str, list[float]]:
 def milliseconds(form: Form) -> float:
     """CPU time of one call of the form, which other work of the machine hardly changes, or with a GPU wall time; the
     mean of as many as fill `SECONDS`."""
-    clock = time.perf_counter if torch.cuda.is_initialized() else time.process_time
+    on_gpu = torch.cuda.is_initialized()
+    clock = time.perf_counter if on_gpu else time.process_time
     calls, begin, end = 0, clock(), 0.0
     while end < begin + SECONDS:
         for _ in range(max(1, calls)):  # to read the clock takes a while too
             form()
+            if on_gpu:
+                torch.cuda.synchronize()
             calls += 1
-        if torch.cuda.is_initialized():
-            torch.cuda.synchronize()
         end = clock()
     return (end - begin) / calls * 1e3
 
