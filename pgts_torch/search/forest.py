@@ -57,7 +57,7 @@ class Forest:
         self._known = StateRecords(
             topology,
             options,
-            places=bottom + num_roots * (7 * A + 9) + wanted,
+            places=bottom + num_roots * (8 * A + 9) + wanted,
             places_of_state=(bottom + 1) * options.merges,
         )
         self._known.check_memory()

@@ -123,7 +123,7 @@ def search(  # type: ignore[no-untyped-def]
             under_way = 0
             for b in range(B):
                 _refresh(child, node, arm, edge, node_at, rules, b)
-                slot[b].waiting = due(node, arm, slot, lane, rules, preference, b, b, score_A, class_A)
+                slot[b].waiting = due(node, arm, slot, lane, rules, preference, b, b, score_A, class_A, True)
                 under_way += slot[b].waiting
             if under_way == 0:
                 _finish(child, node, arm, edge, node_at, rules, turn[0], q_BA, mass_BA, mass_N)
@@ -134,7 +134,7 @@ def search(  # type: ignore[no-untyped-def]
             turn[5] = 0
         for b in range(turn[2], B):
             while i < slot[b].waiting:
-                root_arm = arm[b, lane[b, i].action]
+                root_arm = arm[b, lane[b, i].first]
                 if root_arm.open == 0:  # other roots have expanded all below it
                     slot[b].used -= 1
                     i += 1
@@ -142,7 +142,7 @@ def search(  # type: ignore[no-untyped-def]
                 # On its way down a simulation brings nodes up to date, so that a second time it may go another way.
                 level, below = level_after - 1, 0
                 if level_after == 0:
-                    level, below = _descend(child, node, arm, edge, path, node_at, rules, b, lane[b, i].action, score_A)
+                    level, below = _descend(child, node, arm, edge, path, node_at, rules, b, lane[b, i].first, score_A)
                 level_after = 0
                 if below == 0:
                     below, y = nodes, path[level]

@@ -141,7 +141,7 @@ def _rank(arm, lane, preference, w, b, n, count, score_A, class_A):  # type: ign
             ):
                 best = a
         class_A[best] = -1
-        lane[w, i].action = best
+        lane[w, i].first = best
 
 
 @inlined
@@ -165,16 +165,26 @@ def _begin_round(slot, rules, w, phase, width):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def due(node, arm, slot, lane, rules, preference, w, n, score_A, class_A):  # type: ignore[no-untyped-def]
-    """Each action of root n that is due gets one of the next simulations, in the order of the first lanes; how many,
-    0 where its search is over."""
+def _go_on(arm, lane, w, n, count):  # type: ignore[no-untyped-def]
+    """Whether so many of the first lanes have actions that are left and not exhausted."""
+    for i in range(count):
+        a = lane[w, i].first
+        if lane[w, a].survives == 0 or arm[n, a].open == 0:
+            return False
+    return True
+
+
+@inlined
+def due(node, arm, slot, lane, rules, preference, w, n, score_A, class_A, in_order):  # type: ignore[no-untyped-def]
+    """Each action of root n that is due gets one of the next simulations; how many, 0 where its search is over. They
+    are those of the first lanes, the best first if `in_order`."""
     x = slot[w]
     left = rules.simulations - 1 - x.used  # the first one has expanded the root
     if left < 1 or node[n].open == 0:
         return 0
     count = 1
     if not rules.halves:
-        lane[w, 0].action = select(arm, rules, n, score_A)
+        lane[w, 0].first = select(arm, rules, n, score_A)
     else:
         if x.ranked != x.width:  # a new round: the best `width` actions of those that are left go on
             _rank(arm, lane, preference, w, x.root, n, x.width, score_A, class_A)
@@ -182,9 +192,11 @@ def due(node, arm, slot, lane, rules, preference, w, n, score_A, class_A):  # ty
             for a in range(arm.shape[1]):
                 lane[w, a].survives = 0
             for i in range(x.width):
-                lane[w, lane[w, i].action].survives = 1
+                lane[w, lane[w, i].first].survives = 1
         count = min(left, x.width, node[n].open)
-        _rank(arm, lane, preference, w, x.root, n, count, score_A, class_A)
+        # Where all that are left are due, they are in the lanes already.
+        if in_order or count < x.width or not _go_on(arm, lane, w, n, count):
+            _rank(arm, lane, preference, w, x.root, n, count, score_A, class_A)
         x.waves -= 1
         if x.waves == 0 and x.phase + 1 < x.phases:
             _begin_round(slot, rules, w, x.phase + 1, max(2, x.width // 2))

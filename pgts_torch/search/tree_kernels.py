@@ -154,9 +154,9 @@ def search(  # type: ignore[no-untyped-def]
             x.waiting = 0
             if valued_L[-1] > rules.max_nodes:
                 return TOO_MANY
-            count = due(node, arm, slot, lane, rules, preference, w, root, score_A, class_A)
+            count = due(node, arm, slot, lane, rules, preference, w, root, score_A, class_A, False)
             for i in range(count):
-                _descend(node, arm, edge, lane, rules, w, i, lane[w, i].action, score_A)
+                _descend(node, arm, edge, lane, rules, w, i, lane[w, i].first, score_A)
             if count == 0:
                 for a in range(arm.shape[1]):
                     q_BA[x.root, a] = arm[root, a].q

@@ -35,9 +35,9 @@ sequential halving, its round, how many actions it has, how many rounds there ar
 left.   ranked: `width` when the actions were
 last ranked.   waiting: simulations that are under way."""
 
-LANE = np.dtype([(name, "i8") for name in ("survives", "node", "action", "k")])
-"""One for each slot and action. survives: whether the action is left in sequential halving.   node, action, k: the edge
-where one of the simulations under way has ended."""
+LANE = np.dtype([(name, "i8") for name in ("survives", "first", "node", "action", "k")])
+"""One for each slot and action. survives: whether the action is left in sequential halving.   first: the action of the
+root that one of the simulations under way has taken.   node, action, k: the edge where it has ended."""
 
 STEP = np.dtype([(name, "i8") for name in ("node", "action", "k")])
 """The edge that a simulation takes, one for each level of a graph."""
