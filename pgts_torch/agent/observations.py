@@ -83,6 +83,11 @@ class _Part:
         return x_N.long() - first
 
 
+def fit_keys(space: spaces.Dict) -> list[str]:
+    """The entries of dictionary observations that can be learned from."""
+    return [key for key, one in space.items() if all(isinstance(leaf, Component) for _, leaf in found_in(one))]
+
+
 @final
 class Observations:
     """Makes tensors of the observations of an environment, a row of each (`components`).
@@ -153,9 +158,8 @@ class Observations:
             strange = f"{self._what} are {type(part).__name__}, which no network takes"
             if not path or not isinstance(space, spaces.Dict):
                 raise PgtsError(f"{strange}: make numbers of them by a wrapper")
-            fine = [key for key, one in space.items() if all(isinstance(leaf, Component) for _, leaf in found_in(one))]
             raise PgtsError(
-                f"{strange}, in their part {path[0]!r}: set observation_keys to those to learn from, {fine}"
+                f"{strange}, in their part {path[0]!r}: set observation_keys to those to learn from, {fit_keys(space)}"
             )
         return known
 

@@ -2,12 +2,15 @@
 
 import argparse
 import json
+import shlex
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from pgts_torch.cli.arguments import (
+    WIDTH,
     Parser,
     choice_of,
     command_name,
@@ -381,6 +384,40 @@ def list_(arguments: Arguments) -> None:
     print(json.dumps(answer) if given.json else describe(answer))
 
 
+@command
+def init(arguments: Arguments) -> None:
+    """Write a configuration to begin with, for an environment."""
+    parser = Parser(init)
+    parser.add_argument(
+        "env_id", metavar="ENV", help="as in gymnasium.make; MODULE:ID imports MODULE first; or MODULE:CLASS"
+    )
+    parser.add_argument("-o", "--out", metavar="FILE", type=Path, help="where to write (default: NAME.yaml)")
+    parser.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
+    _add_kwargs(parser)
+    parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the training (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
+    parser.epilog = INIT_HELP
+    given = parser.parse_args(arguments)
+    from pgts_torch.experiment import initial
+
+    path = initial.target(given.env_id, given.out, overwrite=given.overwrite)
+    proposal = initial.propose(given.env_id, kwargs=given.kwargs, seed=given.seed)
+    initial.write(path, proposal, overwrite=given.overwrite)
+    if given.json:
+        print(json.dumps(initial.to_json(proposal, path)))
+        return
+    for sentence in initial.describe(proposal):
+        print(textwrap.fill(sentence, WIDTH, break_on_hyphens=False))
+    print(f"\n{path} is written; pgts train --config {shlex.quote(str(path))}")
+
+
+INIT_HELP = """\
+It makes the environment, looks for a model of it as training does, runs two
+iterations at a few depths and takes the deepest lookahead with which the
+training takes less than ten minutes. The file has all options that apply,
+each with its meaning and range; those that have their defaults are commented
+out."""
+
 STATIONARY_OPTIONS = {
     "ladder": ("n", "gamma", "start"),
     "tightrope": ("gamma", "start"),
@@ -437,9 +474,7 @@ def check_model(arguments: Arguments) -> None:
     """Try out whether an environment can serve as a model of itself."""
     parser = Parser(check_model)
     parser.add_argument("env_id", metavar="ENV_ID", help="as in gymnasium.make; MODULE:ID imports MODULE first")
-    parser.add_argument(
-        "--kwargs", metavar="JSON", type=json_object, default={}, help='for gymnasium.make, as {"is_slippery": false}'
-    )
+    _add_kwargs(parser)
     parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the walks (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
     parser.epilog = PROTOCOL_HELP
@@ -460,6 +495,12 @@ An environment of your own needs two methods:
   def set_state(self, state):
       self.x, self.fuel = state
 and draws from self.np_random only."""
+
+
+def _add_kwargs(parser: Parser) -> None:
+    parser.add_argument(
+        "--kwargs", metavar="JSON", type=json_object, default={}, help='for gymnasium.make, as {"is_slippery": false}'
+    )
 
 
 def _add_launch(parser: Parser) -> None:

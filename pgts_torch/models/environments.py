@@ -80,9 +80,9 @@ class EnvSource:
         """Read what a user gives.
 
         Args:
-            env: an id, as gymnasium.make takes it; a spec; an instance, which is only looked at: others are made from
-                its spec and have to be like it; a function that makes a new environment; or several as a VectorEnv that
-                resets by mask.
+            env: an id, as gymnasium.make takes it, or MODULE:NAME of a class; a spec; an instance, which is only looked
+                at: others are made from its spec and have to be like it; a function that makes a new environment; or
+                several as a VectorEnv that resets by mask.
             kwargs: for gymnasium.make, of an id.
             gamma: handed to environments that carry a discount of their own, pgts/*, by their id.
             actions_per_dimension: into how many evenly spaced values each dimension of continuous actions is divided;
@@ -136,6 +136,8 @@ class EnvSource:
         _import(env_id)
         if (spec := _spec(env_id)) is not None:
             env_id = f"{env_id[: env_id.rfind(':') + 1]}{spec.id}"  # with its version, so that it means the same later
+        elif (named := _named(env_id)) is not None:
+            return cls(env_id, [lambda **_: named(**kwargs)], description=env_id, actions_per_dimension=count)
         ours = spec is not None and spec.namespace == "pgts"
         if ours and count is not None:
             raise PgtsError(f"actions_per_dimension is {count}; {env_id} has discrete actions")
@@ -346,6 +348,13 @@ def _import(env_id: str) -> None:
         except ModuleNotFoundError as error:
             why = f"needs {module}: pip install 'pgts_torch[{extra}]'" if extra else f"cannot be made: {error}"
             raise PgtsError(f"{env_id} {why}") from error
+
+
+def _named(env_id: str) -> Callable[..., gymnasium.Env] | None:
+    """The class or the function of MODULE:NAME, which makes environments; None where a module has no such name."""
+    module, colon, name = env_id.rpartition(":")
+    found = getattr(import_named(module), name, None) if colon else None
+    return found if callable(found) else None
 
 
 def _spec(env_id: str) -> EnvSpec | None:

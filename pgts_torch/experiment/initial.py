@@ -1,0 +1,339 @@
+"""The configuration to begin with in an environment, with the model that was found and the price that was measured."""
+
+import json
+import re
+import textwrap
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from gymnasium import spaces
+
+from pgts_torch import files
+from pgts_torch.agent.iteration import Iteration
+from pgts_torch.agent.observations import fit_keys
+from pgts_torch.agent.pgts import PGTS
+from pgts_torch.agent.world import DynamicsWorld, SimulatedWorld, TabularWorld
+from pgts_torch.config import Config, strict_yaml
+from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.experiment.resume import flat, plain
+from pgts_torch.experiment.run import build
+from pgts_torch.models.base import LearningModel
+from pgts_torch.models.environments import EnvSource
+from pgts_torch.options.schema import Option, schema_of
+
+PATIENCE = 600.0
+"""The seconds that the whole training is to take, as far as its second iteration tells; or twice as long as with the
+smallest depth, if that is more."""
+
+LONG = 10.0
+"""Where an iteration takes more seconds with the smallest depth, its lookahead starts from fewer states."""
+
+LONGEST_EPISODE = 500
+"""The most steps of a rollout, where the environment's own time limit is longer; `FixedHorizon` where it has none."""
+
+FEWEST_ROOTS = 16
+"""It starts from so many at least."""
+
+TABLE_DEPTHS, OTHER_DEPTHS = (1, 2, 4, 8, 16), (0, 1, 2, 4)
+"""The depths that are tried, in this order. A table is read without queries, and paths meet in its states."""
+
+LEARNED_DEPTH = 1
+"""Deeper lookaheads add up the errors of a model of vectors that is learned."""
+
+_ALWAYS = ("name", "total_steps", "env.id", "search.depth", "rollout.num_envs", "eval.every")
+_WIDTH = 99
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A configuration to begin with.
+
+    model: what its lookahead queries, in words.
+    why: what the environment lacks for a model that need not be learned; empty where it lacks nothing.
+    shows: observations and actions, in words.
+    price: what an iteration costs, in a sentence.
+    seconds: of the whole training, as far as its second iteration tells.
+    """
+
+    config: Config
+    model: str
+    why: str
+    shows: str
+    price: str
+    seconds: float
+
+
+def target(env_id: str, out: Path | None, *, overwrite: bool) -> Path:
+    """The file to write, by default NAME.yaml in the working folder; PgtsError if it exists and is not to be replaced,
+    or is no file."""
+    path = Path(f"{_name(env_id)}.yaml") if out is None else out
+    found = files.kind(path, follow=True) or files.kind(path)
+    if found not in (None, "file"):
+        raise PgtsError(f"{path} is a {found}; -o must name a file")
+    if found is not None and not overwrite:
+        raise PgtsError(f"{path} exists: give --overwrite to replace it, or another name by -o")
+    if files.kind(path.parent, follow=True) != "folder":
+        raise PgtsError(f"{path} cannot be written: {path.parent} is not a folder")
+    return path
+
+
+def propose(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Proposal:
+    """Find a model for an environment as training does, try trainings of two iterations, and choose.
+
+    The first of these that applies: a model that is known (table, dynamics, simulator); one that is learned from the
+    steps; none, with the advantages of the actions taken. The depth is the largest of a few with which the training
+    takes less than ten minutes, or less than twice as long as with the smallest.
+
+    Raises:
+        PgtsError: the environment cannot be made, or no agent can act in it, or it fails.
+    """
+    torch.set_num_threads(1)
+    source = EnvSource.of(env_id, kwargs=kwargs)
+    with closing(source.make_one()) as env:
+        is_continuous, space = isinstance(env.action_space, spaces.Box), env.observation_space
+    made: dict[str, Any] = {"id": source.description, "kwargs": dict(kwargs)}
+    if isinstance(space, spaces.Dict) and 0 < len(keys := fit_keys(space)) < len(space):
+        made["observation_keys"] = keys
+    general = {"name": _name(env_id), "seed": seed, "env": made}
+    limit = min(source.time_limit or LONGEST_EPISODE, LONGEST_EPISODE)
+    fixed = {"rollout": {"horizon": {"type": "fixed", "length": limit}}} if source.time_limit else {}
+    continuous = {"policy": {"type": "gaussian"}, "replay": {"type": "uniform"}} if is_continuous else {}
+    own = continuous or fixed
+    learned = {"policy": continuous["policy"]} if is_continuous else {}
+    sampled = {
+        "estimator": {"type": "sampled"},
+        "search": {"depth": 0},
+        "rollout": {"num_envs": 8, "horizon": {"type": "steps", "length": 128}},
+    }
+    kinds = ("ensemble",) if is_continuous else ("counts", "latent", "ensemble")
+    ways = [own, *(learned | {"model": {"type": kind}} for kind in kinds), learned | sampled]
+    why = ""
+    for way in ways:
+        try:
+            tried = _Tried.of(general | way, 0 if is_continuous or way is ways[-1] else LEARNED_DEPTH)
+        except MissingModel as error:
+            why = why or str(error)
+            continue
+        if way is ways[0] and not is_continuous:
+            tried = _deepest(tried)
+        if tried.iteration > LONG and tried.roots > FEWEST_ROOTS and way is fixed:
+            fewer = max(FEWEST_ROOTS, int(tried.roots * LONG / tried.iteration))
+            tried = tried.again(max_roots=int(float(f"{fewer:.1g}")))
+        return replace(tried.proposal, why=why)
+    raise AssertionError("sampled advantages need no model")
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A training of two iterations: what it was made from and what it came to.
+
+    tables: whether the lookahead reads a table.   branching: actions.   roots: states that the lookahead starts from.
+    iteration: the seconds of the second one.
+    """
+
+    data: dict[str, Any]
+    proposal: Proposal
+    tables: bool
+    branching: int
+    roots: int
+    iteration: float
+
+    @property
+    def seconds(self) -> float:
+        return self.proposal.seconds
+
+    @property
+    def depth(self) -> int:
+        depth = self.proposal.config.search.depth
+        assert isinstance(depth, int)
+        return depth
+
+    def again(self, **search: Any) -> "_Tried":
+        """Try it with other options of the lookahead."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they were shown the first time
+            return _Tried.of(self.data | {"search": self.data.get("search", {}) | search}, self.depth)
+
+    @classmethod
+    def of(cls, data: dict[str, Any], depth: int) -> "_Tried":
+        """Try a training; `depth` where `data` names none."""
+        data = data | {"search": {"depth": depth} | data.get("search", {})}
+        with closing(build(Config.model_validate(data))) as algorithm:
+            algorithm.iterate()
+            begun = time.perf_counter()
+            iteration = algorithm.iterate()
+            seconds = time.perf_counter() - begun
+            config = _whole(data, algorithm)
+            price = algorithm.pricing.price
+            said = f"an iteration takes about {seconds:.2g} s" if not price else str(replace(price, advice=()))
+            if price is not None and not price.calls:
+                said = f"an iteration takes about {seconds:.2g} s and no model calls, because the table is known"
+            proposal = Proposal(
+                config=config,
+                model=_model(algorithm),
+                why="",
+                shows=f"observations are {_shown(algorithm)}, {_actions(algorithm)}",
+                price=said,
+                seconds=seconds * config.total_steps / max(iteration.num_steps, 1),
+            )
+            tables = isinstance(algorithm.world, TabularWorld) and algorithm.world.mdp is not None
+            return cls(data, proposal, tables, max(algorithm.world.num_actions, 2), _roots(iteration), seconds)
+
+
+def _roots(iteration: Iteration) -> int:
+    return 0 if iteration.state_N is None else len(iteration.state_N)
+
+
+def _deepest(first: _Tried) -> _Tried:
+    """Try other depths, the smallest first, as long as the next one will probably not take too long."""
+    best, limit = None, 0.0
+    for depth in TABLE_DEPTHS if first.tables else OTHER_DEPTHS:
+        if best is not None:
+            # Until paths meet, each level takes as many times longer as there are actions.
+            growth = 1.0 if first.tables else float(first.branching ** (depth - best.depth))
+            if best.seconds * growth > limit:
+                break
+        tried = first if depth == first.depth else first.again(depth=depth)
+        if best is None:
+            limit = max(PATIENCE, 2 * tried.seconds)
+        elif tried.seconds > limit:
+            break
+        best = tried
+    assert best is not None
+    return best
+
+
+def _whole(data: Mapping[str, Any], algorithm: PGTS) -> Config:
+    """The configuration of a training, with the parts that its environment chose."""
+    options = algorithm.options.model_dump(by_alias=True)
+    total = Config().total_steps
+    chosen = {"env": data["env"], "total_steps": total, "eval": {"every": total // 10}}
+    return Config.model_validate(dict(data) | options | chosen)
+
+
+def _model(algorithm: PGTS) -> str:
+    world = algorithm.world
+    model = type(algorithm.world.model).__name__
+    if algorithm.depth_choice is None:
+        return "no model: the update takes the advantages of the actions taken"
+    if isinstance(world.model, LearningModel):
+        return f"a model that is learned from the steps ({algorithm.options.model.type})"
+    if isinstance(world, TabularWorld):
+        return f"the environment's table of {world.mdp_shape[0]:,} states"
+    if isinstance(world, DynamicsWorld):
+        return f"its dynamics in torch ({model})"
+    if isinstance(world, SimulatedWorld):
+        return "a simulator: the environment itself, restored from snapshots"
+    return model
+
+
+def _shown(algorithm: PGTS) -> str:
+    space = algorithm.world.observation_space
+    if isinstance(algorithm.world, TabularWorld):
+        return "numbered states"
+    if isinstance(space, spaces.Box):
+        kind = {1: "vectors", 3: "images"}.get(len(space.shape), "arrays")
+        return f"{kind} of {' x '.join(map(str, space.shape))}"
+    if isinstance(space, spaces.Dict):
+        return f"dictionaries of {', '.join(space)}"
+    return f"tuples of {len(space)}" if isinstance(space, spaces.Tuple) else str(space)
+
+
+def _actions(algorithm: PGTS) -> str:
+    world = algorithm.world
+    if not world.num_actions:
+        return f"actions are vectors of {world.action_size}"
+    masked = ", some of which are not legal everywhere" if world.masks not in (None, "off") else ""
+    return f"there are {world.num_actions} actions{masked}"
+
+
+def _name(env_id: str) -> str:
+    """A word for a run and a file, as minigrid_empty_5x5 for MiniGrid-Empty-5x5-v0."""
+    last = re.sub(r"-v\d+$", "", re.split(r"[:/]", env_id)[-1])
+    return re.sub(r"[^a-z0-9]+", "_", last.lower()).strip("_") or "run"
+
+
+def describe(proposal: Proposal) -> Iterator[str]:
+    """Yield what was found, in sentences."""
+    config, training = proposal.config, proposal.seconds
+    yield f"{config.env.id}: {proposal.shows}. The lookahead queries {proposal.model}."
+    if proposal.why:
+        yield f"Why no other: {proposal.why}."
+    yield (
+        f"Measured at depth {config.search.depth}: {proposal.price}. Then the whole training of "
+        f"{config.total_steps:,} steps takes about {_duration(training)}, as long as episodes stay as they are."
+    )
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.2g} s"
+    return f"{seconds / 60:.2g} minutes" if seconds < 5400 else f"{seconds / 3600:.2g} hours"
+
+
+def to_json(proposal: Proposal, path: Path) -> dict[str, Any]:
+    """Return what was found as plain values."""
+    return {"file": str(path)} | asdict(replace(proposal, config=None)) | {"config": plain(proposal.config)}  # type: ignore[arg-type]
+
+
+def text(proposal: Proposal) -> str:
+    """Return the configuration as YAML with comments, from which `load` reads it. Options that are as by default are
+    there, too, commented out."""
+    head = [
+        *describe(proposal),
+        "Options behind # have their defaults: remove the # to change one.",
+    ]
+    lines = [f"# {line}" for each in head for line in textwrap.wrap(each, _WIDTH, break_on_hyphens=False)]
+    values = flat(whole := plain(proposal.config)) | {"env.kwargs": whole["env"]["kwargs"]}
+    tree: dict[str, Any] = {}
+    for option in schema_of(Config).options():
+        if option.exists(values):
+            *above, last = option.key.split(".")
+            section = tree
+            for part in above:
+                section = section.setdefault(part, {})
+            section[last] = option
+    for name, child in tree.items():
+        lines += [""] * (not isinstance(child, Option) or name == "name")
+        lines += _lines(name, child, values, "")
+    return "\n".join(lines) + "\n"
+
+
+def _lines(name: str, child: Any, values: Mapping[str, Any], indent: str) -> Iterator[str]:
+    if isinstance(child, Option):
+        value = values.get(child.key, child.default)
+        is_live = value != child.default or child.key in _ALWAYS or name in ("type", "kind")
+        yield f"{indent}# {_sentence(child.meaning)} ({child.requirement})"
+        yield f"{'' if is_live else '#'}{indent}{name}: {_value(value)}"
+        return
+    within = [line for key, each in child.items() for line in _lines(key, each, values, indent + "  ")]
+    is_live = any(not line.lstrip().startswith("#") for line in within)
+    yield f"{'' if is_live else '#'}{indent}{name}:"
+    yield from within
+
+
+def _sentence(meaning: str) -> str:
+    """The first sentence of a meaning."""
+    return re.split(r"(?<! al)\. ", meaning, maxsplit=1)[0].rstrip(".")
+
+
+def _value(value: Any) -> str:
+    """Return a value as YAML in one line."""
+    if isinstance(value, list | dict):
+        return json.dumps(value)
+    if type(value) is int:
+        return f"{value:_}"
+    return strict_yaml.dump({"key": value}).removeprefix("key: ").strip()
+
+
+def write(path: Path, proposal: Proposal, *, overwrite: bool) -> None:
+    """Write the file, unless there is one by now that is not to be replaced."""
+    if files.kind(path) is not None and not overwrite:
+        raise PgtsError(f"{path} exists by now: give --overwrite to replace it, or another name by -o")
+    files.replace(path, text(proposal).encode())
