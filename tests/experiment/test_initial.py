@@ -136,7 +136,7 @@ def made(env: str, *more: str) -> tuple[Config, dict[str, Any]]:
         ("walks:Restored", "simulator", ("mlp", "network", "cmpo")),
         ("walks:Masked", "simulator", ("mlp", "network", "cmpo")),
         ("images/Catch-v0", "simulator", ("cnn", "network", "cmpo")),
-        pytest.param("MiniGrid-Empty-5x5-v0", "simulator", ("mlp", "network", "cmpo"), marks=pytest.mark.long),
+        pytest.param("MiniGrid-Empty-5x5-v0", "simulator", ("cnn", "network", "cmpo"), marks=pytest.mark.long),
         pytest.param("Pendulum-v1", "dynamics in torch", ("gaussian", "network", "mpo"), marks=pytest.mark.long),
         pytest.param("walks:Hidden", "learned from the steps", ("mlp", "network", "cmpo"), marks=pytest.mark.long),
         pytest.param("Taxi-v4", "table of 500 states", ("softmax", "tabular", "mirror"), marks=pytest.mark.long),
