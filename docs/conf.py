@@ -8,6 +8,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+
 from pgts_torch.cli.arguments import describe_options
 from pgts_torch.cli.commands import COMMANDS
 from pgts_torch.config import Config
@@ -18,12 +20,15 @@ HERE = Path(__file__).parent
 project, author = "pgts_torch", "the authors of pgts_torch"
 version = release = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+FILES = ["CITATION.cff", "SECURITY.md"]
+html_extra_path = [f"../{name}" for name in FILES]
 html_static_path, html_css_files, html_show_copyright = ["_static"], ["site.css"], False
 highlight_language = "text"  # of blocks without a language: formulas, what a program prints
 exclude_patterns = ["_build", "figures"]
 # Tutorials are run where they have changed; a cell that fails ends the build.
 nb_execution_mode, nb_execution_cache_path = "cache", str(HERE / "_build/.jupyter_cache")
 nb_execution_timeout, nb_execution_raise_on_error = 600, True
+nb_output_stderr = "remove"  # what an iteration costs on this machine
 html_theme, html_title = "furo", f"pgts_torch {version}"
 myst_heading_anchors = 3
 autodoc_member_order, autodoc_typehints = "bysource", "none"
@@ -79,6 +84,14 @@ def _write_reference(app: Any) -> None:
     )
 
 
+def _files_of_the_repository(app: Any, doctree: nodes.document, page: str) -> None:
+    """Links of the README to files beside it, which `html_extra_path` puts beside the first page."""
+    for link in doctree.findall(nodes.reference):
+        if link.get("refid") in FILES:
+            link["refuri"] = link.attributes.pop("refid")
+
+
 def setup(app: Any) -> None:
+    app.connect("doctree-resolved", _files_of_the_repository)
     app.connect("builder-inited", _write_reference)
     app.connect("autodoc-process-docstring", _as_rst, priority=400)  # before napoleon
