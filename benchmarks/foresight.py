@@ -7,10 +7,12 @@
 100 random MDPs, each with an update, a step size, a state weight and an initial policy of its own, at five depths.
 `predict` writes in which iteration `tabular.foresight.foresee` has 90 % of the way from the initial return to J* behind
 it, or that it does not within 60. It knows tables and settings, and has made no run. `run` trains PGTS on them from
-rollouts with a learned critic and holds the outcomes to that file. Beside it two predictions that should be worse:
+rollouts with a learned critic and holds the outcomes to that file. Beside it are predictions that should be worse:
 
-    exact       Algorithm 1 with exact values of states and all of them visited, as if rollouts hid nothing
-    wrong step  the foreseen one, but with a step size three times too large
+    exact        Algorithm 1 with exact values of states and all of them visited, as if rollouts hid nothing
+    wrong step   the foreseen one, but with a step size three times too large
+    wrong depth  the foreseen one, but that of m = 0 at all depths
+    majority     whatever is more frequent
 
 The MDPs: 6 to 20 states, 2 or 3 actions, 1 or 2 successors, 2 to 10 % of all actions rewarded, gamma 0.8 to 0.95; in
 seven of ten action 0 leads back to the start from most states and earns a little. The initial policy prefers action 0.
@@ -18,7 +20,6 @@ seven of ten action 0 leads back to the start from most states and earns a littl
 
 import argparse
 import csv
-import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -33,19 +34,17 @@ from torch import Tensor
 
 from pgts_torch import PGTS
 from pgts_torch.envs.vector import TabularVectorEnv
+from pgts_torch.options.updates import Mirror, Projected, SoftmaxGradient
 from pgts_torch.seeding import numpy_stream
 from pgts_torch.tabular import TabularMDP, exact, random_mdp
-from pgts_torch.tabular.ascent import centred, floored, projected_step, softmax_step
 from pgts_torch.tabular.foresight import foresee
 
 HERE = Path(__file__).parent
 PREDICTIONS, RUNS = HERE / "foresight.csv", Path("runs/foresight.jsonl")
 DEPTHS = (0, 1, 2, 4, 8)
-WORLDS, ENVS, LENGTH, ITERATIONS, ARRIVED, FLOOR = 100, 16, 30, 60, 0.9, 12.0
+WORLDS, ENVS, LENGTH, ITERATIONS, ARRIVED = 100, 16, 30, 60, 0.9
 STEP_SIZES = {"projected": (0.1, 3.0), "softmax": (1.0, 30.0), "mirror": (0.3, 10.0), "default": (0.3, 3.0)}
 """Updates, each with the range of its step sizes: `mirror` in reward units, and as it is by default."""
-
-Step = Callable[[Tensor, Tensor, Tensor, float], Tensor]
 
 
 class World(NamedTuple):
@@ -70,30 +69,13 @@ class World(NamedTuple):
         """The update as an argument of PGTS."""
         options = {"type": self.kind, "step_size": self.step_size, "state_weight": self.weight}
         if self.kind == "mirror":
-            return options | {"normalize": "none", "floor": None}
+            return options | {"normalize": "none"}
         return options | {"type": "mirror"} if self.kind == "default" else options
-
-    @property
-    def step(self) -> Step:
-        """The same for `foresee`."""
-        if self.kind in ("projected", "softmax"):
-            return projected_step if self.kind == "projected" else softmax_step
-        return functools.partial(_mirrored, rms=self.kind == "default", is_uniform=self.weight == "uniform")
 
     def arrival(self, J_K: Iterable[float]) -> int | None:
         """The first iteration with 90 % of the way from the initial return to J* behind it; None: there is none."""
         J_0, J_optimal = exact.evaluate(self.mdp, self.pi_SA).J, exact.optimal(self.mdp).J
         return next((k for k, J in enumerate(J_K) if J >= J_0 + ARRIVED * (J_optimal - J_0)), None)
-
-
-def _mirrored(pi_NA: Tensor, q_NA: Tensor, weight_N: Tensor, eta: float, *, rms: bool, is_uniform: bool) -> Tensor:
-    """The mirror update of tables: as many states as are likely to be visited share the root mean square."""
-    advantage_NA = centred(q_NA, pi_NA)
-    if rms:
-        share_N = weight_N if is_uniform else torch.ones_like(weight_N)
-        scale = ((share_N * (pi_NA * advantage_NA.square()).sum(-1)).sum() / share_N.sum()).sqrt()
-        advantage_NA = advantage_NA / scale if scale > 0 else advantage_NA
-    return floored(pi_NA.log(), eta * weight_N[:, None] * advantage_NA, FLOOR if rms else None).softmax(-1)
 
 
 def world(*names: str | int) -> World:
@@ -134,9 +116,11 @@ PREDICTORS: dict[str, dict[str, Any]] = {
 
 def predicted(world: World, depth: int, *, factor: float = 1.0, **knobs: Any) -> int | None:
     """In which iteration the training is to arrive."""
-    settings = {"num_envs": ENVS, "length": LENGTH, "state_weight": world.weight, "step": world.step} | knobs
-    size = factor * world.step_size
-    run = foresee(world.mdp, world.pi_SA, depth=depth, step_size=size, iterations=ITERATIONS, **settings)
+    kinds: dict[str, type[Projected | SoftmaxGradient | Mirror]] = {"projected": Projected, "softmax": SoftmaxGradient}
+    options = world.update | {"step_size": factor * world.step_size}
+    update = kinds.get(world.kind, Mirror).model_validate(options)
+    settings: dict[str, Any] = {"num_envs": ENVS, "length": LENGTH} | knobs
+    run = foresee(world.mdp, world.pi_SA, depth=depth, iterations=ITERATIONS, update=update, **settings)
     return world.arrival(run.J_K.tolist())
 
 
@@ -197,17 +181,19 @@ def verdict(records: Sequence[Record], predictions: Predictions) -> str:
     arrived = [r["arrival"] is not None for r in records]
     lines = [f"{sum(arrived)} of {len(records)} runs arrive within {ITERATIONS} iterations", ""]
     lines.append(f"{'prediction':<14}{'right':>12}{'share':>8}   iterations of those that arrive as foreseen")
-    for name in PREDICTORS:
-        pairs = [(predictions[r["world"], r["depth"]][name], r["arrival"]) for r in records]
+    said = {name: [predictions[r["world"], r["depth"]][name] for r in records] for name in PREDICTORS}
+    said["wrong depth"] = [predictions[r["world"], 0]["foreseen"] for r in records]
+    for name, foreseen in said.items():
+        pairs = list(zip(foreseen, (r["arrival"] for r in records), strict=True))
         hits = sum((k is None) == (true is None) for k, true in pairs)
-        ratios = np.array([true / k for k, true in pairs if k and true])
-        near = [float((np.abs(np.log(ratios)) <= np.log(1 + off)).mean()) for off in (0.1, 0.25)]
+        off = np.array([true / k for k, true in pairs if k and true])
+        near = [f"{(np.abs(np.log(off)) <= np.log(1 + share)).mean():.0%}" for share in (0.1, 0.25)]
         lines.append(
             f"{name:<14}{f'{hits} of {len(pairs)}':>12}{hits / len(pairs):>8.1%}   median run / foreseen "
-            f"{np.median(ratios):.2f}, within 10 %: {near[0]:.0%}, 25 %: {near[1]:.0%}"
+            f"{np.median(off):.2f}, within 10 %: {near[0]}, 25 %: {near[1]}"
         )
     most = max(sum(arrived), len(arrived) - sum(arrived))
-    lines.append(f"{'always the same':<14}{f'{most} of {len(arrived)}':>11}{most / len(arrived):>8.1%}")
+    lines.append(f"{'majority':<14}{f'{most} of {len(arrived)}':>12}{most / len(arrived):>8.1%}")
     lines += ["", "foreseen, by"]
     groups: dict[str, Callable[[Record], Any]] = {
         "depth": lambda r: r["depth"],

@@ -309,8 +309,8 @@ def test_methods_of_public_classes_are_read_and_private_ones_are_not():
 
 # Theory
 
-THEORY_TESTS = ("tests/tabular/test_stationary_sets.py", "study/tests/test_theory.py")
-"""The files whose tests docs/theory.md names without a file."""
+THEORY_TESTS = ("tests/tabular/test_stationary_sets.py", "tests/tabular/test_rates.py", "study/tests/test_theory.py")
+"""The files whose tests docs/theory.md and docs/rates.md name without a file."""
 
 
 def unknown_tests(text: str) -> set[str]:
@@ -321,9 +321,10 @@ def unknown_tests(text: str) -> set[str]:
     return {file for file in files if not (ROOT / file).exists()} | (set(re.findall(r"`(test_\w+)`", text)) - names)
 
 
-def test_every_test_that_the_page_on_theory_names_exists():
-    text = (ROOT / "docs" / "theory.md").read_text()
-    assert len(re.findall(r"`test_\w+`", text)) > 20
+@pytest.mark.parametrize(("page", "least"), [("theory", 20), ("rates", 10)])
+def test_every_test_that_the_pages_on_theory_name_exists(page, least):
+    text = (ROOT / "docs" / f"{page}.md").read_text()
+    assert len(re.findall(r"`test_\w+`", text)) > least
     assert unknown_tests(text) == set()
 
 

@@ -1,6 +1,6 @@
 """The exact world: tabular MDPs in float64 and everything that theory says of them."""
 
-from pgts_torch.tabular import ascent, exact, stationary, stationary_sets
+from pgts_torch.tabular import ascent, exact, foresight, rates, stationary, stationary_sets
 from pgts_torch.tabular.mdp import TabularMDP
 from pgts_torch.tabular.zoo import (
     combination_lock,
@@ -22,10 +22,12 @@ __all__ = [
     "corridor",
     "deep_sea",
     "exact",
+    "foresight",
     "grid",
     "ladder",
     "mirage",
     "random_mdp",
+    "rates",
     "river_swim",
     "roundabout",
     "stationary",

@@ -1,9 +1,5 @@
 """What a training from rollouts will come to, foreseen in the exact world: Algorithm 1 without noise, as far as its
-rollouts let it see (docs/rates.md, Sec. 8)."""
-
-import math
-from collections.abc import Callable
-from typing import Literal
+rollouts let it see (docs/rates.md, Sec. 9)."""
 
 import numpy as np
 import torch
@@ -12,8 +8,10 @@ from torch import Tensor
 
 from pgts_torch.bellman import backup, policy_mean
 from pgts_torch.errors import PgtsError, check_count
+from pgts_torch.options.fields import limit
+from pgts_torch.options.updates import Mirror, Projected, SoftmaxGradient
 from pgts_torch.tabular import exact
-from pgts_torch.tabular.ascent import Ascent, projected_step
+from pgts_torch.tabular.ascent import Ascent, centred, floored, projected_step, scaled, softmax_step
 from pgts_torch.tabular.mdp import TabularMDP
 
 EVEN = 0.5
@@ -25,10 +23,8 @@ def foresee(
     pi_SA: Float[Tensor, "S A"],
     *,
     depth: int,
-    step_size: float,
     iterations: int,
-    step: Callable[[Tensor, Tensor, Tensor, float], Tensor] = projected_step,
-    state_weight: Literal["occupancy", "uniform"] = "occupancy",
+    update: Projected | SoftmaxGradient | Mirror = Mirror(),  # noqa: B008 - frozen
     num_envs: int = 16,
     length: int = 200,
     trace: float = 0.9,
@@ -42,25 +38,25 @@ def foresee(
     mean value of the visits; the values of the others move toward expected lambda returns, as those of a tabular critic
     do. Chance finds, and noise that decides between nearly equal actions, are not foreseen.
 
-    It costs `length` products of S x S matrices an iteration: for tables of up to some hundred states.
+    It costs `length` products of S x S matrices an iteration: for tables of up to some hundred states. The defaults are
+    those of `PGTS` for tables.
 
     Args:
         mdp: the MDP.
         pi_SA: the initial policy.
         depth: m.
-        step_size: eta.
         iterations: how many.
-        step: how a policy moves, as in `ascent.ascend`. It is called with all states that have been visited.
-        state_weight: the option of the update.
+        update: its options; the step size must be a number.
         num_envs, length: rollouts of an iteration, with a fixed horizon.
         trace, critic_step_size: lambda and step size of the critic.
     """
-    if not 0 <= step_size < math.inf:
-        raise PgtsError(f"step_size is {step_size}; it must be finite and at least 0")
     for name, count in (("depth", depth), ("iterations", iterations)):
         check_count(name, count, least=0)
     for name, count in (("num_envs", num_envs), ("length", length)):
         check_count(name, count)
+    update = update.filled("tables") if isinstance(update, Mirror) else update
+    if isinstance(update.step_size, str):
+        raise PgtsError(f"update.step_size is {update.step_size}; it must be a number here, not a schedule")
     pi_SA = exact.check_policy(mdp, pi_SA)
     unseen_S = torch.ones(mdp.num_states, dtype=torch.float64)
     v_S, known_S = torch.zeros_like(unseen_S), torch.zeros_like(unseen_S, dtype=torch.bool)
@@ -73,11 +69,29 @@ def foresee(
         v_S = _fitted(mdp, pi_SA, v_S, known_S, seen_S, (visits_S, visited_S), trace, critic_step_size)
         known_S = seen_S
         look_SA = exact.lookahead(mdp, backup(mdp.outcomes, v_S), depth)
-        weight_S = occupancy_S if state_weight == "occupancy" else visited_S
+        weights = {"occupancy": occupancy_S, "visits": visits_S / visits_S.sum(), "uniform": visited_S}
+        weight_N = weights[str(update.state_weight)][seen_S]
         pi_SA = pi_SA.clone()
-        pi_SA[seen_S] = step(pi_SA[seen_S], look_SA[seen_S], weight_S[seen_S], step_size)
+        pi_SA[seen_S] = _moved(update, pi_SA[seen_S], look_SA[seen_S], weight_N, visited_S[seen_S])
     returns.append(float(mdp.start_S @ exact.policy_values(mdp, pi_SA)))
     return Ascent(torch.tensor(returns, dtype=torch.float64), pi_SA)
+
+
+def _moved(
+    update: Projected | SoftmaxGradient | Mirror, pi_NA: Tensor, q_NA: Tensor, weight_N: Tensor, visited_N: Tensor
+) -> Float[Tensor, "N A"]:
+    """The policy after the expected step in states that are visited with these probabilities."""
+    eta = float(update.step_size or 0)
+    if not isinstance(update, Mirror):
+        return (projected_step if isinstance(update, Projected) else softmax_step)(pi_NA, q_NA, weight_N, eta)
+    advantage_NA = centred(q_NA, pi_NA)
+    if update.normalize == "rms":
+        # Of the states that are visited in an iteration, each as often as it is one of them.
+        share_N = visited_N if update.state_weight == "uniform" else torch.ones_like(visited_N)
+        scale = ((share_N * policy_mean(pi_NA, advantage_NA.square())).sum() / share_N.sum()).sqrt()
+        advantage_NA = advantage_NA / scale if scale > 0 else advantage_NA
+    floor = None if update.floor is None else limit(update.floor)
+    return floored(pi_NA.log(), scaled(advantage_NA, eta * weight_N), floor).softmax(-1)
 
 
 def expected_visits(
