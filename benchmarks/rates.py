@@ -4,7 +4,7 @@
 
 Exact quantities: the first iterate with 99 % of the way from the initial return to J* behind it, from the MDPs and
 initial policies of `python -m study --only depth`; Garnets have 10 states, 2 actions, 2 successors, and are the median
-of 15. Samples: the sup-error of `search.sampled` that 5 % of 200 searches exceed, on Garnet(200,4,5) from 4 states.
+of 15. Samples: the sup-error of `search.sampled` that 5 % of 100 searches exceed, on Garnet(200,4,5) from 4 states.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from pgts_torch.tabular.ascent import centred, floored, normalised, projected_st
 
 DEPTHS, WAY, LIMIT, LARGE = (0, 1, 2, 4, 8, 16), 0.99, 400, 1e9
 SHARES: tuple[Share, ...] = ("none", "level", "search")
+MOST_CALLS = 1e5
 SAMPLES, FAILURE = (1, 2, 4, 8, 16, 32, 64), 0.05
 
 
@@ -177,7 +178,7 @@ def sample_errors(depth: int, share: Share, searches: int) -> Errors:
     found = Errors([], [], [])
     for C in SAMPLES:
         proof = rates.sample_bound(mdp, evaluation.v_S, roots, depth=depth, samples=C, failure=FAILURE, share=share)
-        if proof.model_calls > 3e5:
+        if proof.model_calls > MOST_CALLS:
             break
         looks = [
             sampled(
@@ -229,14 +230,14 @@ def picture(found: dict[tuple[int, Share], Errors]) -> Figure:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="20 searches")
+    parser.add_argument("--quick", action="store_true", help="10 searches")
     parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
     torch.set_num_threads(1)
     print_large_steps()
     print_deep_enough()
     print_mirage()
-    found = print_samples(20 if given.quick else 200)
+    found = print_samples(10 if given.quick else 100)
     if given.picture:
         picture(found).savefig(given.picture, dpi=120)
 
