@@ -224,7 +224,7 @@ def picture(found: dict[tuple[int, Share], Errors]) -> Figure:
             panel.plot(one.calls, one.proved, f"C{k}--", linewidth=1, label=f"{share}, proved")
         panel.set(xscale="log", yscale="log", xlabel="model calls, 4 roots", title=f"m = {depth}")
     figure.axes[0].set_ylabel("sup-error, exceeded by 5 %")
-    figure.axes[2].legend(fontsize=7)
+    figure.axes[0].legend(fontsize=7, loc="upper right")  # above the errors of m = 0 there is room
     return figure
 
 
