@@ -74,7 +74,7 @@ def foresee(
         pi_SA = pi_SA.clone()
         pi_SA[seen_S] = _moved(update, pi_SA[seen_S], look_SA[seen_S], weight_N, visited_S[seen_S])
     returns.append(float(mdp.start_S @ exact.policy_values(mdp, pi_SA)))
-    return Ascent(torch.tensor(returns, dtype=torch.float64), pi_SA)
+    return Ascent(torch.tensor(returns, dtype=torch.float64), pi_SA, depth)
 
 
 def _moved(
