@@ -18,6 +18,7 @@ from pgts_torch.tabular import (
     mirage,
     random_mdp,
     river_swim,
+    roundabout,
     tightrope,
 )
 from tests.support import always, outcomes_of, uniform_policy
@@ -267,6 +268,10 @@ def test_the_advantage_of_right_on_the_mirage_is_that_of_the_formula(width, delt
         (lambda: mirage(delta=0.0), "delta is 0.0; it must be above 0 and below 1"),
         (lambda: mirage(delta=1.0), "delta is 1.0; it must be above 0 and below 1"),
         (lambda: mirage(gamma=2.0), "gamma is 2.0"),
+        (lambda: roundabout(0), "depth is 0; it must be a whole number of at least 1"),
+        (lambda: roundabout(gamma=1.0), "gamma is 1.0; with depth 1 nothing goes round there"),
+        (lambda: roundabout(cost=5.0), "cost is 5.0; with depth 1 and gamma 0.9 it must be above 0.64"),
+        (lambda: roundabout(cost=math.nan), "cost is nan"),
         (lambda: grid(0), "size is 0"),
         (lambda: grid(5), "trap 32 is not on the grid; states are 0 to 24"),
         (lambda: grid(goal=100), "goal 100 is not on the grid"),
