@@ -1,10 +1,14 @@
 """Continuous actions: how the lookahead over K drawn actions tends to that over all, and learning beside PPO and SAC.
 
     python benchmarks/continuous.py draws
+    python benchmarks/continuous.py search
     python benchmarks/continuous.py learning --env Pendulum-v1 --seeds 5 --steps 5000
 
 `draws`: on the double integrator, whose values have a closed form, by how much max_k q falls short of max_a q, and how
 far sum_k pi_hat q is from E_pi q: mean over states (bias) and standard deviation (spread).
+`search`: there too, m = 1 and 2 steps ahead of v = 2 v*, which is below T v as values of policies are, by how much the
+action that a search chooses is below the best of all in T^m q: of full width over K actions, and by mcts with as many
+model calls over 16.
 `learning`: the mean return of ten greedy episodes after so many environment steps, of this package and of PPO and SAC
 of Stable-Baselines3 with their defaults, seed by seed, with the CPU seconds of the training.
 """
@@ -12,6 +16,7 @@ of Stable-Baselines3 with their defaults, seed by seed, with the CPU seconds of 
 import argparse
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -22,18 +27,28 @@ from gymnasium import spaces
 from pgts_torch import PGTS
 from pgts_torch.agent.evaluate import Evaluator
 from pgts_torch.agent.gaussian import GaussianPolicy, MixtureProposal
+from pgts_torch.models.drawn_actions import DrawnActions
 from pgts_torch.models.linear import LinearQuadratic
+from pgts_torch.search import expectimax, mcts
 
-GAMMA, STATES = 0.9, 500
-SIMULATED: dict[str, Any] = {"depth": 0, "num_envs": 4, "horizon": {"type": "fixed", "length": 250}}
+GAMMA, STATES, _ACTIONS = 0.9, 500, 16
+NORMALIZED: dict[str, Any] = {"policy": {"type": "gaussian", "network": {"type": "mlp", "normalize": True}}}
+SIMULATED: dict[str, Any] = {
+    **NORMALIZED,
+    "depth": 0,
+    "num_envs": 4,
+    "horizon": {"type": "fixed", "length": 250},
+    "max_roots": 400,
+}
 OURS: dict[str, dict[str, Any]] = {
     "Pendulum-v1": {"depth": 0, "replay": "uniform"},
     "MountainCarContinuous-v0": {"depth": 0, "model": "ensemble"},
-    "InvertedPendulum-v5": {"depth": 0, "model": "ensemble"},
+    "InvertedPendulum-v5": {"depth": 0, "replay": {"type": "uniform", "starts": 16, "length": 64}},
+    "InvertedPendulum-v5 ensemble": {"depth": 0, "model": "ensemble"},
     "Hopper-v5": SIMULATED,
     "HalfCheetah-v5": SIMULATED,
 }
-"""The settings of this package, by environment; all others are the defaults."""
+"""Our settings, by environment, and model where it is not the given one; all others are the defaults."""
 
 
 class _Observed:
@@ -67,8 +82,48 @@ def draws(counts: list[int]) -> None:
         print(f"{count:5}{short_N.mean():25.5f}{short_N.max():9.5f}{off_N.mean():24.5f}{off_N.std():9.5f}")
 
 
+def search(roots: int) -> None:
+    """Print a row for each depth and number of calls."""
+    model = LinearQuadratic.double_integrator(gamma=GAMMA)
+    policy = GaussianPolicy(spaces.Box(-np.inf, np.inf, (2,)), 1)
+    root_B = model.number(torch.randn(roots, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    state_ND, leaf = model.states(root_B), 2 * model.optimal()
+    widened: dict[str, Any] = {"C = 1": {"widening": 1}, "C = 3": {"widening": 3}}
+    print("  m   K   calls   full width    mcts" + "".join(f"   mcts, {name}" for name in widened))
+    for depth, count in ((1, 8), (1, 12), (1, 16), (2, 4), (2, 6), (2, 8)):
+        P_DD = leaf
+        for _ in range(depth):
+            P_DD = model.improved(P_DD)
+        best_N = model.v(model.improved(P_DD), state_ND)
+
+        def searched(num_actions: int, find: Callable[..., Any]) -> tuple[float, int]:
+            drawn = DrawnActions(model, num_actions)
+            proposal = MixtureProposal(_Observed(model), policy, num_actions, 2.0, torch.tensor([1]))  # type: ignore[arg-type]
+            drawn.redraw(proposal)
+            v_leaf = lambda state_N: model.v(leaf, model.states(state_N))  # noqa: E731
+            look = find(drawn, root_B, depth=depth, v_leaf=v_leaf)  # noqa: B023
+            action_NX = proposal(root_B).action_NKX[torch.arange(roots), look.q_BA.argmax(-1)]
+            short = best_N - model.q(P_DD, state_ND, action_NX)  # noqa: B023
+            return float(short.mean()), look.model_calls // roots
+
+        wide, calls = searched(count, expectimax)
+        cells = [searched(_ACTIONS, partial(mcts, simulations=max(1, calls // _ACTIONS)))[0]]
+        for options in widened.values():
+            # A simulation takes at least a call, and C where it reaches a new node.
+            least = calls - _ACTIONS + 1
+            while True:
+                short, taken = searched(_ACTIONS, partial(mcts, simulations=least, **options))
+                if taken <= calls:
+                    break
+                least = min(least - 1, least * calls // taken)
+            cells.append(short)
+        print(
+            f"{depth:3}{count:4}{calls:8}{wide:13.4f}{cells[0]:8.4f}" + "".join(f"{cell:14.4f}" for cell in cells[1:])
+        )
+
+
 def ours(env: str, steps: int, every: int, seed: int) -> Iterator[tuple[int, float]]:
-    model = PGTS(env, policy="gaussian", seed=seed, **OURS.get(env, SIMULATED))
+    model = PGTS(env.split()[0], seed=seed, **{"policy": "gaussian"} | OURS[env])
     with Evaluator(10) as score:
         while model.num_env_steps < steps:
             model.learn(min(model.num_env_steps - model.num_env_steps % every + every, steps))
@@ -80,8 +135,8 @@ def stable_baselines(name: str) -> Callable[[str, int, int, int], Iterator[tuple
         import stable_baselines3
         from stable_baselines3.common.evaluation import evaluate_policy
 
-        model = getattr(stable_baselines3, name)("MlpPolicy", gymnasium.make(env), seed=seed, device="cpu")
-        judged = stable_baselines3.common.monitor.Monitor(gymnasium.make(env))
+        model = getattr(stable_baselines3, name)("MlpPolicy", gymnasium.make(env.split()[0]), seed=seed, device="cpu")
+        judged = stable_baselines3.common.monitor.Monitor(gymnasium.make(env.split()[0]))
         while model.num_timesteps < steps:
             model.learn(min(every, steps - model.num_timesteps), reset_num_timesteps=False)
             judged.reset(seed=0)
@@ -108,8 +163,9 @@ def learning(args: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["draws", "learning"])
+    parser.add_argument("what", choices=["draws", "search", "learning"])
     parser.add_argument("--counts", type=int, nargs="+", default=[2, 4, 8, 16, 32, 64, 128])
+    parser.add_argument("--roots", type=int, default=100)
     parser.add_argument("--env", default="Pendulum-v1", choices=list(OURS))
     parser.add_argument("--learners", nargs="+", default=list(LEARNERS), choices=list(LEARNERS))
     parser.add_argument("--seeds", type=int, default=5)
@@ -119,6 +175,8 @@ def main() -> None:
     torch.set_num_threads(1)
     if args.what == "draws":
         draws(args.counts)
+    elif args.what == "search":
+        search(args.roots)
     else:
         learning(args)
 
