@@ -32,19 +32,28 @@ from pgts_torch.models.linear import LinearQuadratic
 from pgts_torch.search import expectimax, mcts
 
 GAMMA, STATES, _ACTIONS = 0.9, 500, 16
-NORMALIZED: dict[str, Any] = {"policy": {"type": "gaussian", "network": {"type": "mlp", "normalize": True}}}
 SIMULATED: dict[str, Any] = {
-    **NORMALIZED,
+    "policy": {"type": "gaussian", "network": {"type": "mlp", "normalize": True}},
     "depth": 0,
     "num_envs": 4,
     "horizon": {"type": "fixed", "length": 250},
     "max_roots": 400,
 }
+UPHILL: dict[str, Any] = SIMULATED | {
+    "depth": 3,
+    "action_repeat": 20,
+    "actions": 8,
+    "proposal_scale": 3.0,
+    "search": {"kind": "mcts", "widening": 1, "simulations": 80},
+    "num_envs": 1,
+    "max_roots": 100,
+    "update": {"type": "mpo", "kl_mean": 0.3, "learning_rate": 3e-3, "minibatch_size": 32, "num_epochs": 20},
+}
 OURS: dict[str, dict[str, Any]] = {
-    "Pendulum-v1": {"depth": 0, "replay": "uniform"},
-    "MountainCarContinuous-v0": {"depth": 0, "model": "ensemble"},
-    "InvertedPendulum-v5": {"depth": 0, "replay": {"type": "uniform", "starts": 16, "length": 64}},
-    "InvertedPendulum-v5 ensemble": {"depth": 0, "model": "ensemble"},
+    "Pendulum-v1": {"policy": "gaussian", "depth": 0, "replay": "uniform"},
+    "MountainCarContinuous-v0": UPHILL,
+    "InvertedPendulum-v5": SIMULATED | {"horizon": {"type": "fixed", "length": 100}},
+    "InvertedPendulum-v5 ensemble": {"policy": "gaussian", "depth": 0, "model": "ensemble"},
     "Hopper-v5": SIMULATED,
     "HalfCheetah-v5": SIMULATED,
 }
@@ -123,7 +132,7 @@ def search(roots: int) -> None:
 
 
 def ours(env: str, steps: int, every: int, seed: int) -> Iterator[tuple[int, float]]:
-    model = PGTS(env.split()[0], seed=seed, **{"policy": "gaussian"} | OURS[env])
+    model = PGTS(env.split()[0], seed=seed, **OURS[env])
     with Evaluator(10) as score:
         while model.num_env_steps < steps:
             model.learn(min(model.num_env_steps - model.num_env_steps % every + every, steps))

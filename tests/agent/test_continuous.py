@@ -184,9 +184,16 @@ def test_a_lookahead_trains_the_double_integrator_to_nearly_its_best_return():
     assert after.discounted_return.mean > 0.8 * before.discounted_return.mean
 
 
-def test_rewards_of_any_size_train_the_same_policy():
-    one, other = (PGTS(lambda: Cart(reward_scale=2.0**k), **SMALL | {"gamma": GAMMA}) for k in (-10, 20))  # noqa: B023
+REPLAYED = {"policy": "gaussian", "actions": 4, "depth": 0, "replay": {"type": "uniform", "starts": 4, "length": 10}}
+
+
+@pytest.mark.parametrize("options", [SMALL, REPLAYED], ids=["rollouts", "replay"])
+def test_rewards_of_any_size_train_the_same_policy(options):
+    horizon = {"type": "steps", "length": 20, "first": 60} if options is REPLAYED else options["horizon"]
+    given = options | {"gamma": GAMMA, "horizon": horizon}
+    one, other = (PGTS(lambda: Cart(reward_scale=2.0**k), **given) for k in (-10, 20))  # noqa: B023
     for model in (one, other):
+        model.iterate()
         model.iterate()
     assert all(map(torch.equal, one.policy.network.weights, other.policy.network.weights))
 

@@ -127,7 +127,7 @@ def test_a_shipped_configuration_is_valid_and_says_what_it_shows(name: str) -> N
 def test_the_shipped_configurations_are_those_of_the_paper_and_of_gymnasium() -> None:
     own = {"deep_sea", "deep_sea_bsuite", "deep_sea_stochastic", "grid", "ladder", "random", "tightrope"}
     toy_text = {"cliff_walking", "frozen_lake_4x4", "frozen_lake_8x8", "taxi"}
-    others = toy_text | {"acrobot", "cartpole", "mountain_car", "door_key"}
+    others = toy_text | {"acrobot", "cartpole", "mountain_car", "mountain_car_continuous", "door_key"}
     images = {"catch", "minigrid_door_key", "minigrid_empty"}
     learned = {f"learned_{name}" for name in (toy_text | {"acrobot", "cartpole", "deep_sea", "mountain_car"} | images)}
     games = {f"atari_{name}" for name in ("breakout", "freeway", "montezuma_revenge", "pong")}
