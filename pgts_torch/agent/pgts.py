@@ -33,7 +33,7 @@ from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
 from pgts_torch.agent.watching import Watching
 from pgts_torch.agent.world import SimulatedWorld, TabularWorld
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.base import Model
 from pgts_torch.models.environments import Given, close_environments
 from pgts_torch.options.arguments import shortest
@@ -298,9 +298,10 @@ class PGTS:
                 evaluates and at the end, and results. A training that goes on writes into the same folder.
 
         Raises:
-            PgtsError: a callback that cannot be called; the folder is none, or has events of another training; or the
-                environment failed, naming step and seeds.
+            PgtsError: a number of steps that is none; a callback that cannot be called; the folder is none, or has
+                events of another training; or the environment failed, naming step and seeds.
         """
+        check_count("total_steps", total_steps, least=0)
         callbacks = [callback] if callable(callback) else callback
         if not isinstance(callbacks, Sequence) or not all(map(callable, callbacks)):
             raise PgtsError(f"callback is {callback!r}; it must be a function of (model, iteration), or a list of such")

@@ -289,6 +289,9 @@ def _making(name: str) -> Iterator[None]:
         raise
     except gymnasium.error.DependencyNotInstalled as error:
         raise PgtsError(f"{name} needs something that is not installed: {error}") from error
+    except gymnasium.error.NameNotFound as error:
+        way_out = f" MODULE:{name} imports the module that registers it" * (":" not in name)
+        raise PgtsError(f"{name} cannot be made: {error}{way_out}") from error
     except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
         raise PgtsError(f"{name} cannot be made: {error}") from error
     except BaseException as error:

@@ -49,7 +49,7 @@ class Meter:
 
     @property
     def seconds(self) -> float:
-        """Since the iteration began."""
+        """Since the iteration began, without what is done once in its first query, as loops are compiled."""
         return self._clock() - self._begun
 
     def update(self) -> None:
@@ -96,9 +96,12 @@ class Meter:
             self._sizes = []
         level, left, growth = len(self._sizes), state_N, None
         if divides and level <= 1 and len(state_N) > 2 * (_FIRST + _FEW):
-            for few in (_FIRST, _FEW):
-                probe, left = left[:few], left[few:]
-                self._timed(ask, probe)
+            begun = self._clock()
+            self._timed(ask, left[:_FIRST])
+            first = self._clock() - begun
+            probe, left = left[_FIRST : _FIRST + _FEW], left[_FIRST + _FEW :]
+            self._timed(ask, probe)
+            self._begun += max(0.0, first - self._rate * _FIRST)
             # States follow each other along episodes. Their children that were visited are no new states, but what
             # follows the others grows by all.
             follow, new = children(probe)

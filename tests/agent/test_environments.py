@@ -125,6 +125,10 @@ def test_an_id_that_names_its_module_is_imported_from_there(tmp_path, monkeypatc
     assert PGTS.load(tmp_path / "model.pt", trust_imports=True).num_env_steps == 10
     with pytest.raises(PgtsError, match="nothing_of_mine:Field-v0 cannot be made: No module named"):
         PGTS("nothing_of_mine:Field-v0")
+    with pytest.raises(PgtsError, match=r"doesn't exist\. MODULE:Meadow-v0 imports the module that registers it$"):
+        PGTS("Meadow-v0")
+    with pytest.raises(PgtsError, match=r"Environment `Meadow` doesn't exist\.$"):
+        PGTS("fields_of_mine:Meadow-v0")
 
 
 def test_continuous_actions_need_no_model_where_advantages_are_sampled():

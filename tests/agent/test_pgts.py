@@ -103,6 +103,14 @@ def test_learn_counts_the_steps_of_all_calls():
     assert model.num_iterations == 4
 
 
+@pytest.mark.parametrize("total_steps", ["100", -1, 1.5, True, None])
+def test_steps_that_are_no_number_of_steps_are_refused_before_any_is_made(total_steps):
+    model = make()
+    with pytest.raises(PgtsError, match=f"^total_steps is {total_steps!r}; it must be a whole number of at least 0$"):
+        model.learn(total_steps)
+    assert model.num_env_steps == 0
+
+
 def test_a_callback_sees_every_iteration_and_ends_the_training_by_returning_false():
     seen = []
 

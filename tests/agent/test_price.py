@@ -131,6 +131,21 @@ def test_a_few_of_many_roots_are_queried_first_where_a_model_answers_singly():
     assert sizes[:3] == [8, 32, roots - 40]
 
 
+def test_what_is_done_once_in_the_first_query_is_no_part_of_the_price(monkeypatch, capsys):
+    prices = []
+    for once in (0.0, 90.0):
+        model = PGTS(**CASES["many roots in a simulator"])
+        said, queried = ticking(model, monkeypatch, patience=0.05)
+        clock = functools.partial(lambda once, queried: 1e-3 * queried[0] + once * (queried[0] > 0), once, queried)
+        monkeypatch.setattr(price, "Meter", functools.partial(Meter, patience=0.05, clock=clock))
+        model.iterate()
+        assert len(said) == 1
+        prices.append(model.pricing.price)
+    assert prices[1].seconds == pytest.approx(prices[0].seconds)
+    assert prices[0].seconds > 0.1
+    assert "cheaper" not in capsys.readouterr().err
+
+
 def test_a_price_that_follows_the_roots_alone_would_be_wrong():
     model = PGTS(**CASES["paths that never meet"])
     iteration = model.iterate()

@@ -197,6 +197,15 @@ def test_environments_have_panels_of_their_own_and_scores_are_pooled_where_they_
         compared(scale={"Taxi": (0, 1)})
 
 
+def test_no_scale_is_asked_for_where_no_group_is_in_all_environments(here):
+    for depth, env in enumerate(("CartPole-v1", "Acrobot-v1")):
+        run(Path(f"runs/{env}"), f"--env.id={env}", f"--search.depth={depth}")
+    answer = compared()
+    assert [len(panel["curves"]) for panel in answer["environments"]] == [1, 1]
+    assert answer["notes"] == []
+    assert compared(scale={"Acrobot-v1": (0, 1), "CartPole-v1": (0, 1)})["scaled"] == {}
+
+
 def test_what_is_no_run_or_says_nothing_is_one_sentence(here):
     made(1, seeds=2)
     (here / "photos").mkdir()

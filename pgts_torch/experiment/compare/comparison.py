@@ -328,7 +328,8 @@ def _scaled(panels: Sequence[Panel], scale: Mapping[str, tuple[float, float]], n
     envs = {panel.env.partition(" ")[0] for panel in panels}
     if unknown := [env for env in scale if env not in envs]:
         raise PgtsError(f"--scale names {unknown[0]}; the environments are {', '.join(sorted(envs))}")
-    if len(panels) < 2 and not scale:
+    in_all = set.intersection(*({curve.letter for curve in panel.curves} for panel in panels))
+    if not in_all or (len(panels) < 2 and not scale):
         return {}
     if missing := sorted(envs - scale.keys()):
         notes.add(
@@ -340,4 +341,4 @@ def _scaled(panels: Sequence[Panel], scale: Mapping[str, tuple[float, float]], n
         low, high = scale[panel.env.partition(" ")[0]]
         for curve in panel.curves:
             strata[curve.letter].append((curve.score_R - low) / (high - low))
-    return {letter: estimate(each) for letter, each in strata.items() if len(each) == len(panels)}
+    return {letter: estimate(each) for letter, each in strata.items() if letter in in_all}
