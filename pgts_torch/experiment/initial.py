@@ -25,6 +25,7 @@ from pgts_torch.experiment.resume import flat, plain
 from pgts_torch.experiment.run import build
 from pgts_torch.models.base import LearningModel
 from pgts_torch.models.environments import EnvSource
+from pgts_torch.options.rollouts import Rollouts
 from pgts_torch.options.schema import Option, schema_of
 
 PATIENCE = 600.0
@@ -36,6 +37,12 @@ LONG = 10.0
 
 LONGEST_EPISODE = 500
 """The most steps of a rollout, where the environment's own time limit is longer; `FixedHorizon` where it has none."""
+
+SLOW = 120.0
+"""Where an iteration of the usual size would take more seconds, a smaller one is proposed, as it was tried first."""
+
+FIRST = {"num_envs": 4, "length": 100, "max_roots": 50}
+"""The smaller iteration that is tried first, so that a slow simulator is not waited for."""
 
 FEWEST_ROOTS = 16
 """It starts from so many at least."""
@@ -116,11 +123,13 @@ def propose(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Proposal:
     why = ""
     for way in ways:
         try:
+            if way is fixed and (small := _too_slow(general, limit)) is not None:
+                return small
             tried = _Tried.of(general | way, 0 if is_continuous or way is ways[-1] else LEARNED_DEPTH)
         except MissingModel as error:
             why = why or str(error)
             continue
-        if way is ways[0] and not is_continuous:
+        if way is fixed:
             tried = _deepest(tried)
         if tried.iteration > LONG and tried.roots > FEWEST_ROOTS and way is fixed:
             fewer = max(FEWEST_ROOTS, int(tried.roots * LONG / tried.iteration))
@@ -184,6 +193,15 @@ class _Tried:
             )
             tables = isinstance(algorithm.world, TabularWorld) and algorithm.world.mdp is not None
             return cls(data, proposal, tables, max(algorithm.world.num_actions, 2), _roots(iteration), seconds)
+
+
+def _too_slow(general: dict[str, Any], limit: int) -> Proposal | None:
+    """Try a small training, and propose it where one of the usual size would be too slow; None where it would not."""
+    length, num_envs = min(FIRST["length"], limit), FIRST["num_envs"]
+    rollout = {"num_envs": num_envs, "horizon": {"type": "fixed", "length": length}}
+    tried = _Tried.of(general | {"rollout": rollout, "search": {"max_roots": FIRST["max_roots"]}}, 0)
+    usual = Rollouts.standing("fixed")["num_envs"] * limit
+    return tried.proposal if tried.iteration * usual / (num_envs * length) > SLOW else None
 
 
 def _roots(iteration: Iteration) -> int:

@@ -237,6 +237,15 @@ def test_the_deepest_lookahead_that_is_not_too_slow_is_taken(here, monkeypatch):
     assert initial._deepest(Fake(1)).depth == 0  # type: ignore[arg-type]
 
 
+def test_a_slow_simulator_gets_a_small_iteration_and_is_not_tried_at_the_usual_size(here, monkeypatch):
+    monkeypatch.setattr(initial, "SLOW", 0.0)
+    monkeypatch.setattr(initial, "_deepest", lambda tried: pytest.fail("tried"))
+    config, said = made("walks:Restored")
+    assert (config.rollout.num_envs, config.search.max_roots, config.search.depth) == (4, 50, 0)
+    assert config.rollout.horizon.length == 20
+    assert "simulator" in said["model"]
+
+
 def test_a_class_is_named_by_its_module_wherever_an_id_is(here):
     env = EnvSource.of("walks:Restored", kwargs={"goal": 3}).make_one()
     assert isinstance(env, gymnasium.Env)
