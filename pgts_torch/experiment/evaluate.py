@@ -9,7 +9,7 @@ from pgts_torch.agent.evaluate import Evaluation, Evaluator
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.checkpoint import newest
-from pgts_torch.experiment.ownership import BEST_FILE, is_earlier
+from pgts_torch.experiment.ownership import BEST_FILE, is_earlier, read_mark
 
 KINDS = {"deterministic": True, "sampled": False}
 """The kinds of evaluation: with the most probable actions (True), or with sampled ones."""
@@ -34,7 +34,8 @@ def checkpoint_of(run: Path, which: str) -> Path:
         return last_checkpoint(run)
     if files.kind(run / BEST_FILE) != "file":
         raise PgtsError(
-            f"{run} holds no {BEST_FILE}, which eval.every with eval.keep_best leave: take its last checkpoint"
+            f"{run} holds no {BEST_FILE}, which eval.every with eval.keep_best leave"
+            + ": take its last checkpoint" * (newest(run) is not None)
         )
     return run / BEST_FILE
 
@@ -45,5 +46,7 @@ def last_checkpoint(run: Path) -> Path:
     if found is None and is_earlier(run):
         raise PgtsError(f"{run} is the folder of a run of version 0.1, which this version does not read: train again")
     if found is None:
+        if read_mark(run) is not None:
+            raise PgtsError(f"{run} is a run that has left no checkpoint yet: go on with it (pgts train --resume)")
         raise PgtsError(f"{run} holds no checkpoint; it must be the folder of a run")
     return found[0]

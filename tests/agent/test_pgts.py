@@ -111,6 +111,10 @@ def test_steps_that_are_no_number_of_steps_are_refused_before_any_is_made(total_
     assert model.num_env_steps == 0
 
 
+def test_a_whole_number_of_steps_may_be_a_float():
+    assert make().learn(1e1).num_env_steps == make().learn(10).num_env_steps
+
+
 def test_a_callback_sees_every_iteration_and_ends_the_training_by_returning_false():
     seen = []
 

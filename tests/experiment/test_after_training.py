@@ -1,6 +1,7 @@
 """`pgts watch` and `pgts export`: what they print and write of a finished run, and what they refuse."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -105,3 +106,13 @@ def test_a_run_without_a_best_model_says_what_leaves_one(finished, capsys, tmp_p
         assert "holds no best.pt, which eval.every with eval.keep_best leave" in capsys.readouterr().err
         assert main([command, str(folder)]) == 2
         assert "holds no checkpoint" in capsys.readouterr().err
+
+
+def test_a_run_that_was_cut_off_before_its_first_checkpoint_is_said_to_be_one(finished, capsys, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder, ignore=shutil.ignore_patterns("checkpoints", "best.pt"))
+    for command in ("watch", "export", "evaluate"):
+        assert main([command, str(folder)]) == 2
+        assert "has left no checkpoint yet: go on with it (pgts train --resume)" in capsys.readouterr().err
+    assert main(["watch", str(folder), "--checkpoint", "best"]) == 2
+    assert "take its last" not in capsys.readouterr().err
