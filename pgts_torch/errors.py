@@ -97,7 +97,7 @@ class Stopped(Exception):
         self.signal = signal
 
 
-def check_count(name: str, value: int, *, least: int = 1) -> int:
+def check_count(name: str, value: float, *, least: int = 1) -> int:
     """The value; PgtsError unless it is a whole number of at least `least`."""
     if type(value) is int and value >= least:  # the others take longer to look at
         return value

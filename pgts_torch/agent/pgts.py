@@ -279,7 +279,7 @@ class PGTS:
 
     def learn(
         self,
-        total_steps: int,
+        total_steps: int | float,
         *,
         callback: Callback | Sequence[Callback] = (),
         progress: bool | None = None,
@@ -301,8 +301,9 @@ class PGTS:
             PgtsError: a number of steps that is none; a callback that cannot be called; the folder is none, or has
                 events of another training; or the environment failed, naming step and seeds.
         """
-        whole = isinstance(total_steps, float) and total_steps.is_integer()  # 1e5
-        total_steps = check_count("total_steps", int(total_steps) if whole else total_steps, least=0)
+        if isinstance(total_steps, float) and total_steps.is_integer():
+            total_steps = int(total_steps)  # 1e5
+        total_steps = check_count("total_steps", total_steps, least=0)
         callbacks = [callback] if callable(callback) else callback
         if not isinstance(callbacks, Sequence) or not all(map(callable, callbacks)):
             raise PgtsError(f"callback is {callback!r}; it must be a function of (model, iteration), or a list of such")
