@@ -111,6 +111,13 @@ def _sync(folder: Path) -> None:
         os.close(handle)
 
 
+def as_path(path: str | Path) -> Path:
+    """The path; PgtsError where it is none."""
+    if not isinstance(path, str | Path):
+        raise PgtsError(f"{path!r} is no path; it must be a str or a pathlib.Path")
+    return Path(path)
+
+
 def target(path: str | Path, is_ours: Callable[[bytes], bool], what: str, *, most: int | None = None) -> Path:
     """Where a file may be written, behind symbolic links: nothing is there, or an empty file, or one that we have
     written before.
@@ -120,10 +127,10 @@ def target(path: str | Path, is_ours: Callable[[bytes], bool], what: str, *, mos
         what: it must be, to be replaced.
 
     Raises:
-        PgtsError: something else is there.
+        PgtsError: something else is there, or it is no path.
     """
     with named(f"{path} cannot be written"):
-        place = Path(os.path.realpath(path))
+        place = Path(os.path.realpath(as_path(path)))
     found = kind(place)
     if found == "file" and (raw := read(place, most=most)) and not is_ours(raw):
         raise PgtsError(f"{path} exists and is not {what}: move it away, or choose another name")

@@ -174,9 +174,10 @@ class _Plain(nn.Module):
 
 def _format(path: str | Path, format: Format | None) -> Format:
     """The format that is given, or that the name of the file says."""
-    found = format or next((each for each, end in SUFFIXES.items() if Path(path).suffix == end), None)
+    suffix = files.as_path(path).suffix
+    found = format or next((each for each, end in SUFFIXES.items() if suffix == end), None)
     if found is None or found not in SUFFIXES:
-        given = f"{path} ends in {Path(path).suffix!r}" if format is None else f"format is {format!r}"
+        given = f"{path} ends in {suffix!r}" if format is None else f"format is {format!r}"
         raise PgtsError(f"{given}; a policy is exported as torch ({SUFFIXES['torch']}) or onnx ({SUFFIXES['onnx']})")
     return found
 

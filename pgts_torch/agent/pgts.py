@@ -285,7 +285,8 @@ class PGTS:
         progress: bool | None = None,
         tensorboard: str | Path | None = None,
     ) -> Self:
-        """Iterate until there are `total_steps` environment steps, including those before this call.
+        """Iterate until there are `total_steps` environment steps, including those before this call. Iterations are
+        whole, so there may be more by one iteration.
 
         Args:
             callback: one or more, each called with (self, iteration) after each iteration; if one returns False,

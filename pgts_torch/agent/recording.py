@@ -36,7 +36,7 @@ class Seen(NamedTuple):
 def suffix_of(path: str | Path) -> str:
     """The end of the name of a file, which says what is written; PgtsError where it is another one, or what writes it
     is not installed."""
-    suffix = Path(path).suffix.lower()
+    suffix = files.as_path(path).suffix.lower()
     if suffix not in _SIGNS:
         raise PgtsError(f"{path} ends in {suffix!r}; a recording is a .gif, an .mp4 or, as text, a .txt")
     if suffix == ".mp4" and (find_spec("imageio") is None or find_spec("imageio_ffmpeg") is None):

@@ -248,3 +248,10 @@ def test_a_model_that_cannot_be_saved_leaves_the_file_as_it_was(tmp_path):
         make(reward_range=(Fraction(-5), Fraction(5))).save(path)
     assert path.read_bytes() == whole
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("write", ["save", "record", "export"])
+def test_what_is_no_path_is_refused_by_all_that_write_a_file(write):
+    model = make()
+    with pytest.raises(PgtsError, match=r"^3 is no path; it must be a str or a pathlib.Path$"):
+        getattr(model, write)(3)
