@@ -152,6 +152,7 @@ def test_every_tutorial_is_short_and_ends_with_what_to_try_next():
 def test_the_cells_of_a_tutorial_run_as_plain_python(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = run(TUTORIALS[name].read_text(encoding="utf-8"), SHORT.get(name, {}))
+    assert found[1], "no cell has printed anything"
     if name not in SHORT:
         CLAIMS[name](*found)
 

@@ -67,7 +67,7 @@ class Moment(NamedTuple):
 @final
 class Watching:
     """Episodes of the policy of a training, in environments of their own. The training is not affected, but for the
-    numbers of states, which are numbered anew where they are no table.
+    numbers of states, which get other ones where they are no table.
 
     Args:
         parts: of the training.
@@ -125,7 +125,7 @@ class Watching:
                 self._twin = _Twin(source, mode, self._env)
 
     def close(self) -> None:
-        """Close the environments. The lookahead of the training begins anew where states have other numbers now."""
+        """Close the environments. Where states have other numbers now the lookahead of the training forgets them."""
         close_environments(self._env)
         if self._parts.depth_choice is not None:
             self._parts.depth_choice.look.restart(self._generator())

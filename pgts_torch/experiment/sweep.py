@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 TABLE_FILE, CURVES_FILE = "table.json", "curves.png"
 
-SET_BY_SWEEP = {
-    "search.depth": "--depths says which",
+SET_BY_MANY = {
     "seed": "--seeds says how many",
     "run.dir": "--out is the folder of all runs",
     "run.overwrite": "finished runs are kept, others go on",
@@ -30,6 +29,9 @@ SET_BY_SWEEP = {
     "processes": "every run is one, --jobs says how many run at once",
     "max-restarts": "the same command goes on with runs that were cut off",
 }
+"""Keys that a command sets itself which trains many runs, and which option to use instead."""
+
+SET_BY_SWEEP = {"search.depth": "--depths says which"} | SET_BY_MANY
 """Keys that a sweep sets itself, and which option to use instead."""
 
 

@@ -9,22 +9,12 @@ from typing import Any
 
 from pgts_torch.config import Config, ConfigError, load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.sweep import check_overrides
+from pgts_torch.experiment.sweep import SET_BY_MANY, check_overrides
 
 Value = float | int | str
 Values = Mapping[str, Value]
 
 FORMS = "uniform(LOW,HIGH), log(LOW,HIGH), int(LOW,HIGH), logint(LOW,HIGH) or several values, as in 1,2,4"
-SET_BY_TUNE = {
-    "seed": "--seeds says how many",
-    "run.dir": "--out is the folder of all runs",
-    "run.overwrite": "finished runs are kept, others go on",
-    "threads": "every run has one, --jobs says how many run at once",
-    "processes": "every run is one, --jobs says how many run at once",
-    "max-restarts": "the same command goes on with runs that were cut off",
-}
-"""Keys that a tuning sets itself, and which option to use instead."""
-
 _MEASURES = ("env.id", "env.kwargs", "total_steps", "eval", "log", "run")
 _EVALUATIONS = 10
 
@@ -148,15 +138,15 @@ def plan(
         ConfigError: a configuration is wrong.
         PgtsError: an option cannot be tuned, or is set elsewhere.
     """
-    check_overrides(overrides, SET_BY_TUNE, "tuning")
+    check_overrides(overrides, SET_BY_MANY, "tuning")
     if not options:
         raise PgtsError(f"nothing is tuned: give --option KEY=VALUES, with {FORMS}")
     found = tuple(option(text) for text in options)
     for each in found:
         if sum(each.key == other.key for other in found) > 1:
             raise PgtsError(f"--option {each.key} is given twice")
-        if each.key in SET_BY_TUNE:
-            raise PgtsError(f"--option {each.key} is set by the tuning: {SET_BY_TUNE[each.key]}")
+        if each.key in SET_BY_MANY:
+            raise PgtsError(f"--option {each.key} is set by the tuning: {SET_BY_MANY[each.key]}")
         if any(each.key == key or each.key.startswith(f"{key}.") for key in _MEASURES):
             raise PgtsError(f"--option {each.key} would change what is measured, so trials could not be compared")
         if any(given.partition("=")[0] == f"--{each.key}" for given in overrides):
