@@ -5,8 +5,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pgts_torch.cli.arguments import Parser, output_folder
+from pgts_torch.cli.arguments import Parser
 from pgts_torch.cli.main import exit_code
+from pgts_torch.cli.types import output_folder
 from study import PARTS
 
 

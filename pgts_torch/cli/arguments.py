@@ -1,23 +1,22 @@
-"""The command line's parser, the types of its arguments, its help and its output."""
+"""The command line's parser, arguments that several commands have, help and output."""
 
 import argparse
-import difflib
 import itertools
 import json
-import math
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
-from pgts_torch import files
+from pgts_torch.cli.types import json_object, run_folder, whole
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.ownership import is_earlier
-from pgts_torch.options.fields import INT64_MAX
 from pgts_torch.options.schema import Option
 
+Arguments = Sequence[str]
 WIDTH = 79
+
+FAILED = 1
+"""The exit code where a command has done its work and the answer is no."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -90,128 +89,32 @@ def _value(value: Any) -> str:
     return f"{value:_}" if type(value) is int else json.dumps(value)
 
 
-def whole(least: int, word: str | None = None) -> Callable[[str], Any]:
-    """An argparse type: a whole number of at least `least`, below 2**63; or the word."""
-
-    def convert(text: str) -> int | str:
-        if text == word:
-            return text
-        if not (text.isascii() and text.isdecimal() and len(text) < 20 and least <= int(text) <= INT64_MAX):
-            whole_number = f"a whole number >= {least}"
-            is_not = f"not {whole_number} and below 2**63" if word is None else f"neither {whole_number} nor {word}"
-            raise argparse.ArgumentTypeError(f"{text!r} is {is_not}")
-        return int(text)
-
-    return convert
-
-
-def listed(convert: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
-    """An argparse type: values separated by commas; each counts once."""
-    return lambda text: tuple(dict.fromkeys(map(convert, text.split(","))))
+def add_run(parser: Parser) -> None:
+    """The folder of a run, and which of its checkpoints."""
+    parser.add_argument("run_dir", metavar="RUN_DIR", type=run_folder, help="the folder of a run")
+    parser.add_argument(
+        "--checkpoint",
+        metavar="WHICH",
+        type=whole(0, "last", "best"),
+        default="last",
+        help="last (default); best, the best model by the evaluations of a run with eval.keep_best; or the number of "
+        "environment steps after which one was kept",
+    )
+    add_trust(parser)
 
 
-def choice_of(text: str, known: Collection[str]) -> str:
-    """Return the end of a message about an unknown word: the likeliest one, or all."""
-    close = difflib.get_close_matches(text, known, n=1)
-    return f"did you mean {close[0]}?" if close else f"choose from {', '.join(known)}"
+def add_trust(parser: Parser, when: str = "") -> None:
+    parser.add_argument(
+        "--trust-imports",
+        action="store_true",
+        help=f"{when}import the modules that the saved environment and model name, as MODULE:ID (see SECURITY.md)",
+    )
 
 
-def json_object(text: str) -> dict[str, Any]:
-    """An argparse type: a JSON object."""
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        value = None
-    if not isinstance(value, dict):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a JSON object")
-    return value
-
-
-def unit_interval(text: str) -> float:
-    """An argparse type: a number in [0, 1]."""
-    return _real(text, lambda value: 0 <= value <= 1, "a number in [0, 1]")
-
-
-def positive(text: str) -> float:
-    """An argparse type: a number above 0."""
-    return _real(text, lambda value: 0 < value < math.inf, "a number above 0")
-
-
-def _real(text: str, is_fine: Callable[[float], bool], what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not is_fine(value):
-        raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
-    return value
-
-
-def env_scale(text: str) -> tuple[str, tuple[float, float]]:
-    """An argparse type: ENV=LOW,HIGH."""
-    env, _, ends = text.rpartition("=")
-    try:
-        low, high = map(float, ends.split(","))
-    except ValueError:
-        low = high = math.nan
-    if not (env and math.isfinite(high - low) and low < high):
-        raise argparse.ArgumentTypeError(f"{text!r} is not ENV=LOW,HIGH, with two ascending numbers")
-    return env, (low, high)
-
-
-def path_kind(text: str) -> str | None:
-    """Return what is at a path (`files.kind`); ArgumentTypeError where it cannot be looked up."""
-    try:
-        with files.named(f"{text!a}"):
-            text.encode()  # bytes that the locale lacks were escaped, and can be looked up, but not written down
-        return files.kind(text, follow=True)
-    except PgtsError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def output_folder(text: str) -> Path:
-    """An argparse type: a folder, which need not exist yet."""
-    if path_kind(text) not in (None, "folder"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
-    return Path(text)
-
-
-def html_file(text: str) -> Path:
-    """An argparse type: a path that ends in .html, in an existing folder."""
-    if Path(text).suffix != ".html" or path_kind(text) == "folder":
-        raise argparse.ArgumentTypeError(f"{text!r} is not a file that ends in .html")
-    return file_path(text)
-
-
-def file_path(text: str) -> Path:
-    """An argparse type: the path of a file, which need not exist yet, in an existing folder."""
-    path = Path(text)
-    if path_kind(text) == "folder":
-        raise argparse.ArgumentTypeError(f"{text!r} is a folder; it must be a file")
-    if not path.parent.is_dir():
-        raise argparse.ArgumentTypeError(f"{text!r}: {str(path.parent)!r} is not a folder")
-    return path
-
-
-def film_path(text: str) -> Path:
-    """An argparse type: a path that ends in .gif, .mp4 or .txt, in an existing folder."""
-    if Path(text).suffix.lower() not in (".gif", ".mp4", ".txt"):
-        raise argparse.ArgumentTypeError(f"{text!r} does not end in .gif, .mp4 or .txt")
-    return file_path(text)
-
-
-def run_folder(text: str) -> Path:
-    """An argparse type: a folder that has the config.yaml of a run."""
-    path = Path(text)
-    if path_kind(text) != "folder":
-        raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
-    if not (path / "config.yaml").is_file():
-        raise argparse.ArgumentTypeError(f"{text!r} is not the folder of a run: it has no config.yaml")
-    if is_earlier(path):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is the folder of a run of version 0.1: read it with that, or train again"
-        )
-    return path
+def add_kwargs(parser: Parser) -> None:
+    parser.add_argument(
+        "--kwargs", metavar="JSON", type=json_object, default={}, help='for gymnasium.make, as {"is_slippery": false}'
+    )
 
 
 def print_values(answer: Mapping[str, Any], *, as_json: bool) -> None:

@@ -5,9 +5,10 @@ import importlib.metadata
 import sys
 from collections.abc import Callable
 
-from pgts_torch.cli.arguments import Parser, choice_of, summary
-from pgts_torch.cli.commands import COMMANDS, Arguments
+from pgts_torch.cli.arguments import Arguments, Parser, summary
+from pgts_torch.cli.commands import COMMANDS
 from pgts_torch.cli.terminal import plain_warnings, rank, safe_output
+from pgts_torch.cli.types import choice_of
 from pgts_torch.errors import LOST, NotFinite, PgtsError, RankLost, Stopped
 
 TRAINING_FAILED = 1
@@ -65,7 +66,9 @@ def _run_command(arguments: Arguments) -> None:
     summaries = [f"  {name:<12}{summary(function)}" for name, function in COMMANDS.items()]
     usage = "pgts [-h] [--version] COMMAND ..."
     parser = Parser(main, prog="pgts", usage=usage, description="Policy gradient with tree search.")
-    parser.epilog = "\n".join(["commands:", *summaries, "", "pgts COMMAND --help explains each."])
+    parser.epilog = "\n".join(
+        ["commands:", *summaries, "", "pgts init ENV is where to begin; pgts COMMAND --help explains each."]
+    )
     parser.add_argument("--version", action="store_true", help="print the version and stop")
     parser.add_argument("command", metavar="COMMAND", nargs="?", help="what to do")
     parser.add_argument("arguments", metavar="...", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)

@@ -9,7 +9,8 @@ import sys
 import warnings
 from pathlib import Path
 
-from pgts_torch.cli.commands import COMMANDS, Arguments
+from pgts_torch.cli.arguments import Arguments
+from pgts_torch.cli.commands import COMMANDS
 from pgts_torch.cli.main import exit_code
 from pgts_torch.cli.terminal import rank
 from pgts_torch.errors import LOST, RankLost

@@ -1,4 +1,4 @@
-"""The data behind `pgts evaluate`: evaluate the last checkpoint of a run."""
+"""The data behind `pgts evaluate`: evaluate a checkpoint of a run."""
 
 from pathlib import Path
 
@@ -9,35 +9,44 @@ from pgts_torch.agent.evaluate import Evaluation, Evaluator
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.checkpoint import newest
-from pgts_torch.experiment.ownership import BEST_FILE, is_earlier, read_mark
+from pgts_torch.experiment.ownership import BEST_FILE, checkpoints, is_earlier, read_mark
 
 KINDS = {"deterministic": True, "sampled": False}
 """The kinds of evaluation: with the most probable actions (True), or with sampled ones."""
 
 
-def evaluate_run(run: str | Path, *, episodes: int, seed: int, trust_imports: bool = False) -> dict[str, Evaluation]:
-    """Evaluate the last checkpoint of a run, with greedy and with sampled actions."""
+def evaluate_run(
+    run: Path, *, checkpoint: str | int = "last", episodes: int, seed: int, trust_imports: bool = False
+) -> dict[str, Evaluation]:
+    """Evaluate a checkpoint of a run, as `checkpoint_of` takes it, with greedy and with sampled actions."""
     torch.set_num_threads(1)
-    loaded = PGTS.load(last_checkpoint(Path(run)), trust_imports=trust_imports)
+    loaded = PGTS.load(checkpoint_of(run, checkpoint), trust_imports=trust_imports)
     with loaded as algorithm, Evaluator(episodes) as evaluator:
         return {kind: evaluator(algorithm, deterministic=greedy, seed=seed) for kind, greedy in KINDS.items()}
 
 
-def checkpoint_of(run: Path, which: str) -> Path:
-    """Return the path of the best model of a run folder, or of its newest intact checkpoint; PgtsError if there is
-    none.
+def checkpoint_of(run: Path, which: str | int) -> Path:
+    """Return the path of a checkpoint of a run folder; PgtsError if there is none.
 
     Args:
-        which: "best" or "last".
+        which: "last", the newest intact one; "best", the best model by its evaluations; or the number of environment
+            steps after which it was written.
     """
     if which == "last":
         return last_checkpoint(run)
-    if files.kind(run / BEST_FILE) != "file":
-        raise PgtsError(
-            f"{run} holds no {BEST_FILE}, which eval.every with eval.keep_best leave"
-            + ": take its last checkpoint" * (newest(run) is not None)
-        )
-    return run / BEST_FILE
+    kept = checkpoints(run)
+    if which == "best":
+        if files.kind(run / BEST_FILE) != "file":
+            raise PgtsError(
+                f"{run} holds no {BEST_FILE}, which eval.every with eval.keep_best leave"
+                + ": take its last checkpoint" * bool(kept)
+            )
+        return run / BEST_FILE
+    for path in kept:
+        if int(path.stem) == which:
+            return path
+    steps = ", ".join(str(int(path.stem)) for path in kept)
+    raise PgtsError(f"{run} holds no checkpoint of step {which}" + f"; it has those of {steps}" * bool(kept))
 
 
 def last_checkpoint(run: Path) -> Path:

@@ -12,13 +12,13 @@ from pgts_torch.experiment.ownership import EXPORT_FILES
 
 
 def export_run(
-    run: Path, out: Path | None, *, format: Format | None, checkpoint: str, trust_imports: bool = False
+    run: Path, out: Path | None, *, format: Format | None, checkpoint: str | int, trust_imports: bool = False
 ) -> dict[str, Any]:
     """Export the policy of a checkpoint, by default into the folder of the run.
 
     Args:
         format: default: by the end of `out`, or torch.
-        checkpoint: "best" or "last".
+        checkpoint: as `checkpoint_of` takes it.
 
     Returns:
         What the file says of itself; "file" is its path.

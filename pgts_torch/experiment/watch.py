@@ -20,7 +20,7 @@ def watch_run(
     run: Path,
     out: Path | None,
     *,
-    checkpoint: str,
+    checkpoint: str | int,
     episodes: int,
     fps: float | None,
     quiet: bool,
@@ -30,7 +30,7 @@ def watch_run(
     """Record episodes of a run, or print them; they are printed, too, where the environment cannot be drawn.
 
     Args:
-        checkpoint: "best" or "last".
+        checkpoint: as `checkpoint_of` takes it.
         fps: of a file; in a terminal the most steps a second, by default as many as there are.
         quiet: whether nothing is printed in place of the text form.
         options: others of `PGTS.record`.

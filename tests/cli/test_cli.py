@@ -54,8 +54,8 @@ class FakeEvaluation(types.ModuleType):
         super().__init__("pgts_torch.experiment.evaluate")
         self.calls: list[Any] = []
 
-    def evaluate_run(self, run: Path, *, episodes: int, seed: int, trust_imports: bool) -> dict[str, Answer]:
-        self.calls.append((run, episodes, seed, trust_imports))
+    def evaluate_run(self, run: Path, **options: Any) -> dict[str, Answer]:
+        self.calls.append((run, *options.values()))
         return {"sampled": Answer(0.25), "deterministic": Answer(0.5, 0.125)}
 
 
@@ -165,7 +165,7 @@ def test_evaluate_passes_on_its_arguments_and_prints_for_people_or_programs(
     fake = FakeEvaluation()
     monkeypatch.setitem(sys.modules, "pgts_torch.experiment.evaluate", fake)
     (here / "config.yaml").write_text(dump(Config()))
-    assert main(["evaluate", ".", "--episodes", "7", "--seed", "3"]) == 0
+    assert main(["evaluate", ".", "--episodes", "7", "--seed", "3", "--checkpoint", "40"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "sampled.mean              0.25",
         "sampled.half_width        none",
@@ -174,7 +174,7 @@ def test_evaluate_passes_on_its_arguments_and_prints_for_people_or_programs(
     ]
     assert main(["evaluate", "--json", "."]) == 0
     assert json.loads(capsys.readouterr().out)["deterministic"] == {"mean": 0.5, "half_width": 0.125}
-    assert fake.calls == [(Path("."), 7, 3, False), (Path("."), 100, 0, False)]
+    assert fake.calls == [(Path("."), 40, 7, 3, False), (Path("."), "last", 100, 0, False)]
 
 
 def test_an_error_of_the_run_is_one_line_and_ctrl_c_exits_with_130(

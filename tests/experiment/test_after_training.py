@@ -84,7 +84,7 @@ def test_the_last_or_the_best_model_is_exported(finished, capsys, tmp_path):
         (["--out", "film.avi"], "argument --out: 'film.avi' does not end in .gif, .mp4 or .txt"),
         (["--out", "none/film.gif"], "argument --out: 'none/film.gif': 'none' is not a folder"),
         (["--fps", "0"], "argument --fps: '0' is not a number above 0"),
-        (["--checkpoint", "first"], "argument --checkpoint: invalid choice: 'first'"),
+        (["--checkpoint", "first"], "argument --checkpoint: 'first' is neither a whole number >= 0 nor last nor best"),
     ],
 )
 def test_a_mistake_is_named_before_anything_is_loaded(finished, more, mistake, capsys, tmp_path, monkeypatch):
@@ -106,6 +106,25 @@ def test_a_run_without_a_best_model_says_what_leaves_one(finished, capsys, tmp_p
         assert "holds no best.pt, which eval.every with eval.keep_best leave" in capsys.readouterr().err
         assert main([command, str(folder)]) == 2
         assert "holds no checkpoint" in capsys.readouterr().err
+
+
+def test_a_checkpoint_is_chosen_by_its_step(finished, capsys, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    kept = [int(path.stem) for path in sorted((folder / "checkpoints").iterdir())]
+    assert len(kept) > 1
+    assert [PGTS.load(checkpoint_of(folder, step)).num_env_steps for step in kept] == kept
+    assert main(["evaluate", str(folder), "--checkpoint", str(kept[0]), "--episodes", "3", "--json"]) == 0
+    first = json.loads(capsys.readouterr().out)
+    shutil.rmtree(folder / "checkpoints")
+    (folder / "checkpoints").mkdir()
+    shutil.copy(finished / "checkpoints" / f"{kept[0]:012d}.pt", folder / "checkpoints")
+    assert main(["evaluate", str(folder), "--episodes", "3", "--json"]) == 0  # the last one, where no other is left
+    assert json.loads(capsys.readouterr().out) == first
+    for command in ("watch", "export", "evaluate"):
+        assert main([command, str(finished), "--checkpoint", "7"]) == 2
+        steps = ", ".join(map(str, kept))
+        assert f"holds no checkpoint of step 7; it has those of {steps}\n" in capsys.readouterr().err
 
 
 def test_a_run_that_was_cut_off_before_its_first_checkpoint_is_said_to_be_one(finished, capsys, tmp_path):

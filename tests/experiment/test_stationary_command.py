@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pgts_torch.cli.commands import STATIONARY_OPTIONS
+from pgts_torch.cli.commands.stationary import MDPS
 from pgts_torch.cli.main import main
 from pgts_torch.tabular import deep_sea, exact, grid, ladder, random_mdp, stationary_sets, tightrope
 
@@ -137,7 +137,7 @@ def test_a_long_table_shows_the_depths_at_which_something_changes(tmp_path, monk
 MISTAKES = {
     "": "WHAT",
     "laddr": "'laddr' is not an MDP; did you mean ladder?",
-    "xyz": ", ".join(STATIONARY_OPTIONS),
+    "xyz": ", ".join(MDPS),
     "none.npz": "'none.npz' is not a file",
     "tightrope --n 3": "--n does not apply to tightrope, which takes --gamma, --start",
     "ladder --mdp-seed 3": "--mdp-seed does not apply to ladder",
@@ -174,5 +174,5 @@ def test_the_help_tells_the_names_and_the_arrays_of_a_file(capsys):
     assert main(["stationary", "--help"]) == 0
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) < 80
-    for word in [*STATIONARY_OPTIONS, 'numpy.savez("mdp.npz", P=P, R=R, gamma=0.9)', "[S, A, S]", "[S, A]", "start"]:
+    for word in [*MDPS, 'numpy.savez("mdp.npz", P=P, R=R, gamma=0.9)', "[S, A, S]", "[S, A]", "start"]:
         assert word in out

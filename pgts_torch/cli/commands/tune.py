@@ -1,0 +1,92 @@
+"""The command `pgts tune`."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+from pgts_torch.cli.arguments import FAILED, Arguments, Parser
+from pgts_torch.cli.terminal import print_kept
+from pgts_torch.cli.types import output_folder, unit_interval, whole
+
+TUNED_METRICS = ("eval/deterministic_return", "eval/sampled_return", "exact/J")
+
+HELP = """\
+Keys of the configuration and of --option are those of pgts train. Trials that
+are done are kept and others go on from their last checkpoint, so a tuning that
+was cut off goes on when it is started again, and more trials can be added.
+Every run has one thread. A trial that fails is named and the others go on.
+tune.json, tune.png and best.yaml are written; pgts train takes the last one."""
+
+
+def tune(arguments: Arguments) -> None:
+    """Look for good values of options, over several seeds."""
+    parser = Parser(tune, usage="%(prog)s --out DIR --option KEY=VALUES ... [--KEY VALUE ...]")
+    parser.add_argument("--out", metavar="DIR", type=output_folder, help="for DIR/trial-N/seed-S and the results")
+    parser.add_argument(
+        "--option",
+        metavar="KEY=VALUES",
+        action="append",
+        default=[],
+        help="which values a key may have: uniform(LOW,HIGH), log(LOW,HIGH), int(LOW,HIGH), logint(LOW,HIGH), or "
+        "several as in 1,2,4; once for each key",
+    )
+    parser.add_argument("--config", metavar="FILE", help="as for pgts train; none: the defaults")
+    parser.add_argument("--trials", metavar="N", type=whole(1), default=50, help="in all (default: %(default)s)")
+    parser.add_argument(
+        "--seeds", metavar="N", type=whole(1), default=3, help="of each trial, 0 to N - 1 (default: %(default)s)"
+    )
+    parser.add_argument("--jobs", metavar="N", type=whole(1), default=1, help="seeds at once (default: %(default)s)")
+    parser.add_argument(
+        "--metric",
+        choices=TUNED_METRICS,
+        default=TUNED_METRICS[0],
+        help="of the trained policy, higher is better (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--sampler", choices=("tpe", "random"), default="tpe", help="what proposes values (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--prune",
+        metavar="SHARE",
+        type=unit_interval,
+        default=0.5,
+        help="end trials whose best evaluation is among this share of the worst; 0: none (default: 0.5, the median)",
+    )
+    parser.add_argument(
+        "--prune-trials",
+        metavar="N",
+        type=whole(0),
+        default=5,
+        help="complete trials before any is pruned (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--prune-steps",
+        metavar="N",
+        type=whole(0),
+        default=0,
+        help="environment steps, of all seeds together, before a trial is pruned (default: %(default)s)",
+    )
+    parser.add_argument("--storage", metavar="FILE", type=Path, help="Optuna's, of SQLite (default: DIR/tune.db)")
+    parser.add_argument(
+        "--confirm", metavar="N", type=whole(0), default=0, help="train the best one with N other seeds (default: 0)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the results as one JSON object")
+    parser.epilog = HELP
+    given, overrides = parser.parse_known_args(arguments)
+    if given.out is None:
+        parser.error("the following arguments are required: --out")
+    from pgts_torch.experiment.tune import space
+
+    settings = {name: getattr(given, name) for name in ("seeds", "metric", "out")}
+    plan = space.plan(given.config, overrides, options=given.option, **settings)
+    from pgts_torch.experiment.tune import result
+    from pgts_torch.experiment.tune.study import Pruning
+
+    answer = result.tune(
+        plan,
+        pruning=Pruning(given.prune, given.prune_trials, given.prune_steps),
+        **{name: getattr(given, name) for name in ("trials", "jobs", "sampler", "storage", "confirm")},
+    )
+    print_kept(json.dumps(asdict(answer)) if given.json else result.describe(answer), kept=f"{given.out}/tune.json")
+    if answer.best is None:
+        raise SystemExit(FAILED)
