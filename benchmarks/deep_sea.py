@@ -39,7 +39,7 @@ UPDATES = {
         "step_size": STEP_SIZE,
         "state_weight": "uniform",
         "normalize": "none",
-        "floor": None,
+        "floor": 12.0,
     },
 }
 METHODS = ("ppo", "a2c", *(f"pgts-{m}" for m in DEPTHS), "h-pmd-16", "pgts-adaptive")

@@ -438,8 +438,8 @@ class PGTS:
 
     def export(self, path: str | Path, *, format: exporting.Format | None = None) -> dict[str, Any]:
         """Write the policy as a program that acts without this package: from observations, as the environment gives
-        them, to probabilities (or mean and standard deviation) and to the action that `predict` returns. If several
-        processes train together all must call it, and the first one writes.
+        them, to probabilities (or mean and standard deviation) and to the action that `predict` returns. It does not
+        check what it is given. If several processes train together all must call it, and the first one writes.
 
         Args:
             path: an earlier export there is replaced.

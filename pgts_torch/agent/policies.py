@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from typing import Any, final
 
 import torch
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor
 
 from pgts_torch.agent.components import legal_only
@@ -76,21 +76,22 @@ class Policy(ABC):
         """Load parameters of the same shape; PgtsError if they do not fit."""
 
     def sample(self, observation_N: Tensor, *, generator: torch.Generator) -> Num[Tensor, "N ..."]:
-        """Sample one action for each observation.
+        """Sample one action for each observation; NotFinite where a probability is not finite."""
+        return drawn(self.probs(observation_N), generator=generator)
 
-        It is the action with the largest pi(a|o) / E_a for exponentially distributed E_a, as in `torch.multinomial`,
-        which takes five times as long because it checks its probabilities.
 
-        Raises:
-            NotFinite: a probability is not finite.
-        """
-        pi_NA = self.probs(observation_N)
-        score_N, action_N = (pi_NA / torch.empty_like(pi_NA).exponential_(generator=generator)).max(-1)
-        if not math.isfinite(score_N.sum()):
-            off_N = score_N.isnan() | ~pi_NA.isfinite().all(-1)
-            if bool(off_N.any()):
-                raise NotFinite(f"the policy's probabilities are {pi_NA[off_N][0].tolist()}", what="probability")
-        return action_N
+def drawn(pi_NA: Float[Tensor, "N A"], *, generator: torch.Generator) -> Int[Tensor, "N"]:
+    """Sample one action from each row of weights, which need not add up to 1.
+
+    It is the action with the largest pi(a|o) / E_a for exponentially distributed E_a, as in `torch.multinomial`, which
+    takes five times as long because it checks its probabilities.
+    """
+    score_N, action_N = (pi_NA / torch.empty_like(pi_NA).exponential_(generator=generator)).max(-1)
+    if not math.isfinite(score_N.sum()):
+        off_N = score_N.isnan() | ~pi_NA.isfinite().all(-1)
+        if bool(off_N.any()):
+            raise NotFinite(f"the policy's probabilities are {pi_NA[off_N][0].tolist()}", what="probability")
+    return action_N
 
 
 class TabularPolicy(Policy):

@@ -2,13 +2,16 @@
 
 import textwrap
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from pydantic import TypeAdapter, ValidationError
 
+from pgts_torch import files
 from pgts_torch.agent.certificate import Trust
 from pgts_torch.agent.evaluate import Evaluation
 from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.ownership import SUMMARY_FILE
 
 EndedBy = Literal["total_steps", "certificate", "return"]
 
@@ -83,12 +86,18 @@ def results(summary: Summary) -> dict[str, float]:
 _SUMMARY = TypeAdapter(Summary)
 
 
-def from_json(raw: bytes) -> Summary:
-    """Return the summary that a run has written; PgtsError if it is of another form."""
+def summary_in(folder: Path) -> Summary | None:
+    """What a finished run came to; None if it is not finished; PgtsError where that cannot be read, or is damaged."""
+    path = folder / SUMMARY_FILE
+    if files.kind(path) is None:
+        return None
     try:
-        return _SUMMARY.validate_json(raw, strict=True)
+        return _SUMMARY.validate_json(files.read(path), strict=True)
     except ValidationError as error:
-        raise PgtsError(first_mistake(error, "summary")) from error
+        raise PgtsError(
+            f"{path} is damaged ({first_mistake(error, 'summary')}): remove it, and the run is summed up again from "
+            "its last checkpoint"
+        ) from error
 
 
 def first_mistake(error: ValidationError, what: str) -> str:

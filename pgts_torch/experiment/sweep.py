@@ -12,7 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from pgts_torch import files
 from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.ownership import CONFIG_FILE, SUMMARY_FILE
+from pgts_torch.experiment.ownership import CONFIG_FILE
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.statistics import Mean, estimate, interquartile_mean
 
@@ -105,6 +105,8 @@ def plan(
             own = {"search.depth": depth, "seed": seed, "threads": 1, "run.dir": folder, "run.overwrite": "false"}
             arguments = [*overrides, *(f"--{key}={value}" for key, value in own.items())]
             runs.append(Run(depth, seed, load(path, arguments), (*shared, *arguments)))
+    from pgts_torch.experiment.summary import summary_in  # torch waits until the arguments have proved themselves
+
     for run in runs:
         summary_in(run.folder)
         earlier = run.folder / CONFIG_FILE
@@ -133,6 +135,7 @@ def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
     from pgts_torch.experiment.compare.comparison import compare
     from pgts_torch.experiment.compare.drawing import figure, png
     from pgts_torch.experiment.run import build
+    from pgts_torch.experiment.summary import summary_in
 
     waiting = [run for run in runs if summary_in(run.folder) is None]
     for config in {run.depth: run.config for run in waiting}.values():
@@ -179,21 +182,6 @@ def _is_table(raw: bytes) -> bool:
         return bool(TypeAdapter(Sweep).validate_json(raw))
     except ValidationError:
         return False
-
-
-def summary_in(folder: Path) -> "Summary | None":
-    """What a finished run came to; None if it is not finished; PgtsError where that is damaged."""
-    path = folder / SUMMARY_FILE
-    if files.kind(path) is None:
-        return None
-    from pgts_torch.experiment.summary import from_json  # torch waits until the arguments have proved themselves
-
-    try:
-        return from_json(files.read(path))
-    except PgtsError as error:
-        raise PgtsError(
-            f"{path} is damaged ({error}): remove it, and the run is summed up again from its last checkpoint"
-        ) from error
 
 
 def _rows(finished: "Sequence[tuple[Run, Summary]]", score_is: str) -> Iterator[Row]:

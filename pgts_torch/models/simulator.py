@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from typing import Any, final
 
 import numpy as np
@@ -12,18 +11,16 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
-from pgts_torch.errors import PgtsError, RandomOutcomes, check_count, failure
+from pgts_torch.errors import PgtsError, RandomOutcomes, failure
 from pgts_torch.models.adapters import methods_for
 from pgts_torch.models.answers import Answers, Step, without_collector
 from pgts_torch.models.base import EnumeratingModel, SamplingModel, Transitions
 from pgts_torch.models.clocks import trusted_clock
 from pgts_torch.models.environments import Given
-from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, ExactModel, Happened, step_text
+from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, Happened, step_text
 from pgts_torch.models.masks import ActionMasks
-from pgts_torch.models.provenance import draws_its_own
-from pgts_torch.models.snapshot_model import SnapshotModel, watched
+from pgts_torch.models.snapshot_model import SnapshotModel
 from pgts_torch.models.snapshots import SnapshotAdapter
-from pgts_torch.models.stepper import Stepper
 from pgts_torch.seeding import SharedGenerators
 
 _ANY_KEY, _CALLS_OF_A_PART = 0, 1024
@@ -31,7 +28,7 @@ _ANY_KEY, _CALLS_OF_A_PART = 0, 1024
 
 
 @final
-class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel):
+class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel):
     """An instance of a Gymnasium environment that is put into a state and stepped, to find what may follow an action.
 
     The instance is used by the model alone, so queries never touch the environment that an agent acts in. What its
@@ -64,7 +61,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             1, or above 1 beside a highest value or action masks.
     """
 
-    kind, is_cheap, num_outcomes, answers_singly = "simulator", False, 1, True
+    num_outcomes, answers_singly = 1, True
 
     def __init__(
         self,
@@ -80,9 +77,17 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float64,
     ) -> None:
-        if not 0 <= gamma <= 1:
-            raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
-        check_count("action_repeat", action_repeat)
+        super().__init__(
+            env,
+            gamma=gamma,
+            actions=actions,
+            action_repeat=action_repeat,
+            adapter=adapter,
+            observe=observe,
+            masks=masks,
+            device=device,
+            dtype=dtype,
+        )
         if action_repeat > 1 and highest_value < math.inf:
             raise PgtsError(f"highest_value is {highest_value}; under repeated actions no bound of v* stays one")
         if action_repeat > 1 and masks is not None:
@@ -90,22 +95,10 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
                 f"action_repeat is {action_repeat}, and {masks.what} may forbid the second of two equal actions: take "
                 "1, or set action_masks to 'off'"
             )
-        self._stepper = stepper = Stepper(
-            env, gamma=gamma, actions=actions, adapter=adapter, observe=observe, masks=masks
-        )
-        self._masks = masks
-        super().__init__(stepper.name, stepper.space, observe, device)
-        self.action_repeat, self.adapter, self.actions = action_repeat, stepper.adapter, stepper.actions
-        self.num_actions, self.gamma, self.highest_value = len(self.actions), gamma, highest_value
-        self.env, self.dtype = stepper.env, dtype
-        self._draws_its_own = draws_its_own(stepper.made)
+        stepper, self._masks, self.highest_value = self._stepper, masks, highest_value
+        self.actions, self.num_actions = stepper.actions, len(stepper.actions)
         stepper.clock = trusted_clock(stepper) if action_repeat == 1 else None
         self._answers = Answers(stepper.at_count if stepper.clock else None)
-
-    @property
-    def simulator_steps(self) -> int:  # type: ignore[override]
-        """How often the simulator was stepped."""
-        return self._stepper.steps
 
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
@@ -120,7 +113,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             PgtsError: the environment fails, see `sample`.
         """
         states, part = self._checked("state", state_N, self.num_states), max(1, _CALLS_OF_A_PART // self.num_actions)
-        with self._watched():
+        with self._watched(self._answers.clear):
             steps = [step for i in range(0, len(states), part) for step in self._certain(states[i : i + part])]
         # K = 1: the one outcome of each action has probability 1.
         answer, shape = self._answer(steps), (len(state_N), self.num_actions, 1)
@@ -137,7 +130,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
         """
         states = self._checked("state", state_N, self.num_states)
         queries = zip(states, self._checked("action", action_N, self.num_actions), key_N.tolist(), strict=True)
-        with self._watched():
+        with self._watched(self._answers.clear):
             return self._answer([self._step(*query, self.action_repeat) for query in queries])
 
     def is_random(self, state_N: Int[Tensor, "N"], action_N: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
@@ -152,23 +145,13 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             random.append(step.random or bool(shared.used))
         return torch.tensor(random, dtype=torch.bool, device=self.device)
 
-    def _watched(self) -> AbstractContextManager[None]:
-        return watched(self.name, draws_its_own=self._draws_its_own, forget=self._answers.clear)
-
-    def _answer(self, steps: Sequence[tuple[Step, int]]) -> Transitions:
-        return Transitions(
-            torch.tensor([step.reward for step, _ in steps], dtype=self.dtype, device=self.device),
-            torch.tensor([step.discount for step, _ in steps], dtype=self.dtype, device=self.device),
-            torch.tensor([child for _, child in steps], dtype=torch.int64, device=self.device),
-        )
-
     def outcome_of(self, happened: Happened, *, query_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
         """0 where a step is, bit for bit, what the simulator gives: from memory where it was queried for that before,
         and where `query_N` says so by a step of the simulator."""
         # Plain Python numbers: each step is compared by itself, and in numpy that would take ten times as long.
         columns = [column_N.tolist() for column_N in vars(happened).values()]
         query = itertools.repeat(True) if query_N is None else query_N.tolist()
-        with self._watched():
+        with self._watched(self._answers.clear):
             return np.array([self._outcome_of(*one) for one in zip(*columns, query, strict=False)], dtype=np.int64)
 
     def _outcome_of(
@@ -181,12 +164,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             step, _ = self._step(state, action, _ANY_KEY, 1)
             if step.random:
                 return RANDOM
-        reached = step.child.snapshot
-        # Bit for bit, because the same code has made both. A truncated episode cannot have gone on.
-        if step.reward != reward or step.discount != discount or (reached.cut and follows):
-            return CONTRADICTED
-        # After an end the next state does not matter.
-        return 0 if discount == 0 or self.adapter.same_state(reached, self.snapshot(next_state)) else CONTRADICTED
+        return 0 if self._is_same(step, reward, discount, next_state, follows) else CONTRADICTED
 
     def outcomes_text(self, state: int, action: int) -> str:
         """The one outcome of a single step."""
@@ -288,14 +266,3 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel, ExactModel)
             raise PgtsError(f"{self.name}: which actions are legal in {self.state_text(state)} is not known")
         illegal = Step(-math.inf, 1.0, seen, False)
         return {action: illegal for action, legal in enumerate(seen.legal) if not legal} | dict(known)
-
-    def _late(self, state: int) -> Any:
-        if not self._stepper.observes_late:
-            return None
-        seen = self._seen[state].like or self._seen[state]
-        if seen.observation is None:
-            try:
-                seen.observation = self._stepper.observation(seen.snapshot.data)
-            except BaseException as error:
-                raise failure(f"{self.name} failed to observe state {state}", error) from error
-        return seen.observation

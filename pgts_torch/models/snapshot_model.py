@@ -1,7 +1,6 @@
 """Models whose states are snapshots, numbered as they are met, equal ones with the same number."""
 
 import itertools
-from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -13,62 +12,84 @@ from gymnasium import spaces
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from pgts_torch.errors import MissingModel, ModelMismatch, PgtsError
+from pgts_torch.errors import MissingModel, ModelMismatch, PgtsError, check_count, failure
 from pgts_torch.models.adapters_generic import Layered
 from pgts_torch.models.answers import Seen, Step, observed
-from pgts_torch.models.base import Model
+from pgts_torch.models.base import Transitions
+from pgts_torch.models.environments import Given
+from pgts_torch.models.exact_model import ExactModel
+from pgts_torch.models.masks import ActionMasks
+from pgts_torch.models.provenance import draws_its_own
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
+from pgts_torch.models.stepper import Stepper
 from pgts_torch.seeding import SharedGenerators
 
 
-@contextmanager
-def watched(name: str, *, draws_its_own: bool, forget: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """MissingModel where a step in this context has drawn from a generator that the whole process shares.
+class SnapshotModel(ExactModel):
+    """An instance of an environment that is put into states and stepped: numbers their snapshots, and remembers the
+    observation of each.
+
+    env: the instance.   adapter: of its snapshots.
 
     Args:
-        name: of the environment.
-        draws_its_own: whether it is known to do no such thing.
-        forget: called first: what such steps gave may have been remembered.
-    """
-    if draws_its_own:
-        yield
-        return
-    with SharedGenerators() as shared:
-        yield
-    if shared.used:
-        forget()
-        raise MissingModel(
-            f"{name} cannot be a model: step draws from the global generator of {shared.used[0]}: draw from "
-            "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
-        )
-
-
-class SnapshotModel(Model):
-    """Numbers snapshots, and remembers the observation of each state.
-
-    env: an instance of the environment.   adapter: of its snapshots.
-
-    Args:
-        name: of the environment.
-        space: of its observations.
-        observe: what to remember of an observation; an array, or None for nothing. Default: all.
-        device: where numbers lie.
+        As in `SimulatorModel`, which says what is raised.
     """
 
-    env: Any
-    adapter: SnapshotAdapter
+    kind, is_cheap = "simulator", False
 
     def __init__(
-        self, name: str, space: spaces.Space, observe: Callable[[Any], Any] | None, device: torch.device | str
+        self,
+        env: Given,
+        *,
+        gamma: float,
+        actions: Sequence[Any] | None,
+        action_repeat: int,
+        adapter: SnapshotAdapter | None,
+        observe: Callable[[Any], Any] | None,
+        masks: ActionMasks | None = None,
+        device: torch.device | str,
+        dtype: torch.dtype,
     ) -> None:
-        self.name, self._space, self._observe = name, space, observe
+        if not 0 <= gamma <= 1:
+            raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
+        check_count("action_repeat", action_repeat)
+        self._stepper = stepper = Stepper(
+            env, gamma=gamma, actions=actions, adapter=adapter, observe=observe, masks=masks
+        )
+        self.gamma, self.action_repeat, self.dtype = gamma, action_repeat, dtype
+        self.name, self.env, self.adapter, self._observe = stepper.name, stepper.env, stepper.adapter, observe
         self.device = torch.empty(0, device=device).device
+        self._draws_its_own = draws_its_own(stepper.made)
         self.num_states = 0
         # By number: the state. By the name of a snapshot: the number.
         self._seen: list[Seen] = []
         self._number: dict[Hashable, int] = {}
         # The instances whose class, map and constants were compared with the model's own.
         self._compared: list[Any] = []
+
+    @property
+    def simulator_steps(self) -> int:  # type: ignore[override]
+        """How often the simulator was stepped."""
+        return self._stepper.steps
+
+    @contextmanager
+    def _watched(self, forget: Callable[[], None] = lambda: None) -> Iterator[None]:
+        """MissingModel where a step in this context has drawn from a generator that the whole process shares.
+
+        Args:
+            forget: called first: what such steps gave may have been remembered.
+        """
+        if self._draws_its_own:
+            yield
+            return
+        with SharedGenerators() as shared:
+            yield
+        if shared.used:
+            forget()
+            raise MissingModel(
+                f"{self.name} cannot be a model: step draws from the global generator of {shared.used[0]}: draw from "
+                "self.np_random only; or take depth 0 and the estimator 'sampled', which need no model"
+            )
 
     def clear(self) -> None:
         """Drop all states. Their numbers are given to other states from here on."""
@@ -189,26 +210,45 @@ class SnapshotModel(Model):
         Raises:
             PgtsError: one of them is not known, because a root was given without it; or it cannot be flattened.
         """
-        rows = [self._observation(state) for state in state_N.tolist()]
-        if self._observe is None and not isinstance(self._space, spaces.Box | spaces.Discrete):
+        rows, space = [self._observation(state) for state in state_N.tolist()], self._stepper.space
+        if self._observe is None and not isinstance(space, spaces.Box | spaces.Discrete):
             try:
-                rows = [spaces.flatten(self._space, row) for row in rows]
+                rows = [spaces.flatten(space, row) for row in rows]
             except NotImplementedError:
-                raise PgtsError(f"{self.name}: {self._space} cannot be flattened: give `observe`") from None
+                raise PgtsError(f"{self.name}: {space} cannot be flattened: give `observe`") from None
         return np.asarray(rows)
 
     def _observation(self, state: int) -> Any:
         self._check("state", state, self.num_states)
         seen = self._seen[state]
-        if seen.observation is None:
-            seen.observation = self._late(state)
+        if seen.observation is None and self._stepper.observes_late:
+            made = seen.like or seen
+            if made.observation is None:
+                try:
+                    made.observation = self._stepper.observation(made.snapshot.data)
+                except BaseException as error:
+                    raise failure(f"{self.name} failed to observe state {state}", error) from error
+            seen.observation = made.observation
         if seen.observation is None:
             raise PgtsError(f"{self.name}: the observation of state {state} was not given, or `observe` made it None")
         return seen.observation
 
-    @abstractmethod
-    def _late(self, state: int) -> Any:
-        """What is remembered of the observation of a state that was not observed; None where it cannot be made."""
+    def _is_same(self, step: Step, reward: float, discount: float, next_state: int, follows: bool) -> bool:
+        """Whether a step of the simulator is, bit for bit, what happened, because the same code has made both."""
+        reached = step.child.snapshot
+        # A truncated episode cannot have gone on.
+        if step.reward != reward or step.discount != discount or (reached.cut and follows):
+            return False
+        # After an end the next state does not matter.
+        return discount == 0 or self.adapter.same_state(reached, self.snapshot(next_state))
+
+    def _answer(self, steps: Sequence[tuple[Step, int]]) -> Transitions:
+        """What `_entered` has returned, as tensors."""
+        return Transitions(
+            torch.tensor([step.reward for step, _ in steps], dtype=self.dtype, device=self.device),
+            torch.tensor([step.discount for step, _ in steps], dtype=self.dtype, device=self.device),
+            torch.tensor([child for _, child in steps], dtype=torch.int64, device=self.device),
+        )
 
     def state_text(self, state: int) -> str:
         """With its observation, or else its snapshot."""

@@ -80,28 +80,31 @@ class Trial:
 
     def __init__(self, actions: Sequence[Any], masks: ActionMasks | None) -> None:
         self._actions, self.masks = actions, masks
-        self._info = weakref.WeakKeyDictionary[gymnasium.Env, Mapping[str, Any]]()
+        # By the id of an environment, because it may have no hash.
+        self._info = dict[int, tuple[weakref.ref[gymnasium.Env], Mapping[str, Any]]]()
 
     def reset(self, env: gymnasium.Env, *, seed: int | None = None) -> Taken:
-        taken = reset(env, seed=seed)
-        self._info[env] = taken.info
-        return taken
+        return self._noted(env, reset(env, seed=seed))
 
     def step(self, env: gymnasium.Env, action: Any) -> Taken:
-        taken = step(env, action if self.masks is None else self._legal(env, action))
-        self._info[env] = taken.info
-        return taken
+        return self._noted(env, step(env, action if self.masks is None else self._legal(env, action)))
 
     def forget(self, env: gymnasium.Env) -> None:
         """Its state is another one now."""
-        self._info.pop(env, None)
+        self._info.pop(id(env), None)
+
+    def _noted(self, env: gymnasium.Env, taken: Taken) -> Taken:
+        self._info[id(env)] = weakref.ref(env), taken.info
+        return taken
 
     def legal(self, env: gymnasium.Env) -> Bool[np.ndarray, "A"] | None:
         """The legal actions in the present state; None where that is not known."""
         if self.masks is None:
             return None
+        noted = self._info.get(id(env))
+        info = noted[1] if noted is not None and noted[0]() is env else {}
         with environment_code(), contextlib.suppress(PgtsError):
-            return self.masks.of(env, self._info.get(env, {}))
+            return self.masks.of(env, info)
         return None
 
     def _legal(self, env: gymnasium.Env, action: Any) -> Any:

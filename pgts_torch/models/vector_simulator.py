@@ -8,21 +8,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import PgtsError, RandomOutcomes, check_count, failure
+from pgts_torch.errors import RandomOutcomes, failure
 from pgts_torch.models.answers import Seen, Step
 from pgts_torch.models.base import FollowingModel, Transitions
 from pgts_torch.models.environments import Given
-from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, ExactModel, Happened, step_text
-from pgts_torch.models.provenance import draws_its_own
-from pgts_torch.models.snapshot_model import SnapshotModel, watched
+from pgts_torch.models.exact_model import CONTRADICTED, NOT_QUERIED, RANDOM, Happened, step_text
+from pgts_torch.models.snapshot_model import SnapshotModel
 from pgts_torch.models.snapshots import SnapshotAdapter
-from pgts_torch.models.stepper import Stepper
 
 _ANY_KEY = 0
 
 
 @final
-class VectorSimulator(SnapshotModel, FollowingModel, ExactModel):
+class VectorSimulator(SnapshotModel, FollowingModel):
     """As `SimulatorModel`, but for actions that are vectors: each is simulated when it is asked for, and nothing is
     remembered, because hardly any is taken twice. A state in which the environment has truncated an episode leads to
     itself with reward 0 and discount 1 under every action.
@@ -35,7 +33,7 @@ class VectorSimulator(SnapshotModel, FollowingModel, ExactModel):
         MissingModel, PgtsError: as `SimulatorModel`.
     """
 
-    kind, is_cheap, num_actions = "simulator", False, 0
+    num_actions = 0
 
     def __init__(
         self,
@@ -49,21 +47,17 @@ class VectorSimulator(SnapshotModel, FollowingModel, ExactModel):
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float64,
     ) -> None:
-        if not 0 <= gamma <= 1:
-            raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
-        check_count("action_repeat", action_repeat)
-        some = [np.zeros(size, np.float32)]  # a stepper has one at least
-        self._stepper = stepper = Stepper(env, gamma=gamma, actions=some, adapter=adapter, observe=observe)
-        super().__init__(stepper.name, stepper.space, observe, device)
-        stepper.clock = None
-        self.gamma, self.action_repeat, self.dtype = gamma, action_repeat, dtype
-        self.env, self.adapter = stepper.env, stepper.adapter
-        self._draws_its_own = draws_its_own(stepper.made)
-
-    @property
-    def simulator_steps(self) -> int:  # type: ignore[override]
-        """How often the simulator was stepped."""
-        return self._stepper.steps
+        super().__init__(
+            env,
+            gamma=gamma,
+            actions=[np.zeros(size, np.float32)],  # a stepper has one at least
+            action_repeat=action_repeat,
+            adapter=adapter,
+            observe=observe,
+            device=device,
+            dtype=dtype,
+        )
+        self._stepper.clock = None
 
     def follow(self, state_N: Int[Tensor, "N"], action_NX: Float[Tensor, "N X"]) -> Transitions:
         """The one outcome of each (state, action).
@@ -76,7 +70,7 @@ class VectorSimulator(SnapshotModel, FollowingModel, ExactModel):
         going = [i for i, state in enumerate(states) if not self._seen[state].snapshot.cut]
         requests = [(self._seen[states[i]].snapshot.data, taken[i]) for i in going]
         made, stepper = list[Step](), self._stepper
-        with watched(self.name, draws_its_own=self._draws_its_own):
+        with self._watched():
             stepper.chance.watch()
             try:
                 stepper.follow_each(requests, self.action_repeat, self.reward_range, made)
@@ -91,7 +85,7 @@ class VectorSimulator(SnapshotModel, FollowingModel, ExactModel):
         steps = [_stays(self._seen[state]) for state in states]
         for i, step in zip(going, made, strict=True):
             steps[i] = step
-        return self._answer(steps)
+        return self._answer(self._entered(steps))
 
     def sample(
         self, state_N: Int[Tensor, "N"], action_NX: Float[Tensor, "N X"], *, key_N: Int[Tensor, "N"]
@@ -100,26 +94,20 @@ class VectorSimulator(SnapshotModel, FollowingModel, ExactModel):
         the environment fails."""
         states = self._checked("state", state_N, self.num_states)
         queries = zip(states, self._taken(action_NX.cpu().numpy()), key_N.tolist(), strict=True)
-        with watched(self.name, draws_its_own=self._draws_its_own):
-            return self._answer([self._step(*query, self.action_repeat) for query in queries])
+        with self._watched():
+            return self._answer(self._entered([self._step(*query, self.action_repeat) for query in queries]))
 
     def outcome_of(self, happened: Happened, *, query_N: Bool[np.ndarray, "N"] | None = None) -> Int[np.ndarray, "N"]:
         """0 where a step is, bit for bit, what the simulator gives, of those that `query_N` names."""
         outcome_N, taken = np.full(len(happened.state_N), NOT_QUERIED), self._taken(happened.action_N)
         asked = list(range(len(outcome_N))) if query_N is None else np.flatnonzero(query_N).tolist()
-        with watched(self.name, draws_its_own=self._draws_its_own):
+        with self._watched():
             for i in asked:
-                step = self._step(int(happened.state_N[i]), taken[i], _ANY_KEY, 1)
-                outcome_N[i] = RANDOM if step.random else 0 if self._is_same(step, happened, i) else CONTRADICTED
+                state, _, reward, discount, next_state, follows = (each[i].tolist() for each in vars(happened).values())
+                step = self._step(state, taken[i], _ANY_KEY, 1)
+                same = self._is_same(step, reward, discount, next_state, follows)
+                outcome_N[i] = RANDOM if step.random else 0 if same else CONTRADICTED
         return outcome_N
-
-    def _is_same(self, step: Step, happened: Happened, i: int) -> bool:
-        reached = step.child.snapshot
-        discount = float(happened.discount_N[i])
-        if step.reward != happened.reward_N[i] or step.discount != discount or (reached.cut and happened.follows_N[i]):
-            return False
-        after = self.snapshot(int(happened.next_state_N[i]))
-        return discount == 0 or self.adapter.same_state(reached, after)
 
     def outcomes_text(self, state: int, action: Any) -> str:
         """The one outcome of a single step."""
@@ -139,19 +127,8 @@ class VectorSimulator(SnapshotModel, FollowingModel, ExactModel):
         except BaseException as error:
             raise self._failure(state, taken, error) from error
 
-    def _answer(self, steps: Sequence[Step]) -> Transitions:
-        children = [self._enter(step.child) for step in steps]
-        return Transitions(
-            torch.tensor([step.reward for step in steps], dtype=self.dtype, device=self.device),
-            torch.tensor([step.discount for step in steps], dtype=self.dtype, device=self.device),
-            torch.tensor(children, dtype=torch.int64, device=self.device),
-        )
-
     def _failure(self, state: int, taken: Any, error: BaseException) -> BaseException:
         return failure(f"{self.name} failed in state {state} under the action {taken!r}", error)
-
-    def _late(self, state: int) -> Any:
-        return None
 
 
 def _stays(seen: Seen) -> Step:

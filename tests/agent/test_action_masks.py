@@ -293,6 +293,18 @@ def test_masks_that_differ_in_one_state_contradict_the_simulator():
         model.learn(400)
 
 
+def test_an_environment_without_a_hash_is_restored_and_masked():
+    class Equal(ByMethod):
+        def __eq__(self, other):
+            return self is other
+
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(Equal())
+    model = PGTS(Equal, **(SHORT | {"depth": 1}))
+    model.iterate()
+    assert model.num_model_calls > 0
+
+
 def test_a_simulator_never_steps_an_illegal_action():
     env = Strict("info")
     _, info = env.reset(seed=0)

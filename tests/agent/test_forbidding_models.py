@@ -15,6 +15,14 @@ from tests.agent.masked import GAMMA, LEGAL_SA, NEXT_SA, REWARD_SA, ByMethod, St
 
 SHORT = {"num_envs": 2, "horizon": {"type": "fixed", "length": 6}, "gamma": GAMMA, "policy": {"type": "mlp"}}
 LEGAL = torch.from_numpy(LEGAL_SA == 1)
+ALLOWED_SA = torch.cat([LEGAL, torch.ones(1, 3, dtype=torch.bool)])
+
+
+def forbidding_table() -> TabularMDP:
+    """The table of `Strict`, with rewards of -inf."""
+    mdp = legal_mdp()
+    reward_SA = torch.where(ALLOWED_SA, mdp.outcomes.reward_NA, -torch.inf)
+    return TabularMDP(replace(mdp.outcomes, reward_NA=reward_SA), mdp.start_S)
 
 
 class Known(TensorModel):
@@ -93,9 +101,7 @@ def test_a_model_that_allows_something_else_than_the_masks_contradicts_them():
 
 @pytest.mark.parametrize("env", [lambda: Strict("nothing"), ByMethod])
 def test_a_table_of_the_callers_own_says_what_is_allowed(env):
-    mdp, legal_SA = legal_mdp(), torch.cat([LEGAL, torch.ones(1, 3, dtype=torch.bool)])
-    reward_SA = torch.where(legal_SA, mdp.outcomes.reward_NA, -torch.inf)
-    table = TabularMDP(replace(mdp.outcomes, reward_NA=reward_SA), mdp.start_S)
+    table, legal_SA = forbidding_table(), ALLOWED_SA
     options = SHORT | {"policy": "softmax", "gamma": None}
     for critic in ("exact", "tabular"):
         training = PGTS(env, **options, model=TabularModel(table), critic=critic, depth=2)
@@ -103,3 +109,25 @@ def test_a_table_of_the_callers_own_says_what_is_allowed(env):
         evaluate(training, episodes=1, deterministic=False)
         assert (training.policy_table()[~legal_SA] == 0).all()
         assert legal_SA[range(6), training.predict(range(6))].all()
+
+
+def test_predict_takes_no_action_that_a_mask_forbids_beside_a_table():
+    table, pi_SA = forbidding_table(), torch.tensor([[0.5, 0.3, 0.2], [0.0, 0.6, 0.4]])
+    training = PGTS(ByMethod, **(SHORT | {"policy": "softmax", "gamma": None}), model=TabularModel(table), depth=2)
+    logits_SA = training.policy.state_dict()["logits_SA"]
+    logits_SA[[3, 1]] = pi_SA.double().log().where(pi_SA > 0, 0.0)
+    training.policy.load_state_dict({"logits_SA": logits_SA})
+    assert training.predict([3, 1]).tolist() == [0, 1]
+    assert training.predict([3, 1], action_mask=[[0, 1, 1], [1, 0, 1]]).tolist() == [1, 2]
+    assert int(training.predict(3, action_mask=[0, 0, 1])) == 2
+    generator = torch.Generator().manual_seed(0)
+    many = training.predict([3] * 4000, action_mask=[[1, 0, 1]] * 4000, deterministic=False, generator=generator)
+    # P(|mean of 4,000 draws - 2/7| > 0.036) < 1e-6 by the normal law with a standard error of 0.0071
+    assert set(many.tolist()) == {0, 2}
+    assert (many == 2).mean() == pytest.approx(2 / 7, abs=0.036)
+    with pytest.raises(
+        PgtsError, match=r"allows the actions \[0\] in state 1 of ByMethod, of which the policy takes none"
+    ):
+        training.predict([0, 1], action_mask=[[1, 1, 1], [1, 0, 0]])
+    with pytest.raises(PgtsError, match=r"action masks have the shape \(2, 3\); there are 3 observations"):
+        training.predict([0, 1, 2], action_mask=[[1, 1, 1]] * 2)

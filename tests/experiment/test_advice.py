@@ -11,7 +11,7 @@ from pgts_torch.config import load
 from pgts_torch.experiment import run
 from pgts_torch.experiment.advice import Movement, greedy_is_worse
 from pgts_torch.experiment.report.page import write
-from pgts_torch.experiment.summary import Summary, describe, from_json
+from pgts_torch.experiment.summary import Summary, describe, summary_in
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
 
@@ -37,7 +37,7 @@ def test_a_run_of_tiny_steps_says_so_and_what_to_set(tmp_path: Path, env_id: str
     assert note.startswith("the policy hardly moved: 0.0% of its probability is elsewhere than at the start")
     assert "a larger update.step_size than 1e-06" in note
     assert "search.depth above 4" in note
-    assert from_json((tmp_path / "run" / "summary.json").read_bytes()) == summary
+    assert summary_in(tmp_path / "run") == summary
     assert "note                        the policy hardly moved" in describe(summary)
     page = write(tmp_path / "run", None)["page"]
     assert "the policy hardly moved" in Path(page).read_text()

@@ -20,7 +20,7 @@ from pgts_torch.agent.diagnostics import spread
 from pgts_torch.envs.drawing import BAR, Drawing, policy_pixels
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import run
-from pgts_torch.experiment.summary import from_json
+from pgts_torch.experiment.summary import summary_in
 from pgts_torch.tabular import exact, grid, ladder
 from tests.experiment.cut_off import configured, cut_off
 from tests.forks import on_ranks
@@ -100,7 +100,7 @@ def test_hyper_parameters_are_what_differs_from_the_defaults_with_the_results_of
         "update": "mirror",
         "update.step_size": 3,
     }
-    summary = from_json((by_command / "summary.json").read_bytes())
+    summary = summary_in(by_command)
     last = {tag: points[-1] for tag, points in values(by_command).items() if tag.startswith("final/")}
     assert last["final/J"] == (summary.env_steps, pytest.approx(summary.J))
     assert last["final/deterministic_return"][1] == pytest.approx(summary.deterministic.episodic_return.mean)

@@ -225,7 +225,7 @@ def test_what_is_no_run_or_says_nothing_is_one_sentence(here):
         "configuration cannot be read: runs/broken (runs/broken/config.yaml:1: search.depth is -1",
         "photos (photos/config.yaml:1: camera is unknown",
         "no iteration has been written down: runs/early",
-        "the run counts as unfinished: runs/damaged/summary.json (",
+        "the run counts as unfinished: runs/damaged/summary.json is damaged (",
         "runs/damaged: 1 of 11 lines of metrics.jsonl cannot be read",
     ):
         assert said in text

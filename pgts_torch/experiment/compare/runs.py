@@ -14,10 +14,10 @@ from jaxtyping import Float
 from pgts_torch import files
 from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.ownership import CONFIG_FILE, FAILURE_FILE, METRICS_FILE, SUMMARY_FILE, listing
+from pgts_torch.experiment.ownership import CONFIG_FILE, FAILURE_FILE, METRICS_FILE, listing
 from pgts_torch.experiment.report.facts import metrics
 from pgts_torch.experiment.resume import FREE_KEYS, FREE_SECTIONS, flat, plain
-from pgts_torch.experiment.summary import Summary, from_json
+from pgts_torch.experiment.summary import summary_in
 
 J, GREEDY, SAMPLED, TRAINING = "exact/J", "eval/deterministic_return", "eval/sampled_return", "charts/episodic_return"
 
@@ -161,7 +161,11 @@ def _read(folder: Path, notes: Notes) -> Trained:
     lines = [line for line in metrics(folder, unread) if line]
     for each in unread if lines else ():
         notes.add(f"{folder}: {each}")
-    summary = _summary(folder, notes)
+    summary = None
+    try:
+        summary = summary_in(folder)
+    except PgtsError as error:
+        notes.add("the run counts as unfinished", str(error))
     if summary is None:
         state = "failed" if files.kind(folder / FAILURE_FILE) is not None else "unfinished"
         return Trained(folder, config, state, False, lines)
@@ -169,14 +173,3 @@ def _read(folder: Path, notes: Notes) -> Trained:
     last |= {GREEDY: summary.deterministic.episodic_return.mean, SAMPLED: summary.sampled.episodic_return.mean}
     known = {tag: value for tag, value in last.items() if value is not None and math.isfinite(value)}
     return Trained(folder, config, "finished", summary.ended_by != "total_steps", [*lines, known] if lines else [])
-
-
-def _summary(folder: Path, notes: Notes) -> Summary | None:
-    path = folder / SUMMARY_FILE
-    if files.kind(path) is None:
-        return None
-    try:
-        return from_json(files.read(path))
-    except PgtsError as error:
-        notes.add("damaged, and so the run counts as unfinished", f"{path} ({error})")
-        return None

@@ -1,7 +1,7 @@
 """Read the folder of a run for its report. Files that are missing, damaged or being written become notes."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint, ownership
 from pgts_torch.experiment.report.curves import panels
 from pgts_torch.experiment.resume import flat, names_modules, plain
-from pgts_torch.experiment.summary import Summary, from_json, rows
+from pgts_torch.experiment.summary import Summary, rows, summary_in
 from pgts_torch.files import PARTIAL
 from pgts_torch.options.schema import schema_of
 
@@ -39,9 +39,12 @@ def gather(run: Path, *, trust_imports: bool = False) -> tuple[dict[str, Any], P
         PgtsError: the configuration cannot be read.
     """
     config, notes = load(run / ownership.CONFIG_FILE), list[str]()
-    summary = _read(run / ownership.SUMMARY_FILE, from_json, notes)
-    failure = _read(run / ownership.FAILURE_FILE, _mapping, notes)
-    versions = _read(run / ownership.VERSIONS_FILE, _mapping, notes)
+    summary = None
+    try:
+        summary = summary_in(run)
+    except PgtsError as error:
+        notes.append(f"{error}.")
+    failure, versions = (_mapping(run / name, notes) for name in (ownership.FAILURE_FILE, ownership.VERSIONS_FILE))
     lines = metrics(run, notes)
     latest = {tag: value for line in lines for tag, value in line.items()}
     curves, constant, never_finite = panels(lines)
@@ -81,18 +84,15 @@ def number(value: Any) -> float | None:
     return value if isinstance(value, int | float) and abs(value) <= 1e300 else None
 
 
-def _read(path: Path, parse: Callable[[bytes], Any], notes: list[str]) -> Any:
-    """Return the result of `parse` on the bytes of a file; None where there is no file, or it has another form."""
+def _mapping(path: Path, notes: list[str]) -> Values | None:
+    """Return the values in a file; None where there is no file, or it has another form."""
     try:
-        return parse(path.read_bytes())
+        return dict(json.loads(path.read_bytes()))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, RecursionError, TypeError):
         notes.append(f"{path.name} cannot be read, or is not as this version writes it; it is left out.")
-
-
-def _mapping(raw: bytes) -> Values:
-    return dict(json.loads(raw))
+        return None
 
 
 def metrics(run: Path, notes: list[str]) -> list[Values]:

@@ -24,7 +24,7 @@ from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.report.curves import COLOURS, GREY
 from pgts_torch.experiment.statistics import Mean, estimate
-from pgts_torch.experiment.sweep import summary_in
+from pgts_torch.experiment.summary import summary_in
 from pgts_torch.experiment.tune.space import Option, Plan, Value
 from pgts_torch.experiment.tune.study import FAILURE, SCORES, Pruning, imported, run_trials, score, trainings
 

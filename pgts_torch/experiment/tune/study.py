@@ -26,8 +26,7 @@ from pgts_torch.experiment.report.facts import metrics
 from pgts_torch.experiment.resume import flat, plain
 from pgts_torch.experiment.run import build
 from pgts_torch.experiment.statistics import interquartile_mean
-from pgts_torch.experiment.summary import Summary
-from pgts_torch.experiment.sweep import summary_in
+from pgts_torch.experiment.summary import Summary, summary_in
 from pgts_torch.experiment.tune.space import Option, Plan, Values
 
 if TYPE_CHECKING:
