@@ -24,7 +24,7 @@ from common import Form, about, median_ratio, parser, take_turns, use_one_core, 
 from gymnasium import spaces
 from peers import POLICIES, Policy
 
-from pgts_torch.agent.dense_steps import dense_outputs
+from pgts_torch.agent.dense_forward import dense_outputs
 from pgts_torch.agent.networks import Network, make_trunk
 from pgts_torch.compiled import torch_only
 from pgts_torch.models.classic import CartPole
@@ -106,7 +106,10 @@ def peer_search(critic: Network, root_BD: torch.Tensor, policy: Policy) -> Form 
 def neural_leaves(repeats: int) -> dict[str, Any]:
     """Milliseconds of a search, rows of the critic, and mctx's time to it."""
     critic = make_critic()
-    compiled = functools.partial(dense_outputs, critic)
+
+    def compiled(observation_ND: torch.Tensor) -> torch.Tensor:
+        return dense_outputs(critic.theta_D, critic.dense_form, critic.encode(observation_ND))
+
     root_BD = (torch.rand(ROOTS, 4, generator=stream(0, "roots"), dtype=torch.float64) - 0.5) / 10
     model = CartPole(gymnasium.make("CartPole-v1"), gamma=GAMMA)
     found = our_search(model, critic.outputs, root_BD)

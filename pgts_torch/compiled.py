@@ -39,7 +39,7 @@ def can_compile(device: torch.device) -> bool:
 
     That numba is missing is said once.
     """
-    return device.type == "cpu" and not _torch_only and _wanted() and _installed()
+    return not _torch_only and device.type == "cpu" and _usable()
 
 
 def pays(device: torch.device, size: int) -> bool:
@@ -106,12 +106,9 @@ def _digest(folder: Path) -> str:
 
 
 @functools.cache
-def _wanted() -> bool:
-    return os.environ.get(SWITCH) != "0"
-
-
-@functools.cache
-def _installed() -> bool:
+def _usable() -> bool:
+    if os.environ.get(SWITCH) == "0":
+        return False
     if importlib.util.find_spec("numba") is not None:
         return True
     version = f"{sys.version_info.major}.{sys.version_info.minor}"

@@ -58,11 +58,11 @@ def test_tensors_of_the_cpu_are_compiled_for_where_numba_is_installed() -> None:
 
 def test_the_environment_variable_turns_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(compiled.SWITCH, "0")
-    compiled._wanted.cache_clear()
+    compiled._usable.cache_clear()
     try:
         assert not compiled.can_compile(CPU)
     finally:
-        compiled._wanted.cache_clear()
+        compiled._usable.cache_clear()
 
 
 def test_little_work_does_not_load_numba() -> None:
@@ -84,7 +84,7 @@ def test_the_readmes_first_training_does_without_numba(tmp_path: Path) -> None:
 
 def test_without_numba_torch_is_used_and_that_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled.importlib.util, "find_spec", lambda name: None)
-    compiled._installed.cache_clear()
+    compiled._usable.cache_clear()
     try:
         with pytest.warns(RuntimeWarning, match="numba is not installed .* torch alone is used"):
             assert not compiled.can_compile(CPU)
@@ -92,7 +92,7 @@ def test_without_numba_torch_is_used_and_that_is_said_once(monkeypatch: pytest.M
             warnings.simplefilter("error")
             assert not compiled.can_compile(CPU)
     finally:
-        compiled._installed.cache_clear()
+        compiled._usable.cache_clear()
 
 
 def test_a_second_process_finds_compiled_code_on_disk(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -23,13 +24,16 @@ def lambda_returns(
         discount_TB: gamma_t; 0 after a terminated step, so that nothing is bootstrapped there.
         lambda_: in [0, 1]; 1 gives Monte-Carlo returns.
     """
-    lambda_TB = lambda_ * rollout.follows_TB.float()
-    returns_TB = rollout.reward_TB + discount_TB * (1 - lambda_TB) * next_v_TB
+    columns = rollout.reward_TB, discount_TB, next_v_TB, rollout.alive_TB.to(rollout.reward_TB)
     # in numpy, where operations on a few numbers cost least
-    row_TB, later_TB = returns_TB.cpu().numpy(), (discount_TB * lambda_TB).cpu().numpy()
-    for t in reversed(range(len(row_TB) - 1)):
-        row_TB[t] += later_TB[t] * row_TB[t + 1]
-    return torch.from_numpy(row_TB).to(returns_TB.device)
+    reward_TB, rate_TB, value_TB, alive_TB = torch.stack(columns).cpu().numpy()
+    lambda_TB = np.zeros(alive_TB.shape, np.float32)
+    lambda_TB[:-1] = lambda_ * alive_TB[1:]
+    returns_TB = reward_TB + rate_TB * (1 - lambda_TB) * value_TB
+    later_TB = rate_TB * lambda_TB
+    for t in reversed(range(len(returns_TB) - 1)):
+        returns_TB[t] += later_TB[t] * returns_TB[t + 1]
+    return torch.from_numpy(returns_TB).to(discount_TB.device)
 
 
 def critic_targets(

@@ -73,6 +73,22 @@ def outputs(theta_D, size_L, is_tanh, input_NX, rows, out_ND):  # type: ignore[n
 
 
 @allocating
+def choices(theta_D, size_L, is_tanh, input_NX, random_NA, rows, action_N):  # type: ignore[no-untyped-def]
+    """Write the actions with the largest exp(output) / random number. Return whether all outputs are finite."""
+    for start in range(0, len(input_NX), rows):
+        out_ND = _forward(theta_D, size_L, is_tanh, input_NX[start : start + rows])[-1]
+        for n in range(len(out_ND)):
+            best, largest = np.float32(-1), out_ND[n].max()
+            for a in range(out_ND.shape[1]):
+                score = np.float32(math.exp(out_ND[n, a] - largest)) / random_NA[start + n, a]
+                if score > best:
+                    best, action_N[start + n] = score, a
+            if not np.isfinite(out_ND[n].sum()):
+                return False
+    return True
+
+
+@allocating
 def _backward(theta_D, size_L, is_tanh, values, down, gradient_D):  # type: ignore[no-untyped-def]
     """Add the gradient in the weights, from that in the outputs."""
     at = len(theta_D)

@@ -1,6 +1,7 @@
 """Inputs of networks from rows of observations, by the kind of each component."""
 
 import math
+from functools import cached_property
 from typing import Any, final
 
 import torch
@@ -156,7 +157,7 @@ class Values(nn.Module):
         self.norm = self.norm.fixed() if isinstance(self.norm, RunningNorm) else self.norm
 
     def _scaled(self, x_N: Tensor) -> Tensor:
-        x = x_N.reshape(x_N.shape[0], *self._layout)
+        x = x_N if x_N.shape[1:] == self._layout else x_N.reshape(x_N.shape[0], *self._layout)
         return x if self.scale == 1 else (x if x.is_floating_point() else x.float()) / self.scale
 
 
@@ -199,13 +200,17 @@ class Encoder(nn.Module):
     def num_inputs(self) -> int:
         return sum(map(math.prod, self.shapes))
 
+    @cached_property
+    def _each(self) -> list[Any]:
+        return list(self.parts)
+
     def forward(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
-        # plain calls, because calling a module costs as much as a small layer
-        return _joined([part.forward(x_N) for part, x_N in zip(self.parts, self._split(observation_N), strict=False)])
+        # plain calls of plain attributes, because those of modules cost as much as a small layer
+        return _joined([part.forward(x_N) for part, x_N in zip(self._each, self._split(observation_N), strict=False)])
 
     def examples(self, count: int, generator: torch.Generator) -> Float[Tensor, "N ..."]:
         """Return random inputs: one-hot rows of numbers, all else from [0, 1)."""
-        return _joined([part.examples(count, generator) for part in self.parts])  # type: ignore[operator]
+        return _joined([part.examples(count, generator) for part in self._each])
 
     def _split(self, observation_N: Tensor) -> tuple[Tensor, ...]:
         """The entries of each component, the legal actions too."""
@@ -219,14 +224,14 @@ class Encoder(nn.Module):
 
     def absorb(self, observation_N: Tensor, ranks: Ranks = ALONE) -> None:
         """Add these observations, in all ranks, to the running statistics, where there are any."""
-        for part, x_N in zip(self.parts, self._split(observation_N), strict=False):
+        for part, x_N in zip(self._each, self._split(observation_N), strict=False):
             if isinstance(part, Values):
                 part.absorb(x_N, ranks)
 
     @property
     def norm(self) -> RunningNorm | None:
         """The first running statistics; None where there are none."""
-        norms = (part.norm for part in self.parts if isinstance(part, Values))
+        norms = (part.norm for part in self._each if isinstance(part, Values))
         return next((norm for norm in norms if isinstance(norm, RunningNorm)), None)
 
     @property

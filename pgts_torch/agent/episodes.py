@@ -51,6 +51,7 @@ class Episodes:
         self._env, self._gamma, self._seeds = env, gamma, seeds
         self._one_by_one = isinstance(env, SyncVectorEnv) and type(env).step is SyncVectorEnv.step
         self._names_discounts = [names_discounts(one) for one in each_of(env)]
+        self._all_name_discounts = all(self._names_discounts)
         self._over_B = np.zeros(env.num_envs, dtype=bool)
         self._reward_B = np.zeros(env.num_envs)
         self._stepping: int | None = None  # the index of the environment whose step is running
@@ -137,10 +138,13 @@ class Episodes:
             self._legal_BA = self._read_masks(info, ~self._over_B) & ~terminated_B[:, None]
         elif self._unmasked and KEY in info:
             self._refuse_masks()
-        # info["_discount"] is True where an environment has named a discount in this step.
-        named_B = info.get("_discount", "discount" in info) if all(self._names_discounts) else False
-        discount_B = np.where(terminated_B, 0.0, np.where(named_B, info.get("discount", 0.0), self._gamma))
-        check_discounts(discount_B)
+        discount: Any = self._gamma
+        if self._all_name_discounts and "discount" in info:
+            # info["_discount"] is True where an environment has named a discount in this step.
+            discount = np.where(info.get("_discount", True), info["discount"], self._gamma)
+        discount_B = np.where(terminated_B, 0.0, discount)
+        if discount is not self._gamma:
+            check_discounts(discount_B)
         return rewards_of(rewards, self._env.num_envs), discount_B, truncated_B
 
     def _step_alive(self, action_B: np.ndarray, alive_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any, final
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.spaces import Space
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
 from pgts_torch.agent.components import components, image_shape
+from pgts_torch.agent.dense_forward import DenseForm, dense_outputs
 from pgts_torch.agent.encoders import Encoder, convolved
 from pgts_torch.agent.own_modules import OwnLayers, own_layers
 from pgts_torch.agent.policies import fitting
@@ -152,6 +154,8 @@ class Network(nn.Module):
     The head is linear. Where the trunk returns outputs there is none, or `Scaled` if the outputs are rescaled, as those
     of a critic are with the scale of its targets.
 
+    loops: whether outputs are computed by compiled loops; only where it `is_dense`.
+
     Args:
         trunk: may be shared with another network.
         num_outputs: of the head.
@@ -168,6 +172,8 @@ class Network(nn.Module):
         else:
             self.head = _linear(trunk.num_features, num_outputs, gain, generator, trunk.encoder.space)
         self._most_rows = max(1, _MOST_INPUTS // max(trunk.encoder.num_inputs, trunk.num_features))
+        self.loops: Callable[[], bool] = _never
+        self._packed = 0, np.zeros(0, np.float32)
 
     @cached_property
     def weights(self) -> list[nn.Parameter]:
@@ -175,9 +181,32 @@ class Network(nn.Module):
         return [weight for weight in self.parameters() if weight.requires_grad]
 
     @cached_property
+    def num_weights(self) -> int:
+        return sum(weight.numel() for weight in self.weights)
+
+    @property
+    def theta_D(self) -> Float[np.ndarray, "P"]:
+        """All weights as one vector, on the CPU. They lie in it, so each changes with the other; where they lie
+        elsewhere, because another network has the same trunk or because this one is a copy, they are moved into a new
+        one."""
+        place, theta_D = self._packed
+        if self.weights[0].data_ptr() != place:
+            vector_D = torch.cat([weight.detach().view(-1) for weight in self.weights])
+            pieces = vector_D.split([weight.numel() for weight in self.weights])
+            for weight, piece in zip(self.weights, pieces, strict=True):
+                weight.data = piece.view_as(weight)
+            theta_D = vector_D.numpy()
+            self._packed = vector_D.data_ptr(), theta_D
+        return theta_D
+
+    @cached_property
     def tensors(self) -> list[Tensor]:
         """Weights and running statistics."""
         return list(self._named.values())
+
+    @cached_property
+    def encoder(self) -> Encoder:
+        return self.trunk.encoder
 
     @cached_property
     def layers(self) -> list[nn.Module]:
@@ -190,9 +219,8 @@ class Network(nn.Module):
         return all(isinstance(layer, nn.Linear | nn.Tanh | nn.ReLU) for layer in self.layers)
 
     @cached_property
-    def dense_form(self) -> tuple[tuple[int, ...], bool]:
-        """Of a dense network: how many inputs there are and how many outputs each layer has; whether tanh follows
-        these."""
+    def dense_form(self) -> DenseForm:
+        """The layers of a dense network."""
         dense = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
         sizes = dense[0].in_features, *(layer.out_features for layer in dense)
         return sizes, any(isinstance(layer, nn.Tanh) for layer in self.layers)
@@ -214,24 +242,25 @@ class Network(nn.Module):
 
     def encode(self, observation_N: Tensor) -> Float[Tensor, "N ..."]:
         """Return the inputs that `forward` takes, without gradient."""
-        return self.trunk.encoder.forward(observation_N)
+        return self.encoder.forward(observation_N)
 
     def forward(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
         for function in self.functions:
             input_N = function(input_N)
         return input_N
 
-    @torch.no_grad()
-    def outputs(self, observation_N: Tensor, forward: Callable[[Tensor], Tensor] | None = None) -> Float[Tensor, "N D"]:
-        """Return the outputs without gradient, computed in pieces so that memory is bounded.
+    def plain(self, input_N: Float[Tensor, "N ..."]) -> Float[Tensor, "N D"]:
+        """As `forward`, without gradient."""
+        if self.loops():
+            return dense_outputs(self.theta_D, self.dense_form, input_N)
+        with torch.no_grad():
+            return self.forward(input_N)
 
-        Args:
-            forward: what makes outputs of inputs; by default torch.
-        """
-        forward = forward or self.forward
-        if len(observation_N) <= self._most_rows:
-            return forward(self.encode(observation_N))
-        return torch.cat([forward(self.encode(piece)) for piece in observation_N.split(self._most_rows)])
+    def outputs(self, observation_N: Tensor) -> Float[Tensor, "N D"]:
+        """Return the outputs without gradient, computed in pieces so that memory is bounded."""
+        if observation_N.shape[0] <= self._most_rows:
+            return self.plain(self.encode(observation_N))
+        return torch.cat([self.plain(self.encode(piece)) for piece in observation_N.split(self._most_rows)])
 
     @torch.no_grad()
     def follow(self, other: "Network", rate: float) -> None:
@@ -260,6 +289,10 @@ class Network(nn.Module):
                 raise PgtsError(f"{name} is negative")
         for name, value in found.items():
             own[name].copy_(value)
+
+
+def _never() -> bool:
+    return False
 
 
 def _linear(inputs: int, outputs: int, gain: float, generator: torch.Generator, space: Space[Any]) -> nn.Linear:

@@ -5,13 +5,14 @@ from typing import Any, final
 
 import torch
 from gymnasium.spaces import Space
-from jaxtyping import Float, Num
+from jaxtyping import Float, Int, Num
 from torch import Tensor, nn
 
 from pgts_torch.agent.advantages import critic_targets
 from pgts_torch.agent.components import legal_only
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.dense_steps import dense_outputs, dense_steps
+from pgts_torch.agent.dense_forward import dense_choices
+from pgts_torch.agent.dense_steps import compile_as_steps, dense_steps
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.networks import Network, Scaled, Trunk, default_network, make_trunk
 from pgts_torch.agent.optimisers import Optimiser, minibatches
@@ -65,8 +66,19 @@ class NetworkPolicy(Policy):
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         """softmax of the logits of the legal actions."""
-        legal_NA = self.network.trunk.encoder.legal(observation_N)
+        legal_NA = self.network.encoder.legal(observation_N)
         return legal_only(self.network.outputs(observation_N), legal_NA).softmax(-1)
+
+    def sample(self, observation_N: Tensor, *, generator: torch.Generator) -> Int[Tensor, "N"]:
+        """As `Policy.sample`; up to rounding the same actions where the network is computed by compiled loops."""
+        network = self.network
+        if network.loops() and network.encoder.legal(observation_N) is None:
+            shape = observation_N.shape[0], self.num_actions
+            random_NA = torch.empty(shape, dtype=torch.float32).exponential_(generator=generator)
+            action_N = dense_choices(network.theta_D, network.dense_form, network.encode(observation_N), random_NA)
+            if action_N is not None:
+                return action_N
+        return super().sample(observation_N, generator=generator)
 
     def state_dict(self) -> dict[str, Any]:
         return self.network.plain_state()
@@ -120,6 +132,8 @@ class NetworkCritic(Critic):
         self._target_network = copy.deepcopy(self.network) if self._lags else self.network
         self._rate = filled.learning_rate
         self._optimiser = Optimiser(learning_rate=value_at(self._rate, 0), max_grad_norm=limit(options.max_grad_norm))
+        for each in {self.network, self._target_network}:
+            compile_as_steps(each, self._optimiser)
         self._policy: Policy | None = None
         self._queried: tuple[Rollout, tuple[Tensor, Tensor]] | None = None
         self._mean, self._scale = (torch.tensor(x, dtype=torch.float64, device=device) for x in (0.0, 1.0))
@@ -173,7 +187,7 @@ class NetworkCritic(Critic):
         observation_V, action_V = rollout.observation_V, rollout.of_visits(rollout.action_TB)
         if self.target == "v":  # which has no use for them, whatever they are
             action_V = torch.zeros(len(action_V), dtype=torch.int64, device=action_V.device)
-        encoder = self.network.trunk.encoder
+        encoder = self.network.encoder
         if encoder.fresh or not _shares_trunk(self._policy, self.network):
             encoder.absorb(observation_V, rollout.ranks)
         input_V = self.network.encode(observation_V)
@@ -200,16 +214,16 @@ class NetworkCritic(Critic):
         input_V, action_V, target_V = visits
         if self.options.normalize_returns:
             self._rescale(target_V, share.ranks)
-        y_V = torch.where(self._scale == 0, 0.0, (target_V - self._mean) / self._scale)
-        columns = input_V, action_V, y_V.float()
-        with dense_steps(self.network, self._optimiser) as steps:
-            for _ in range(num_passes):
-                for count, part in minibatches(columns, self.options.minibatch_size, share, generator=generator):
-                    if steps is None:
-                        norm: Tensor | float = self._step(count, part, share.ranks)
-                    else:
-                        norm = steps.values(count, part, share.ranks)[0]
-                    readings.add(value_grad_norm=norm)
+            target_V = torch.where(self._scale == 0, 0.0, (target_V - self._mean) / self._scale)
+        columns = input_V, action_V, target_V.float()
+        steps = dense_steps(self.network, self._optimiser)
+        for _ in range(num_passes):
+            for count, part in minibatches(columns, self.options.minibatch_size, share, generator=generator):
+                if steps is None:
+                    norm: Tensor | float = self._step(count, part, share.ranks)
+                else:
+                    norm = steps.values(count, part, share.ranks)[0]
+                readings.add(value_grad_norm=norm)
         self._num_fits += 1
         self._move_target_network()
 
@@ -240,7 +254,7 @@ class NetworkCritic(Critic):
     def q(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         if self.target != "q":
             raise PgtsError("this critic learns v; it has no Q. Make it with target='q', or search with v_leaf")
-        legal_NA = self.network.trunk.encoder.legal(observation_N)
+        legal_NA = self.network.encoder.legal(observation_N)
         return legal_only(self._values(self.network, observation_N), legal_NA)
 
     def state_dict(self) -> dict[str, Any]:
@@ -273,10 +287,9 @@ class NetworkCritic(Critic):
         self._scale.fill_(state["scale"])
 
     def _values(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N D"]:
-        """The network's outputs in reward units, by compiled loops where its steps are."""
-        loops = network.is_dense and self._optimiser.compiles_all_of(network.weights)
-        outputs_ND = dense_outputs(network, observation_N) if loops else network.outputs(observation_N)
-        return self._mean + self._scale * outputs_ND
+        """The network's outputs in reward units."""
+        outputs_ND = network.outputs(observation_N)
+        return self._mean + self._scale * outputs_ND if self.options.normalize_returns else outputs_ND
 
     def _v(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N"]:
         if self.target == "v":

@@ -11,7 +11,6 @@ from the action taken, A_t / pi(a_t|s_t) for it and 0 for the others, a row for 
 import math
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, final
 
@@ -63,7 +62,7 @@ class NetworkUpdate(SteppedUpdate):
             PgtsError: all weights are 0.
         """
         assert isinstance(policy, NetworkPolicy)
-        network, encoder = policy.network, policy.network.trunk.encoder
+        network, encoder = policy.network, policy.network.encoder
         self._follow_schedules()
         ranks = batch.ranks
         with self._optimiser.attempt(network.tensors) as readings:
@@ -124,17 +123,17 @@ class NetworkUpdate(SteppedUpdate):
             most: steps end once KL(pi_old || pi) is above it.
         """
         has_mask = batch.legal_NA is not None
-        with nullcontext() if has_mask else dense_steps(network, self._optimiser, clip) as steps:
-            for count, part in parts:
-                stepped: tuple[Tensor | float, Tensor | float] | None
-                if steps is None:
-                    rows, legal_NA = (part[:-1], part[-1]) if has_mask else (part, None)
-                    stepped = self._step(network, count, rows, legal_NA, batch.ranks, most)
-                else:
-                    stepped = steps.policy(self.form, count, part, batch.ranks, most)
-                if stepped is None:
-                    return
-                yield stepped
+        steps = None if has_mask else dense_steps(network, self._optimiser, clip)
+        for count, part in parts:
+            stepped: tuple[Tensor | float, Tensor | float] | None
+            if steps is None:
+                rows, legal_NA = (part[:-1], part[-1]) if has_mask else (part, None)
+                stepped = self._step(network, count, rows, legal_NA, batch.ranks, most)
+            else:
+                stepped = steps.policy(self.form, count, part, batch.ranks, most)
+            if stepped is None:
+                return
+            yield stepped
 
     def _step(
         self,
@@ -274,12 +273,11 @@ def log_probs_before(network: Network, input_N: Float[Tensor, "N ..."], batch: B
     return log_probs(before, input_N, batch.legal_NA)
 
 
-@torch.no_grad()
 def log_probs(
     network: Network, input_N: Float[Tensor, "N ..."], legal_NA: Bool[Tensor, "N A"] | None
 ) -> Float[Tensor, "N A"]:
     """log pi, without gradient."""
-    return log_softmax(network(input_N), legal_NA)
+    return log_softmax(network.plain(input_N), legal_NA)
 
 
 def log_softmax(logit_NA: Float[Tensor, "N A"], legal_NA: Bool[Tensor, "N A"] | None) -> Float[Tensor, "N A"]:
@@ -319,10 +317,10 @@ def _scale(
 def check_numbers(batch: Batch, readings: Readings) -> None:
     """Advantages and weights: NotFinite unless they are finite, PgtsError unless a weight is positive, when read."""
     advantage_NA, weight_N = batch.advantage_NA, batch.weight_N
-    total = batch.ranks.sum("weights of rows", weight_N.sum())
-    is_weight = (total > 0) & (weight_N >= 0).all()
+    total, off = batch.ranks.sum("weights of rows", weight_N.sum()), (weight_N < 0).sum()
     readings.check(advantage_NA.sum(), lambda _: _refuse_off("advantage", "advantage_NA", advantage_NA))
-    readings.check(torch.where(is_weight, total, torch.nan), lambda _: _refuse_weights(weight_N))
+    readings.check(total, lambda _: _refuse_weights(weight_N), is_good=lambda total: 0 < total < math.inf)
+    readings.check(off, lambda _: _refuse_weights(weight_N), is_good=lambda off: off == 0)
 
 
 def _refuse_off(what: str, name: str, value: Tensor) -> None:

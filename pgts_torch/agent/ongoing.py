@@ -62,26 +62,24 @@ class OngoingEpisodes:
             )
         self._world, self._max_length, self._seed, self._names = world, max_length, seed, names
         self._number_B = [0] * B
+        self._seed_B = [self._seed_of(b) for b in range(B)]
         self._begin_all()
 
     def _begin_all(self) -> None:
         """Let the present episode of each environment begin in the next rollout."""
         B = self._world.env.num_envs
         self._actions_B: list[list[Any]] = [[] for _ in range(B)]
-        self._return_B = [0.0] * B
+        self._return_B = np.zeros(B)
         self._episodes = self._new_episodes()
         self._has_begun = False
 
     def _new_episodes(self) -> Episodes:
         world = self._world
-        return Episodes(world.env, gamma=world.gamma, seeds=self._seeds(), masks=world.masks)
+        return Episodes(world.env, gamma=world.gamma, seeds=self._seed_B, masks=world.masks)
 
-    def _seeds(self) -> list[int]:
-        """The seed of the present episode of each environment."""
-        return [
-            int(seed_sequence(self._seed, "episode", *self._names, b, number).generate_state(1)[0])
-            for b, number in enumerate(self._number_B)
-        ]
+    def _seed_of(self, b: int) -> int:
+        """The seed of the present episode of an environment."""
+        return int(seed_sequence(self._seed, "episode", *self._names, b, self._number_B[b]).generate_state(1)[0])
 
     def collect(
         self, policy: Policy, length: int, *, names: tuple[str | int, ...], generator: torch.Generator
@@ -131,7 +129,7 @@ class OngoingEpisodes:
                 rows.append(_Row(observation_B, after_B, read_B, read_after_B, action_B, reward_B, discount_B, over_B))
                 observation_B, read_B = after_B, read_after_B
                 if over_B.any():
-                    finished += [(self._return_B[b], len(self._actions_B[b])) for b in over_B.nonzero()[0]]
+                    finished += [(float(self._return_B[b]), len(self._actions_B[b])) for b in over_B.nonzero()[0]]
                     with episodes.named(f"at the end of step {t}"):
                         self._begin(over_B)
                         observation_B, read_B = self._observe()
@@ -149,16 +147,17 @@ class OngoingEpisodes:
 
     def _step(self, action_B: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         reward_B, discount_B, truncated_B = self._episodes.step(action_B, np.ones(len(action_B), dtype=bool))
-        for b, (action, reward) in enumerate(zip(action_B.tolist(), reward_B.tolist(), strict=True)):
-            self._actions_B[b].append(action)
-            self._return_B[b] += reward
+        self._return_B += reward_B
+        for actions, action in zip(self._actions_B, action_B.tolist(), strict=True):
+            actions.append(action)
         return reward_B, discount_B, truncated_B
 
     def _begin(self, over_B: np.ndarray) -> None:
         """Begin the next episode in the environments whose episode is over."""
-        for b in over_B.nonzero()[0]:
+        for b in over_B.nonzero()[0].tolist():
             self._number_B[b], self._actions_B[b], self._return_B[b] = self._number_B[b] + 1, [], 0.0
-        self._episodes.restart(over_B, self._seeds())
+            self._seed_B[b] = self._seed_of(b)
+        self._episodes.restart(over_B, self._seed_B)
 
     def _cut(self, rows: list[_Row], begins_B: list[bool], finished: list[tuple[float, int]]) -> Rollout:
         """Return the steps as a rollout, with a column for each episode or part of one.
@@ -166,20 +165,22 @@ class OngoingEpisodes:
         Args:
             begins_B: whether an episode begins with the first step.
         """
-        over_TB = np.array([row.over_B for row in rows])
-        parts = []  # one for each column: its environment, its first step and the step after its last one
-        for b in range(over_TB.shape[1]):
-            ends = [*(over_TB[:-1, b].nonzero()[0] + 1).tolist(), len(rows)]
-            parts += [(b, start, end) for start, end in zip([0, *ends], ends, strict=False)]
-        length = max(end - start for _, start, end in parts)
-        # step_TP: which of the steps stands in each row of each of the P columns; in padding the last one of the part
-        step_TP = np.stack([np.minimum(np.arange(start, start + length), end - 1) for _, start, end in parts], 1)
-        env_P = np.array([b for b, _, _ in parts])
-        alive_TP = np.arange(length)[:, None] < np.array([end - start for _, start, end in parts])
+        ends_BT = np.array([row.over_B for row in rows]).T
+        ends_BT[:, -1] = True
+        # of each of the P columns: its environment, its last step and its first one
+        env_P, last_P = ends_BT.nonzero()
+        first_P = np.zeros_like(last_P)
+        first_P[1:] = np.where(env_P[1:] == env_P[:-1], last_P[:-1] + 1, 0)
+        row_T1 = np.arange((last_P - first_P).max() + 1)[:, None]
+        alive_TP = row_T1 <= last_P - first_P
+        # which of the steps stands in each row of each column; in padding the last one of the part
+        step_TP = np.minimum(first_P + row_T1, last_P)
         action_TP, reward_TP, discount_TP = (
             np.array([getattr(row, name) for row in rows])[step_TP, env_P] for name in _Row._fields[4:7]
         )
-        weight_TP = np.concatenate([np.ones((1, len(parts))), discount_TP[:-1].cumprod(0)]) * alive_TP
+        weight_TP = np.ones_like(discount_TP)
+        weight_TP[1:] = discount_TP[:-1].cumprod(0)
+        weight_TP *= alive_TP
         columns = (action_TP, reward_TP, discount_TP, alive_TP, weight_TP, discount_TP)
         device = self._world.device
         tensors: dict[str, Any] = {n: torch.from_numpy(c).to(device) for n, c in zip(COLUMNS, columns, strict=True)}
@@ -187,19 +188,19 @@ class OngoingEpisodes:
         def both(before: str, after: str) -> Tensor:
             """Columns of these two fields as [T + 1, P]: `before` each step, then `after` the last, also in padding."""
             before_TB, after_TB = (torch.stack([getattr(row, name) for row in rows]) for name in (before, after))
-            if len(parts) == over_TB.shape[1]:  # no episode ends before the last step
+            if len(env_P) == len(ends_BT):  # no episode ends before the last step
                 return torch.cat([before_TB, after_TB[-1:]])
-            last_P = after_TB[step_TP[-1], env_P]
-            after_UP = torch.cat([before_TB[step_TP, env_P], last_P[None]])
+            end_P = after_TB[last_P, env_P]
+            after_UP = torch.cat([before_TB[step_TP, env_P], end_P[None]])
             padded = torch.from_numpy(~alive_TP)
-            after_UP[:-1][padded] = last_P.expand_as(after_UP[:-1])[padded]
+            after_UP[:-1][padded] = end_P.expand_as(after_UP[:-1])[padded]
             return after_UP
 
         observation_UP, state_UP = both("before_B", "after_B"), None
         if isinstance(self._world, ModelWorld):
             read_UP = both("read_before_B", "read_after_B")
             state_UP = self._world.numbers(read_UP.flatten(0, 1)).view(read_UP.shape[:2])
-        begins_P = torch.tensor([start > 0 or begins_B[b] for b, start, _ in parts], device=device)
+        begins_P = torch.from_numpy((first_P > 0) | np.array(begins_B)[env_P]).to(device)
         return Rollout(observation_UP, **tensors, state_UB=state_UP, begins_B=begins_P, finished=tuple(finished))
 
     def state_dict(self) -> dict[str, Any]:
@@ -211,7 +212,7 @@ class OngoingEpisodes:
         return {
             "number": list(self._number_B),
             "actions": actions,
-            "return": list(self._return_B),
+            "return": self._return_B.tolist(),
             "observed": observed_B,
         }
 
@@ -227,7 +228,8 @@ class OngoingEpisodes:
             raise PgtsError(f"it is of {len(state['number'])} environments; this training has {B}")
         for number in state["number"]:
             check_count("number", number, least=0)
-        self._number_B, self._return_B = list(state["number"]), list(state["return"])
+        self._number_B, self._return_B = list(state["number"]), np.array(state["return"], dtype=np.float64)
+        self._seed_B = [self._seed_of(b) for b in range(B)]
         recorded = [actions.tolist() for actions in state["actions"]]
         self._actions_B, self._has_begun = recorded, state["observed"] is not None
         if not self._has_begun:
@@ -240,7 +242,7 @@ class OngoingEpisodes:
                 # All episodes reach their latest step together: one of k actions is reset k steps before the end.
                 due_B = np.array([len(actions) == longest - t for actions in recorded])
                 if t and due_B.any():
-                    self._episodes.restart(due_B, self._seeds())
+                    self._episodes.restart(due_B, self._seed_B)
                 begun_B = np.array([len(actions) >= longest - t for actions in recorded])
                 none = 0 if self._world.action_size is None else [0.0] * self._world.action_size
                 padded = [[none] * (longest - len(actions)) + actions for actions in recorded]
@@ -251,7 +253,7 @@ class OngoingEpisodes:
                 ]
             idle_B = np.array([not actions for actions in recorded])
             if longest and idle_B.any():
-                self._episodes.restart(idle_B, self._seeds())
+                self._episodes.restart(idle_B, self._seed_B)
         observed_B = self._observe()[0].cpu()
         differs_B = (observed_B != state["observed"]).reshape(B, -1).any(-1)
         differs_B |= torch.from_numpy(np.array(return_B) != np.array(self._return_B))
@@ -259,7 +261,7 @@ class OngoingEpisodes:
             b = int(differs_B.nonzero()[0, 0])
             raise PgtsError(
                 f"environment {b} of {env_name(self._world.env)} does not repeat its episode from the seed "
-                f"{self._seeds()[b]} and {len(recorded[b])} actions, so that the training cannot go on where it was: "
+                f"{self._seed_B[b]} and {len(recorded[b])} actions, so that the training cannot go on where it was: "
                 "its steps depend on something else; take the horizon 'fixed' (rollout.horizon), which resets in each "
                 "iteration"
             )

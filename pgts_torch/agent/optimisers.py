@@ -110,10 +110,10 @@ class Optimiser:
         of dense layers do (`dense_steps`)."""
         return self.num_steps >= _MANY and can_compile(device)
 
-    def compiles_all_of(self, parameters: Sequence[Tensor]) -> bool:
-        """Whether steps of these parameters are compiled as a whole, with their gradient."""
-        is_short = sum(each.numel() for each in parameters) <= _SHORT and parameters[0].dtype == torch.float32
-        return is_short and self.method == "adam" and self._compiles(parameters[0].device)
+    def compiles_all_of(self, count: int, like: Tensor) -> bool:
+        """Whether steps of so many numbers like these are compiled as a whole, with their gradient."""
+        is_short = count <= _SHORT and like.dtype == torch.float32
+        return is_short and self.method == "adam" and self._compiles(like.device)
 
     def _prepare(self, parameters: Sequence[Tensor]) -> None:
         """Make room for steps of these parameters, which is kept."""

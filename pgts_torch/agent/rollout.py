@@ -100,7 +100,12 @@ class Rollout:
 
     def of_visits(self, column_TB: Shaped[Tensor, "T B ..."]) -> Shaped[Tensor, "V ..."]:
         """The rows of the visits, in the order of `alive_TB`."""
-        return column_TB.flatten(0, 1).index_select(0, self._visit_V)
+        rows = column_TB.flatten(0, 1)
+        return rows if self._has_no_padding else rows.index_select(0, self._visit_V)
+
+    @property
+    def _has_no_padding(self) -> bool:
+        return self.num_steps == self.alive_TB.numel()
 
     # Positions are found once, because a GPU is waited for each time that a mask is an index.
 
@@ -162,9 +167,13 @@ class Rollout:
         Args:
             v: returns the values of observations; called once, with each visit and each end of an episode.
         """
-        v_M = v(self.observation_UB.flatten(0, 1).index_select(0, self._needed_M)).to(self.reward_TB)
-        v_UB = v_M.new_zeros(len(self.observation_UB) * self.num_episodes).index_copy_(0, self._needed_M, v_M)
-        v_UB = v_UB.view(-1, self.num_episodes)
+        observation_N = self.observation_UB.flatten(0, 1)
+        if self._has_no_padding:
+            v_N = v(observation_N).to(self.reward_TB)
+        else:
+            v_M = v(observation_N.index_select(0, self._needed_M)).to(self.reward_TB)
+            v_N = v_M.new_zeros(len(observation_N)).index_copy_(0, self._needed_M, v_M)
+        v_UB = v_N.view(-1, self.num_episodes)
         return v_UB[:-1], v_UB[1:]
 
     def returns(self) -> Float[Tensor, "B"]:

@@ -3,6 +3,7 @@
 from abc import ABC
 from typing import Any
 
+from pgts_torch.agent.dense_steps import compile_as_steps
 from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.optimisers import Optimiser
@@ -41,3 +42,5 @@ class SteppedUpdate(Update, ABC):
         super().check(policy)
         if isinstance(policy, NetworkPolicy | GaussianPolicy):
             self._optimiser.check_fits(policy.network.weights)
+        if isinstance(policy, NetworkPolicy):
+            compile_as_steps(policy.network, self._optimiser)

@@ -31,7 +31,7 @@ from pgts_torch.trust import import_named
 Given = str | EnvSpec | gymnasium.Env | VectorEnv | Callable[[], gymnasium.Env]
 """What a user may give as an environment."""
 
-_TOGETHER = 16
+_TOGETHER = 8
 """From so many environments on the array operations of a vectorised form take less time than their single steps."""
 
 SLOW = "slow environments are shared out by pgts train --processes N"

@@ -79,10 +79,10 @@ def check_rewards(reward: float | np.ndarray) -> None:
     """NotFinite unless these are finite, and small enough to be learned from."""
     if type(reward) is float and -LARGEST_REWARD <= reward <= LARGEST_REWARD:
         return
+    size = np.abs(reward)
+    if (size <= LARGEST_REWARD).all():
+        return
     if np.isfinite(reward).all():
-        size = np.abs(reward)
-        if (size <= LARGEST_REWARD).all():
-            return
         raise NotFinite(f"the reward is {np.max(size)} in size; it must be at most {LARGEST_REWARD:.2g}", what="reward")
     if isinstance(reward, float):
         raise NotFinite(f"the reward is {reward}", what="reward")

@@ -1,5 +1,6 @@
 """Gradient steps in compiled loops: those of torch up to rounding, for every objective, network and number of ranks."""
 
+import copy
 import math
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from pgts_torch import PGTS
 from pgts_torch.agent import optimisers
+from pgts_torch.agent.dense_steps import compiles
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
 from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
@@ -143,6 +145,53 @@ def test_values_of_a_critic_are_those_of_torch_up_to_rounding_and_compiled_as_it
     assert rows == [70, 0, 70]
 
 
+@pytest.mark.parametrize("network", NETWORKS)
+def test_a_policy_acts_as_by_torch_and_compiled_as_its_steps_are(network, monkeypatch):
+    made, plain = list[int](), dense_kernels.choices
+
+    def counted(*given: Any) -> bool:
+        made.append(len(given[3]))
+        return plain(*given)
+
+    monkeypatch.setattr(dense_kernels, "choices", counted)
+    policy, update = NetworkPolicy(VECTORS, 4, NETWORKS[network], seed=1), UPDATES["gradient"]()
+    with torch.no_grad():
+        policy.network.weights[-1].copy_(torch.tensor([0.0, 1.0, -1.0, 0.5]))  # biases, or nearly all are equal
+    update.check(policy)
+    observation_N = torch.randn(2000, 3, generator=stream(0, "rows"))
+    probs, actions = policy.probs(observation_N), policy.sample(observation_N, generator=stream(0, "actions"))
+    assert made == []
+    monkeypatch.setattr(optimisers, "_MANY", 0)
+    torch.testing.assert_close(policy.probs(observation_N), probs, atol=1e-6, rtol=1e-5)
+    found = policy.sample(observation_N, generator=stream(0, "actions"))
+    assert made == [2000]
+    assert (found != actions).sum() <= 1  # where rounding decides
+    assert not torch.equal(policy.sample(observation_N, generator=stream(1, "actions")), actions)
+    with torch.no_grad():
+        policy.network.weights[-1][2] = math.nan
+    with pytest.raises(NotFinite, match="the policy's probabilities are"):
+        policy.sample(observation_N, generator=stream(0, "actions"))
+
+
+def test_a_trunk_that_two_networks_share_and_copies_of_them_have_the_weights_that_were_last_learned(calls):
+    policy = NetworkPolicy(VECTORS, 4, MLP(hidden=[8]), seed=1)
+    critic = NetworkCritic(VECTORS, 4, NetworkValues(network="shared"), trunk=policy.network.trunk, seed=1)
+    update, observation_N = UPDATES["gradient"](), batch().observation_N
+    update.check(policy)
+    with torch_only():
+        first = critic.v(observation_N), policy.probs(observation_N)
+    for _ in range(2):
+        update(policy, batch(), generator=stream(0, "update"))
+        found = critic.v(observation_N), policy.probs(observation_N)
+        copied = copy.deepcopy(policy.network).outputs(observation_N).softmax(-1)
+        with torch_only():
+            expected = critic.v(observation_N), policy.probs(observation_N)
+        for now, by_torch, before in zip(found, expected, first, strict=True):
+            torch.testing.assert_close(now, by_torch, atol=1e-6, rtol=1e-5)
+            assert not torch.allclose(now, before, atol=1e-5)
+        assert torch.equal(copied, found[1])
+
+
 @pytest.mark.parametrize("x", [0.0, 1e-30, 1e-3, 0.3, 1.0, 4.0, 7.8, 8.0, 1e30, math.inf])
 def test_tanh_is_right_to_a_few_roundings(x):
     for sign in (1, -1):
@@ -211,12 +260,12 @@ def test_few_steps_large_networks_other_layers_and_devices_are_left_to_torch(cal
     assert calls == []
     policy, update = NetworkPolicy(VECTORS, 4, MLP(hidden=[8]), seed=1), UPDATES["ppo"]()
     policy.network.double()
-    assert not update._optimiser.compiles_all_of(policy.network.weights)
+    assert not compiles(policy.network, update._optimiser)
     monkeypatch.setattr(optimisers, "_MANY", 7)
     loaded = Optimiser(learning_rate=1.0, max_grad_norm=None)
     loaded.load_state_dict({"num_steps": 7, "first_D": torch.zeros(3), "second_D": torch.zeros(3)})
-    assert loaded.compiles_all_of([torch.zeros(3)])
-    assert not loaded.compiles_all_of([torch.zeros(3, device="meta")])  # as on a GPU, where it has taken no step yet
+    assert loaded.compiles_all_of(3, torch.zeros(3))
+    assert not loaded.compiles_all_of(3, torch.zeros(3, device="meta"))  # as on a GPU, where it has taken no step yet
     policy = NetworkPolicy(VECTORS, 4, MLP(hidden=[8]), seed=1)
     for expected in (0, 0, 6):  # steps 1 to 6, 7 to 12 and 13 to 18
         update(policy, batch(), generator=stream(0, "update"))

@@ -176,7 +176,7 @@ def test_a_fit_of_a_critic_reads_as_often_whatever_its_minibatches_and_only_to_m
     often = count(num_epochs=5, minibatch_size=64)
     assert count(num_epochs=5, minibatch_size=8) == often
     # Two tensors are copied to host memory, where targets are added up, each by `cpu` and `numpy`.
-    assert often - once == (4 * 4 if fresh_targets else 0)
+    assert often - once == (4 * 2 if fresh_targets else 0)
 
 
 def spoiled(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
