@@ -79,6 +79,18 @@ def read(path: str | Path, *, most: int | None = None, name: str | None = None) 
             return file.read(-1 if most is None else most)
 
 
+def names(folder: Path) -> list[str]:
+    """The names of what is in a folder, in order; PgtsError where it cannot be read."""
+    with named(f"{folder} cannot be read"):
+        return sorted(entry.name for entry in folder.iterdir())
+
+
+def listing(names: list[str], most: int = 5) -> str:
+    """The first names in one line, and how many more there are."""
+    shown = [ascii(name)[1:-1] for name in names[:most]]
+    return ", ".join([*shown, f"{len(names) - most} more"] if len(names) > most else shown)
+
+
 def replace(path: str | Path, raw: bytes) -> None:
     """Write a file, to the disk; a reader meanwhile finds the old file or the new one.
 

@@ -149,6 +149,7 @@ FAULTS: dict[str, dict[str, str]] = {
         "two runs in the same second": "each has a folder of its own",
         "lock that is a symbolic link": NAMED + "; what it leads to is not emptied",
         "file of the user under the name of an output": "refused by name before any work; only our own are replaced",
+        "folder of the user as an output": "refused by name, nothing written; files of the user in ours are named",
     },
     "Processes": {
         "kill at any moment": "started again, the run ends with the bits of one that was never killed",

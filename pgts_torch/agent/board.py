@@ -299,7 +299,7 @@ class Board:
 
 
 def _folder(given: str | Path, *, begins: bool) -> Path:
-    """The folder for events; PgtsError where it is none, or has those of another training."""
+    """The folder for events; PgtsError where it is none, or has those of another training, or something else only."""
     if not isinstance(given, str | Path) or not str(given):
         raise PgtsError(f"tensorboard is {given!r}; it must be the path of a folder")
     path = Path(given)
@@ -308,6 +308,11 @@ def _folder(given: str | Path, *, begins: bool) -> Path:
         raise PgtsError(f"tensorboard is {str(path)!r}, which is a {found}; it must be a folder or not exist")
     with files.named(f"tensorboard {path} cannot be read"):
         there = event_files(path)
+    if not there and found is not None and (foreign := files.names(path)):
+        raise PgtsError(
+            f"tensorboard {path} holds files, but no events ({files.listing(foreign)}); choose another folder, as "
+            f"{path / 'events'}"
+        )
     if begins and there:
         raise PgtsError(
             f"tensorboard {path} holds the events of another training ({there[0]}); choose another folder, or remove "

@@ -1,6 +1,9 @@
 """One process at a time in a run folder."""
 
 import os
+import sys
+import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Self
 
@@ -84,3 +87,18 @@ class RunLock:
 
     def __exit__(self, *error: object) -> None:
         self._file.close()  # releases the lock
+
+
+def wait_for(folders: Iterable[Path]) -> None:
+    """Wait for trainings that have outlived a command that was killed: what they come to counts."""
+    for place in folders:
+        is_said = False
+        while files.kind(place / LOCK_FILE) is not None:
+            try:
+                with RunLock(place):
+                    break
+            except InUse as error:
+                if not is_said:
+                    print(f"waiting: {error}", file=sys.stderr, flush=True)
+                is_said = True
+                time.sleep(1)

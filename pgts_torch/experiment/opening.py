@@ -27,7 +27,6 @@ from pgts_torch.experiment.ownership import (
     clear,
     cut_events,
     digest,
-    listing,
     write_mark,
 )
 from pgts_torch.experiment.resume import Start
@@ -118,7 +117,10 @@ def opened(config: Config, lock: RunLock, start: Start | None, algorithm: PGTS) 
     write_mark(path, new_mark)  # first of all: the mark makes this a run folder
     if start is None:
         if left := [name for name in clear(path, mark) if not (is_edited and name == CONFIG_FILE)]:
-            print(f"note: run.dir {path} also holds {listing(left)}, which no run has left; it stays", file=sys.stderr)
+            print(
+                f"note: run.dir {path} also holds {files.listing(left)}, which no run has left; it stays",
+                file=sys.stderr,
+            )
     else:
         checkpoint.tidy(path, start.path, keep=config.log.keep)
         print(f"going on from {start.path}", file=sys.stderr)

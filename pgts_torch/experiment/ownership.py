@@ -7,6 +7,7 @@ their names. A folder without a mark is not touched.
 import hashlib
 import os
 import re
+import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -108,10 +109,12 @@ def check_folder(path: Path) -> Mark:
         return Mark()
     if found != "folder":
         raise PgtsError(f"run.dir {path} is a {found or 'link to nowhere'}; it must be a folder or not exist")
-    mark, names = read_mark(path), _names(path)
+    mark, names = read_mark(path), files.names(path)
     if mark is None:
         if foreign := [name for name in names if not _is_left_over(path / name)]:
-            whose = "a run of version 0.1" if is_earlier(path) else f"files that no run has left ({listing(foreign)})"
+            whose = (
+                "a run of version 0.1" if is_earlier(path) else f"files that no run has left ({files.listing(foreign)})"
+            )
             raise PgtsError(f"run.dir {path} holds {whose}; choose another folder")
         return Mark()
     for name in names:
@@ -126,15 +129,27 @@ def is_earlier(run: Path) -> bool:
     return any((run / CHECKPOINTS).glob("*/manifest.json"))
 
 
-def listing(names: list[str], most: int = 5) -> str:
-    """The first names in one line, and how many more there are."""
-    shown = [ascii(name)[1:-1] for name in names[:most]]
-    return ", ".join([*shown, f"{len(names) - most} more"] if len(names) > most else shown)
+def check_many(out: Path, own: str, what: str) -> None:
+    """Check that many runs can be put into a folder, without writing to it; where it also holds something else, that is
+    said.
 
+    Args:
+        own: a regular expression of the names that `what` ("sweep", "tuning") gives to files and folders.
 
-def _names(folder: Path) -> list[str]:
-    with files.named(f"{folder} cannot be read"):
-        return sorted(entry.name for entry in folder.iterdir())
+    Raises:
+        PgtsError: nothing in it is ours, and something is there.
+    """
+    if files.kind(out, follow=True) is None:
+        return
+    names = [name for name in files.names(out) if name != LOCK_FILE and not name.endswith(files.PARTIAL)]
+    foreign = [name for name in names if not re.fullmatch(own, name)]
+    if not foreign:
+        return
+    if len(foreign) == len(names):
+        raise PgtsError(
+            f"--out {out} holds files that no {what} has left ({files.listing(foreign)}); choose another folder"
+        )
+    print(f"note: --out {out} also holds {files.listing(foreign)}, which no {what} has left; it stays", file=sys.stderr)
 
 
 def _is_left_over(path: Path) -> bool:
@@ -171,12 +186,12 @@ def clear(run: Path, mark: Mark) -> list[str]:
     config = run / CONFIG_FILE
     if files.kind(config) is not None and digest(files.read(config)) in mark.configs:
         _remove(config)
-    return [name for name in _names(run) if name not in (MARK_FILE, LOCK_FILE)]
+    return [name for name in files.names(run) if name not in (MARK_FILE, LOCK_FILE)]
 
 
 def cut_events(run: Path, noted: Mapping[str, tuple[int, str]]) -> None:
     """Cut the event files of a run to the lengths that are noted of them, and remove the others."""
-    for name in filter(is_events, _names(run)):
+    for name in filter(is_events, files.names(run)):
         if name not in noted:
             _remove(run / name)
         elif files.kind(run / name) == "file":
@@ -186,7 +201,7 @@ def cut_events(run: Path, noted: Mapping[str, tuple[int, str]]) -> None:
 
 def remove_partial(run: Path) -> None:
     """Remove half written files of a killed process. The caller must hold the lock."""
-    for path in [run / name for name in _names(run)] + _in_checkpoints(run):
+    for path in [run / name for name in files.names(run)] + _in_checkpoints(run):
         if _is_partial(path.name):
             _remove(path)
 
@@ -203,7 +218,7 @@ def checkpoints(run: Path) -> list[Path]:
 
 def _in_checkpoints(run: Path) -> list[Path]:
     folder = run / CHECKPOINTS
-    return [folder / name for name in _names(folder)] if files.kind(folder) == "folder" else []
+    return [folder / name for name in files.names(folder)] if files.kind(folder) == "folder" else []
 
 
 def _remove(path: Path) -> None:

@@ -12,7 +12,8 @@ from pydantic import TypeAdapter, ValidationError
 from pgts_torch import files
 from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.ownership import CONFIG_FILE
+from pgts_torch.experiment.locking import wait_for
+from pgts_torch.experiment.ownership import CONFIG_FILE, check_many
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.statistics import Mean, estimate, interquartile_mean
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from pgts_torch.experiment.summary import Summary
 
 TABLE_FILE, CURVES_FILE = "table.json", "curves.png"
+OWN = r"depth-(\d+|adaptive)|table\.json|curves\.png|compare\.(html|png)"
+"""Names of what a sweep, and a comparison of its runs, leaves in its folder."""
 
 SET_BY_MANY = {
     "seed": "--seeds says how many",
@@ -93,8 +96,9 @@ def plan(
     Raises:
         ConfigError: a configuration is wrong.
         PgtsError: an override that the sweep sets itself, or a folder that holds a run, finished or not, of another
-            configuration, or a table or a picture that no sweep has made.
+            configuration, or a table or a picture that no sweep has made; or `out` holds files, but none of a sweep.
     """
+    check_many(out, OWN, "sweep")
     _targets(out)
     check_overrides(overrides, SET_BY_SWEEP, "sweep")
     shared = ["--config", path] if path is not None else []
@@ -125,7 +129,7 @@ def check_overrides(overrides: Sequence[str], set_here: Mapping[str, str], what:
 def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
     """Run the unfinished trainings, each in its own process, and write table.json and curves.png.
 
-    An interrupted training resumes from its last checkpoint.
+    An interrupted training resumes from its last checkpoint; one that outlived a killed sweep is waited for.
 
     Raises:
         PgtsError: what a configuration describes cannot be built; nothing was started.
@@ -137,6 +141,7 @@ def sweep(runs: Sequence[Run], *, jobs: int, out: Path) -> Sweep:
     from pgts_torch.experiment.run import build
     from pgts_torch.experiment.summary import summary_in
 
+    wait_for(run.folder for run in runs)
     waiting = [run for run in runs if summary_in(run.folder) is None]
     for config in {run.depth: run.config for run in waiting}.values():
         build(config)

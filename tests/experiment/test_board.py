@@ -307,6 +307,24 @@ def test_a_file_or_the_events_of_another_training_are_left_alone(by_learn, tmp_p
     assert model.num_env_steps == 0
 
 
+@pytest.mark.fault("folder of the user as an output")
+def test_a_folder_with_other_things_only_is_left_alone(tmp_path):
+    model = PGTS("pgts/Ladder-v0", **SMALL)
+    (tmp_path / "thesis.tex").write_text("mine")
+    refusal = (
+        rf"^tensorboard {tmp_path} holds files, but no events \(thesis\.tex\); choose another folder, as {tmp_path}/"
+    )
+    with pytest.raises(PgtsError, match=refusal):
+        model.learn(60, tensorboard=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    assert model.num_env_steps == 0
+    (tmp_path / "empty").mkdir()
+    model.learn(60, tensorboard=tmp_path / "empty")
+    (tmp_path / "empty/thesis.tex").write_text("mine")
+    model.learn(120, tensorboard=tmp_path / "empty")  # which is ours by now
+    assert values(tmp_path / "empty")["final/env_steps"][-1] == (120, 120)
+
+
 def test_a_line_of_numbers_is_one_event(tmp_path, monkeypatch):
     written: list[Any] = []
     with Events(tmp_path) as events:

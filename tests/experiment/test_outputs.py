@@ -68,7 +68,7 @@ def test_a_page_replaces_a_page_and_nothing_else(here, capsys):
 @pytest.mark.parametrize("name", ["table.json", "curves.png"])
 def test_a_sweep_replaces_its_own_table_and_picture_and_nothing_else(name, here, capsys, monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", ForkedCommand)
-    put(here, out__x="mine")
+    (here / "out").mkdir()
     (here / "out" / name).write_text('{"rows": []}')
     before = tree(here)
     sweep = ["sweep", "--out=out", "--seeds=1", "--depths=0", *TINY, "--total_steps=5", "--run.tensorboard=false"]

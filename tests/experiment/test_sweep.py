@@ -212,6 +212,40 @@ def test_a_run_that_was_killed_has_failed(trainer):
     assert train_all({"a": []}, jobs=1) == {"a": "killed by the signal 9"}
 
 
+@pytest.mark.fault("folder of the user as an output")
+def test_a_folder_with_other_things_only_is_left_alone_and_others_are_named(here, capsys):
+    Path("thesis.tex").write_text("mine")
+    assert main(["sweep", "--out", ".", *SMALL]) == 2
+    refusal = "error: --out . holds files that no sweep has left (thesis.tex); choose another folder\n"
+    assert capsys.readouterr() == ("", refusal)
+    assert [path.name for path in here.iterdir()] == ["thesis.tex"]
+    finish(planned(num_seeds=1)[0], J=0.5)
+    Path("out/thesis.tex").write_text("mine")
+    assert main(["sweep", "--out", "out", "--depths", "0", "--seeds", "1", *SMALL]) == 0
+    note = "note: --out out also holds thesis.tex, which no sweep has left; it stays\n"
+    assert capsys.readouterr().err == note
+    assert Path("out/thesis.tex").read_text() == "mine"
+
+
+@pytest.mark.fault("kill at any moment")
+def test_runs_that_outlive_a_killed_sweep_are_waited_for_and_count(here, monkeypatch, capsys):
+    monkeypatch.setattr(subprocess, "Popen", None)
+    [each] = planned(depths=(0,), num_seeds=1)
+    left, waits = RunLock(each.folder), list[float]()
+
+    def sleep(seconds: float) -> None:
+        waits.append(seconds)
+        if len(waits) == 3:
+            finish(each, J=0.5)
+            left.__exit__()
+
+    monkeypatch.setattr(time, "sleep", sleep)
+    answer = sweep.sweep([each], jobs=1, out=Path("out"))
+    assert (len(waits), answer.failures, answer.rows[0].score.mean) == (3, {}, 0.5)
+    waiting = f"waiting: run.dir out/depth-0/seed-0 is in use by the process {os.getpid()}\n"
+    assert capsys.readouterr().err == waiting
+
+
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_a_run_that_fails_is_named_and_the_others_go_on(here, capsys, monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", ForkedCommand)

@@ -1,10 +1,12 @@
 """The command `pgts tune`: which values are tried, what they are worth, and a tuning that is cut off."""
 
+import contextlib
 import json
 import os
 import signal
 import sqlite3
 import subprocess
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -22,6 +24,7 @@ from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.statistics import estimate
 from pgts_torch.experiment.tune import result, space
 from tests.experiment import finished
+from tests.experiment.runs import tree
 from tests.forks import ForkedCommand, in_child
 
 optuna = pytest.importorskip("optuna")
@@ -245,7 +248,7 @@ def test_trainings_that_outlive_a_tuning_are_waited_for(trainer, monkeypatch, ca
         if len(waits) == 3:
             left.__exit__()
 
-    monkeypatch.setattr(studies.time, "sleep", sleep)
+    monkeypatch.setattr(time, "sleep", sleep)
     assert without(tuned("--trials=3"), "out") == without(whole, "out")
     assert len(waits) == 3
     waiting = f"waiting: run.dir out/trial-0001/seed-1 is in use by the process {os.getpid()}"
@@ -315,6 +318,41 @@ def test_the_runs_of_trials_are_compared(trainer):
     assert [group["label"] for group in found["groups"]] == [f"search.depth {depth}" for depth in sorted(depths)]
 
 
+def refused(capsys: pytest.CaptureFixture[str], *more: str) -> str:
+    before = tree(Path())
+    assert main(["tune", "--option", STEP, "--update.type=mirror", *LADDER, *more]) == 2
+    assert tree(Path()) == before
+    out, err = capsys.readouterr()
+    [mistake] = err.splitlines()
+    assert not out
+    return mistake
+
+
+@pytest.mark.fault("folder of the user as an output")
+def test_a_folder_with_other_things_only_is_left_alone_and_others_are_named(trainer, capsys):
+    Path("thesis.tex").write_text("mine")
+    expected = "error: --out . holds files that no tuning has left (thesis.tex); choose another folder"
+    assert refused(capsys, "--out", ".") == expected
+    first = tuned("--trials=2")
+    capsys.readouterr()
+    Path("out/thesis.tex").write_text("mine")
+    assert tuned("--trials=2") == first
+    assert capsys.readouterr().err == "note: --out out also holds thesis.tex, which no tuning has left; it stays\n"
+    assert Path("out/thesis.tex").read_text() == "mine"
+
+
+@pytest.mark.fault("file of the user under the name of an output")
+def test_a_database_of_something_else_is_left_alone(trainer, capsys):
+    with contextlib.closing(sqlite3.connect("mine.db")) as database:
+        database.execute("CREATE TABLE songs (name TEXT)")
+    mistake = refused(capsys, "--out", "out", "--storage", "mine.db")
+    assert mistake == "error: --storage mine.db is a database of something else, with songs"
+    optuna.create_study(storage="sqlite:///shared.db", study_name="another")
+    tuned("--trials=1", "--storage=shared.db")
+    names = optuna.get_all_study_names("sqlite:///shared.db")
+    assert names == ["another", f"pgts tune {Path('out').resolve()}"]
+
+
 @pytest.mark.parametrize(
     ("spec", "kind", "ends"),
     [
@@ -364,7 +402,7 @@ def test_a_mistake_is_one_line_with_exit_code_2_and_starts_nothing(arguments, he
     assert mistake.startswith("error: ")
     assert MISTAKES[arguments] in mistake
     assert trainer.trained == []
-    assert not Path("o/tune.db").exists()
+    assert not list(here.iterdir())
 
 
 def test_another_tuning_or_something_else_in_the_storage_is_refused(trainer, capsys):

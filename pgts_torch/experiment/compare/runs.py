@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pgts_torch import files
 from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.ownership import CONFIG_FILE, FAILURE_FILE, METRICS_FILE, listing
+from pgts_torch.experiment.ownership import CONFIG_FILE, FAILURE_FILE, METRICS_FILE
 from pgts_torch.experiment.report.facts import metrics
 from pgts_torch.experiment.resume import FREE_KEYS, FREE_SECTIONS, flat, plain
 from pgts_torch.experiment.summary import summary_in
@@ -105,7 +105,7 @@ class Notes:
         self._about.setdefault(what, []).extend([about] if about else [])
 
     def lines(self) -> list[str]:
-        return [f"{what}: {listing(about, most=3)}" if about else what for what, about in self._about.items()]
+        return [f"{what}: {files.listing(about, most=3)}" if about else what for what, about in self._about.items()]
 
     def refusal(self, what: str) -> PgtsError:
         """An error that nothing is left, and why."""

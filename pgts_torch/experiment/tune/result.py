@@ -21,17 +21,21 @@ from pgts_torch.experiment.compare.comparison import WORDS
 from pgts_torch.experiment.compare.drawing import png, shortened
 from pgts_torch.experiment.compare.text import WIDTH, interval
 from pgts_torch.experiment.locking import RunLock
+from pgts_torch.experiment.ownership import check_many
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.report.curves import COLOURS, GREY
 from pgts_torch.experiment.statistics import Mean, estimate
 from pgts_torch.experiment.summary import summary_in
 from pgts_torch.experiment.tune.space import Option, Plan, Value
-from pgts_torch.experiment.tune.study import FAILURE, SCORES, Pruning, imported, run_trials, score, trainings
+from pgts_torch.experiment.tune.study import FAILURE, SCORES, Pruning, check, imported, run_trials, score, trainings
 
 if TYPE_CHECKING:
     import optuna
 
 TABLE_FILE, PICTURE_FILE, BEST_FILE, STORAGE_FILE = "tune.json", "tune.png", "best.yaml", "tune.db"
+OWN = r"(trial|best)-\d{4,}|tune\.(json|png|db.*)|best\.yaml|compare\.(html|png)"
+"""Names of what a tuning, and a comparison of its runs, leaves in its folder."""
+
 SHOWN = 5
 
 
@@ -87,10 +91,13 @@ def tune(
         confirm: seeds for the best configuration, beyond those of the trials.
 
     Raises:
-        PgtsError: as from `run_trials`; or another process has the folder, or files that are not ours are in it.
+        PgtsError: as from `check` and `run_trials`; or another process has the folder, or it is not ours.
         Stopped: a signal came; the same command goes on.
     """
+    check_many(plan.out, OWN, "tuning")
     targets = _targets(plan.out)
+    storage = storage or plan.out / STORAGE_FILE
+    check(plan, storage)
     with RunLock(plan.out, name="--out"):
         study = run_trials(
             plan,
@@ -98,7 +105,7 @@ def tune(
             jobs=jobs,
             pruning=pruning,
             sampler=sampler,
-            storage=storage or plan.out / STORAGE_FILE,
+            storage=storage,
         )
         found = [_trial(each) for each in study.get_trials(deepcopy=False)]
         complete = [trial for trial in found if trial.score is not None]

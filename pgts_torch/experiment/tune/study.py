@@ -7,7 +7,7 @@ of seeds and steps, however many runs there are at once. A trial that was cut of
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +19,7 @@ from pgts_torch import files
 from pgts_torch.config import ConfigError
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.compare.runs import GREEDY, SAMPLED, J
-from pgts_torch.experiment.locking import InUse, RunLock
-from pgts_torch.experiment.ownership import LOCK_FILE
+from pgts_torch.experiment.locking import wait_for
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.report.facts import metrics
 from pgts_torch.experiment.resume import flat, plain
@@ -67,14 +66,10 @@ def run_trials(
     """Train so many trials, counting those that are in the storage already.
 
     Raises:
-        PgtsError: Optuna is not installed, the storage is something else, or of another tuning, or the first
-            configuration cannot be built.
+        PgtsError: the storage is of another tuning, or cannot be written to.
         Stopped: a signal came; the same command goes on.
     """
     optuna = imported()
-    with build(plan.base) as algorithm:
-        if plan.metric == J and algorithm.world.mdp is None:
-            raise PgtsError(f"--metric {J}: the exact return is not known in {plan.base.env.id}; take {GREEDY}")
     with _refused(storage):
         study = _opened(plan, storage)
         study.pruner = (
@@ -87,6 +82,34 @@ def run_trials(
         while (trial := _next(study, trials, sampler)) is not None:
             _train(study, trial, plan, jobs)
     return study
+
+
+def check(plan: Plan, storage: Path) -> None:
+    """Check what can be checked before anything is written.
+
+    Raises:
+        PgtsError: Optuna is not installed, the first configuration cannot be built, or something else is in the place
+            of the storage.
+    """
+    imported()
+    import sqlalchemy
+
+    found = files.kind(storage, follow=True)
+    if found not in (None, "file"):
+        raise PgtsError(f"--storage {storage} is a {found}; it must be a file, or not exist")
+    with _refused(storage):
+        tables = sqlalchemy.inspect(sqlalchemy.create_engine(_url(storage))).get_table_names() if found else []
+    if tables and "trials" not in tables:
+        raise PgtsError(f"--storage {storage} is a database of something else, with {files.listing(tables)}")
+    with build(plan.base) as algorithm:
+        if plan.metric == J and algorithm.world.mdp is None:
+            raise PgtsError(f"--metric {J}: the exact return is not known in {plan.base.env.id}; take {GREEDY}")
+
+
+def _url(storage: Path) -> str:
+    import sqlalchemy
+
+    return sqlalchemy.URL.create("sqlite", database=str(storage)).render_as_string()
 
 
 def imported() -> Any:
@@ -115,13 +138,8 @@ def _refused(storage: Path) -> Iterator[None]:
 
 def _opened(plan: Plan, storage: Path) -> "optuna.Study":
     """The study in the storage, a new one where there is none; PgtsError where it is of another tuning."""
-    import sqlalchemy
-
     optuna = imported()
-    if files.kind(storage) not in (None, "file"):
-        raise PgtsError(f"--storage {storage} is a {files.kind(storage)}; it must be a file, or not exist")
-    url = str(sqlalchemy.URL.create("sqlite", database=str(storage)))
-    kept = optuna.storages.RDBStorage(url, engine_kwargs={"connect_args": {"timeout": 60}})
+    kept = optuna.storages.RDBStorage(_url(storage), engine_kwargs={"connect_args": {"timeout": 60}})
     name = STUDY if storage.parent.resolve() == plan.out.resolve() else f"{STUDY} {plan.out.resolve()}"
     study = optuna.create_study(storage=kept, study_name=name, direction="maximize", load_if_exists=True)
     options = {option.key: option.spec for option in plan.options}
@@ -194,7 +212,7 @@ def _train(study: "optuna.Study", trial: "optuna.Trial", plan: Plan, jobs: int) 
     failures: Mapping[str, str] = {}
     try:
         plan.config(values)
-        _wait_for(folders.values())
+        wait_for(folders.values())
         failures = train_all(trainings(plan, values, folders), jobs=jobs, is_over=watch)
     except ConfigError as error:
         failures = {"the values do not go together": error.mistakes[0]}
@@ -214,21 +232,6 @@ def _train(study: "optuna.Study", trial: "optuna.Trial", plan: Plan, jobs: int) 
         f"pruned at step {told.last_step:,}" if told.state == states.PRUNED else f"{told.value:.4g}"
     )
     print(f"trial {trial.number}: {worth}", file=sys.stderr, flush=True)
-
-
-def _wait_for(folders: Iterable[Path]) -> None:
-    """Wait for trainings that have outlived a tuning that was killed: what they come to counts."""
-    for place in folders:
-        is_said = False
-        while files.kind(place / LOCK_FILE) is not None:
-            try:
-                with RunLock(place):
-                    break
-            except InUse as error:
-                if not is_said:
-                    print(f"waiting: {error}", file=sys.stderr, flush=True)
-                is_said = True
-                time.sleep(1)
 
 
 @final
