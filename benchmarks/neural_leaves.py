@@ -5,8 +5,13 @@
 CartPole from 128 roots, 64 simulations each, depth 8; the critic is a network of two layers of 64 units that knows
 nothing. Both sides have the same network, dynamics and roots. Ours calls model and critic for the new states of all
 roots together, and values all children of a state that it expands: two rows of the critic a simulation, where mctx has
-one. The critic's values are computed by a compiled loop, as in a training from its 200th gradient step on, or by torch.
-How long the critic alone takes for so many rows is a line of its own: no search of ours can be faster.
+one. So one line has half as many simulations, for as many rows. The critic's values are computed by a compiled loop, as
+in a training from its 200th gradient step on, or by torch. How long the critic alone takes for so many rows is a line
+of its own, and so is a search that knows all states, to which the model costs nothing: one call of the critic, and
+loops over trees.
+
+error: the mean of |q - T^m Q| over roots and actions, with T^m Q from a full search with the same critic. best: the
+share of roots where the action with the largest q is the one with the largest T^m Q.
 
 CPU time of one thread on one core for both sides, all forms in turns.
 """
@@ -29,11 +34,11 @@ from pgts_torch.agent.networks import Network, make_trunk
 from pgts_torch.compiled import torch_only
 from pgts_torch.models.classic import CartPole
 from pgts_torch.options import MLP
-from pgts_torch.search import Lookahead, mcts
+from pgts_torch.search import Lookahead, Topology, expectimax, mcts
 from pgts_torch.seeding import stream
 
 ROOTS, SIMULATIONS, DEPTH, HIDDEN, GAMMA = 128, 64, 8, 64, 0.99
-OURS = "mcts, tree"
+OURS, HALF = "mcts, tree", "mcts, tree, half as many"
 
 Critic = Callable[[torch.Tensor], torch.Tensor]
 
@@ -44,16 +49,23 @@ def make_critic() -> Network:
     return Network(trunk, 1, gain=1.0, generator=generator)
 
 
-def our_search(model: CartPole, critic: Critic, root_BD: torch.Tensor) -> Lookahead:
-    """A search that knows no state at first."""
-    model.clear()
-    return mcts(
-        model,
-        model.number(root_BD),
-        depth=DEPTH,
-        v_leaf=lambda state_N: critic(model.states(state_N).float()).squeeze(1).double(),
-        simulations=SIMULATIONS,
-    )
+def leaf_of(model: CartPole, critic: Critic) -> Critic:
+    """The critic's values of numbered states."""
+    return lambda state_N: critic(model.states(state_N).float()).squeeze(1).double()
+
+
+def our_search(
+    model: CartPole,
+    critic: Critic,
+    root_BD: torch.Tensor,
+    simulations: int = SIMULATIONS,
+    known: Topology | None = None,
+) -> Lookahead:
+    """A search that knows no state at first, or those of a topology."""
+    if known is None:
+        model.clear()
+    root_B, leaf = model.number(root_BD), leaf_of(model, critic)
+    return mcts(model, root_B, depth=DEPTH, v_leaf=leaf, simulations=simulations, topology=known)
 
 
 def peer_search(critic: Network, root_BD: torch.Tensor, policy: Policy) -> Form | None:
@@ -119,6 +131,10 @@ def neural_leaves(repeats: int) -> dict[str, Any]:
         with torch_only():
             our_search(model, critic.outputs, root_BD)
 
+    other, full = (CartPole(gymnasium.make("CartPole-v1"), gamma=GAMMA) for _ in range(2))
+    true_BA = expectimax(full, full.number(root_BD), depth=DEPTH, v_leaf=leaf_of(full, compiled)).q_BA
+    known = Topology(other)
+    our_search(other, compiled, root_BD, known=known)
     batch_ND = torch.zeros(rows // found.critic_calls, 4)
 
     def alone(critic: Critic) -> None:
@@ -127,6 +143,8 @@ def neural_leaves(repeats: int) -> dict[str, Any]:
 
     forms: dict[str, Form] = {
         OURS: lambda: our_search(model, compiled, root_BD),
+        HALF: lambda: our_search(model, compiled, root_BD, SIMULATIONS // 2),
+        f"{OURS}, states known": lambda: our_search(other, compiled, root_BD, known=known),
         "the critic alone": lambda: alone(compiled),
         f"{OURS}, critic by torch": lambda: our_search(model, critic.outputs, root_BD),
         "that critic alone": lambda: alone(critic.outputs),
@@ -135,6 +153,8 @@ def neural_leaves(repeats: int) -> dict[str, Any]:
     peers = {f"mctx, {policy}": peer_search(critic, root_BD, policy) for policy in POLICIES}
     forms |= {name: peer for name, peer in peers.items() if peer}
     times = take_turns(forms, repeats)
+    searches = {OURS: forms[OURS], HALF: forms[HALF]} | {name: peer for name, peer in peers.items() if peer}
+    found_BA = {name: _q_values(search()) for name, search in searches.items()}
     return {
         "critic_calls": found.critic_calls,
         "critic_rows": rows,
@@ -145,9 +165,19 @@ def neural_leaves(repeats: int) -> dict[str, Any]:
                 for policy in POLICIES
                 if f"mctx, {policy}" in times
             }
+            | (_against(true_BA, found_BA[form]) if form in found_BA else {})
             for form in forms
         },
     }
+
+
+def _q_values(found: Any) -> torch.Tensor:
+    return found.q_BA if isinstance(found, Lookahead) else torch.from_numpy(np.array(found)).double()
+
+
+def _against(true_BA: torch.Tensor, q_BA: torch.Tensor) -> dict[str, float]:
+    best = (q_BA.argmax(1) == true_BA.argmax(1)).double().mean()
+    return {"error": float((q_BA - true_BA).abs().mean()), "best": float(best)}
 
 
 def main() -> None:
@@ -158,11 +188,13 @@ def main() -> None:
     report = about(args) | neural_leaves(args.repeats or (3 if args.quick else 9))
     print(f"CartPole, {ROOTS} roots, {SIMULATIONS} simulations, depth {DEPTH}")
     print(f"ours: {report['critic_rows']} rows of the critic in {report['critic_calls']} calls")
-    print(f"{'':<28}{'CPU ms':>9}{'to muzero':>11}{'to gumbel':>11}")
+    print(f"{'':<28}{'CPU ms':>9}{'to muzero':>11}{'to gumbel':>11}{'error':>9}{'best':>7}")
     for form, row in report["forms"].items():
         ratios = (f"{row[key]:.2f}" if (key := f"{policy}_time_ratio") in row else "" for policy in POLICIES)
-        print(f"{form:<28}{row['milliseconds']:>9.1f}" + "".join(f"{ratio:>11}" for ratio in ratios))
+        line = f"{form:<28}{row['milliseconds']:>9.1f}" + "".join(f"{ratio:>11}" for ratio in ratios)
+        print(line + (f"{row['error']:>9.4f}{row['best']:>7.0%}" if "error" in row else ""))
     print("to muzero, to gumbel: mctx's time with that policy to this time; above 1, this is faster.")
+    print(f"half as many: {SIMULATIONS // 2} simulations. states known: no call of the model, one of the critic.")
     write(report, args.json)
 
 

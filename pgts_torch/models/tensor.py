@@ -78,8 +78,9 @@ class TensorModel(EnumeratingModel, FollowingModel):
         self.dtype = dtype
         self.action_repeat = action_repeat
         self.is_certain = True
-        # All actions again and again, and as many probabilities.
-        self._action_N, self._one_N = torch.empty(0, dtype=torch.int64), torch.empty(0)
+        # Rows n * A + a: n, a, and a probability.
+        self._row_N = self._action_N = torch.empty(0, dtype=torch.int64)
+        self._one_N = torch.empty(0)
         self.simulator_steps = 0
         """For how many (state, action) `step` was called."""
 
@@ -133,9 +134,11 @@ class TensorModel(EnumeratingModel, FollowingModel):
         # Rows n * A + a: every action in the first state, then in the second, ...
         N, A = state_N.shape[0], self.num_actions
         if N * A > self._action_N.shape[0]:
+            self._row_N = torch.arange(2 * N, device=self.device).repeat_interleave(A)
             self._action_N = torch.arange(A, device=self.device).repeat(2 * N)
             self._one_N = torch.ones(2 * N * A, dtype=self.dtype, device=self.device)
-        reward_N, discount_N, next_N = self._followed(state_N.repeat_interleave(A), self._action_N[: N * A])
+        pairs = state_N.index_select(0, self._row_N[: N * A]), self._action_N[: N * A]
+        reward_N, discount_N, next_N = self._followed(*pairs)
         certain_NAK = self._one_N[: N * A].view(N, A, 1)
         return Outcomes(
             reward_N.view(-1, A), certain_NAK, discount_N.view(-1, A, 1), next_N.view(-1, A, 1), self.num_states
