@@ -96,7 +96,7 @@ def record(names: list[str]) -> None:
 def document() -> str:
     """The text of docs/environments.md."""
     lines = [
-        "# What can be observed",
+        "# Observations, action masks, environments",
         "",
         "Each kind of observation below is trained on, saved, loaded, evaluated and resumed by",
         "[tests/agent/test_spaces.py](../tests/agent/test_spaces.py), with each of its networks and with",

@@ -8,6 +8,7 @@ import importlib
 import io
 import re
 import shlex
+import subprocess
 import sys
 import tomllib
 import types
@@ -18,14 +19,19 @@ from typing import NamedTuple
 import pytest
 
 from pgts_torch.cli.commands import COMMANDS
+from tests.forks import PATIENCE
 
 ROOT = Path(__file__).parents[1]
 PAGES = {
     str(path.relative_to(ROOT)): path
     for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs/start").glob("*.md")))
 }
-LINKED = PAGES | {str(path.relative_to(ROOT)): path for path in sorted((ROOT / "docs/tutorials").glob("*.md"))}
-"""With those whose Python `test_tutorials` runs."""
+LINKED = PAGES | {
+    str(path.relative_to(ROOT)): path
+    for path in sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs/tutorials").glob("*.md")])
+    if path.name != "index.md"
+}
+"""With those whose Python `test_tutorials` runs, and those without."""
 
 
 class Block(NamedTuple):
@@ -42,6 +48,18 @@ def blocks(page: str) -> list[Block]:
         r"^(?:<!-- (long|parsed) -->\n)?```(\w*|\{code-cell\} python)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE
     )
     return [Block(language, text, mark) for mark, language, text in found]
+
+
+def links(page: str) -> list[tuple[str, str]]:
+    """The (file, heading) of the links of a page, "" where one is missing, without those to other places."""
+    prose = re.sub(r"^```.*?^```$|`[^`\n]*`", "", page, flags=re.DOTALL | re.MULTILINE)
+    return [(file, name) for file, name in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", prose) if "://" not in file]
+
+
+def headings(page: str) -> set[str]:
+    """The headings of a page as links name them."""
+    lines = re.findall(r"^#+ (.*)$", page, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", line.lower()).replace(" ", "-") for line in lines}
 
 
 def printed(page: list[Block], *, long: bool) -> Iterator[tuple[str, str]]:
@@ -103,8 +121,32 @@ def test_commands_and_links_of_a_page_exist(page, capsys):
                     COMMANDS[command](["--help"])
                 known = capsys.readouterr().out
                 assert all(word in known for word in arguments if word.startswith("--"))
-    for link in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
-        assert (LINKED[page].parent / link).exists(), link
+    for link, heading in links(text):
+        target = LINKED[page].parent / link if link else LINKED[page]
+        assert target.exists(), link
+        assert not heading or heading in headings(target.read_text(encoding="utf-8")), (link, heading)
+
+
+@pytest.mark.parametrize("page", LINKED)
+def test_code_of_a_page_is_as_narrow_as_the_site(page):
+    text = LINKED[page].read_text(encoding="utf-8")
+    lines = [line for block in blocks(text) if "python" in block.language for line in block.text.splitlines()]
+    assert all(len(line) <= 100 for line in lines)
+
+
+def test_a_dead_link_is_noticed(tmp_path):
+    page = "# One\n\n[a](b.md#c-d), [e](#one), [f](https://g.org/h#i), `[j](k)`\n\n```python\nl[m](n)\n```\n"
+    assert links(page) == [("b.md", "c-d"), ("", "one")]
+    assert headings(page + "## 9. What (it) is\n") == {"one", "9-what-it-is"}
+
+    def dead(body):
+        (tmp_path / "index.html").write_text(f"<h1 id='top'>Top</h1>{body}", encoding="utf-8")
+        done = subprocess.run([sys.executable, ROOT / ".ci/links", tmp_path], timeout=PATIENCE, stdout=subprocess.PIPE)
+        return done.returncode, done.stdout.decode().splitlines()
+
+    assert dead("<a href='#top'>a</a><a href='https://b.org/c'>b</a>") == (0, ["1 links"])
+    assert dead("<a href='#up'>a</a><img src='d.png'>") == (1, ["2 links", "index.html: #up", "index.html: d.png"])
+    assert dead("") == (1, ["0 links"])
 
 
 @pytest.mark.parametrize("package", ["models", "search", "tabular", "envs"])

@@ -123,7 +123,21 @@ class Evaluator:
 
 
 def evaluate(algorithm: PGTS, *, episodes: int, deterministic: bool = True, seed: int = 0) -> Evaluation:
-    """One evaluation by an `Evaluator`, which says what is raised."""
+    """The scores of new episodes, in environments of their own; training is not affected.
+
+    Args:
+        algorithm: the training whose policy acts, without search.
+        episodes: how many, at least 1; they run side by side, under the environment's own time limit.
+        deterministic: take the most probable action, of a gaussian policy the mean; else sample from pi.
+        seed: of these episodes alone.
+
+    Returns:
+        `episodic_return`, `discounted_return` and `episodic_length`, each with its `mean` and the `half_width` of a
+        95 % confidence interval (None for one episode).
+
+    Raises:
+        PgtsError: as `Evaluator` and its call say.
+    """
     with Evaluator(episodes) as evaluator:
         return evaluator(algorithm, deterministic=deterministic, seed=seed)
 

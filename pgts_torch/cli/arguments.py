@@ -71,7 +71,7 @@ def describe_options(options: Sequence[Option]) -> Iterator[str]:
 
 def _describe_option(option: Option, indent: str) -> Iterator[str]:
     deeper = indent + "    "
-    yield from _wrap(f"--{option.key}  {option.requirement} (default: {_value(option.default)})", indent, deeper)
+    yield from _wrap(f"--{option.key}  {option.requirement} (default: {value_text(option.default)})", indent, deeper)
     yield from _wrap(option.meaning, deeper, deeper)
     for value, meaning in option.choices:
         yield from _wrap(f"{value}: {meaning}", deeper + "  ", deeper + "    ")
@@ -82,7 +82,7 @@ def _wrap(text: str, indent: str, further: str) -> list[str]:
     return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=further, break_on_hyphens=False)
 
 
-def _value(value: Any) -> str:
+def value_text(value: Any) -> str:
     """Return a default as it is written on the command line."""
     if isinstance(value, str):
         return value

@@ -73,7 +73,7 @@ class StateIndex:
     count: how many rows there are.
 
     Args:
-        num_columns: D.
+        num_columns: D, how many numbers a row has.
         dtype: of the rows: floating, where -0.0 equals 0.0, or an integer type.
         device: where rows and table lie.
         merge: whether equal rows get one number. False: never; every row is a new one.

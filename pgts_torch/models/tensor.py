@@ -47,7 +47,7 @@ class TensorModel(EnumeratingModel, FollowingModel):
         not -inf. A class sets it to True whose rewards may be -inf.
 
     Args:
-        state_size: D.
+        state_size: D, how many numbers a state has.
         num_actions: A; 0: actions are vectors.
         state_dtype: of the vectors: floating, or int64.
         dtype: of rewards, discounts and values.

@@ -41,15 +41,17 @@ class Lookahead:
     bias_BA: how much q is too high because maxima were taken over sampled values, in reward units, as far as the sample
         itself can tell; None where nothing was sampled.
     samples: the fewest outcomes that were sampled of a (state, action); None where none were.
-    doubt_BA: at least |q - T^m Q|, with T and Q of the environment, in reward units: what the model and the critic may
-        be wrong by, added up along the best plan for errors,
-
-            E_0 = error of the critic,     E_{j+1}(s, a) = e(s, a) + sum_k p_k gamma_k max_a' E_j(s'_k, a')
-
-        e the error of the model (`FallibleModel.step_error`), which may be an estimate. None: not asked for, or the
-        model does not say.
+    doubt_BA: at least |q - T^m Q|, with T and Q of the environment, in reward units. None: not asked for, or the model
+        does not say.
     value_range: between which numbers the model's values lie; both the same (0) where its actions have one outcome
         each, so that equal samples leave no doubt.
+
+    The doubt is what the model and the critic may be wrong by, added up along the best plan for errors,
+
+        E_0 = error of the critic
+        E_{j+1}(s, a) = e(s, a) + sum_k p_k gamma_k max_a' E_j(s'_k, a')
+
+    with the error e of the model (`FallibleModel.step_error`), which may be an estimate.
     """
 
     q_BA: Float[Tensor, "B A"]

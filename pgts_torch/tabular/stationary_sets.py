@@ -78,7 +78,7 @@ class StationarySets:
 def enumerate_sets(
     mdp: TabularMDP, *, max_policies: int = MAX_POLICIES, tolerance: float = TOLERANCE
 ) -> StationarySets:
-    """Decide forevery deterministic policy at which depth it stops being stationary.
+    """Decide for every deterministic policy at which depth it stops being stationary.
 
     Args:
         max_policies: more than these are refused.
