@@ -5,7 +5,8 @@
 A call is what a lookahead pays for one state and action: restore, step, check, take a snapshot, number it. Not all of
 them are simulated where states differ in MiniGrid's clock alone. The step alone is that of the bare environment, with
 and without its observation where the model makes none; it walks on by random actions and is reset where an episode
-ends. The emulator alone is ALE's or MuJoCo's, for as many frames as a step of the environment has. Full search without
+ends. Restored: a snapshot is taken and put back before each of these steps, which is what a call takes at least. The
+emulator alone is ALE's or MuJoCo's, for as many frames as a step of the environment has. Full search without
 a critic, so that no observation of MiniGrid is drawn. CPU microseconds of one thread, medians of repeats in turns after
 a first one, which does not count. What is not installed is left out.
 """
@@ -60,13 +61,15 @@ def actions_of(env: gymnasium.Env) -> list[Any]:
     return sampled_actions(space, ACTIONS, seed=0) if isinstance(space, gymnasium.spaces.Box) else [*all_actions(space)]
 
 
-def step_cost(env: Any, *, is_blind: bool) -> float:
+def step_cost(env: Any, *, is_blind: bool = False, is_restored: bool = False) -> float:
     """CPU microseconds of a step of the environment itself.
 
     Args:
-        is_blind: its steps make no observation, if the model's do not.
+        is_blind: its steps make no observation; not a number if the model's do.
+        is_restored: a snapshot is taken and put back before each step, which makes an observation as the model's do.
     """
-    if is_blind and adapter_for(env).skip_observations(env) is None:
+    adapter = adapter_for(env)
+    if (is_blind or is_restored) and adapter.skip_observations(env) is None and is_blind:
         return float("nan")
     random, actions = np.random.default_rng(0), actions_of(env)
     chosen = random.integers(len(actions), size=STEPS)
@@ -74,6 +77,8 @@ def step_cost(env: Any, *, is_blind: bool) -> float:
     spent = 0.0
     for a in chosen:
         begin = time.thread_time()
+        if is_restored:
+            adapter.set_state(env, adapter.get_state(env).data)
         _, _, terminated, truncated, _ = env.step(actions[a])
         spent += time.thread_time() - begin
         if terminated or truncated:
@@ -116,21 +121,24 @@ def main(arguments: list[str] | None = None) -> None:
     args = common.parser(__doc__).parse_args(arguments)
     common.use_one_core()
     report: dict[str, Any] = {"about": common.about(args)}
-    columns = "calls", "simulated", "a call", "a step", "blind", "emulator", "call / step"
+    columns = "calls", "simulated", "a call", "a step", "blind", "restored", "emulator", "call / step"
     print(f"{'us':18}{'m':>3}" + "".join(f"{column:>12}" for column in columns))
     for name, case in CASES.items():
         if not importlib.util.find_spec(case[0]):
             print(f"{case[0]} is not installed: {name} is left out", file=sys.stderr)
             continue
-        base = made(case)().unwrapped
-        blind = made(case)().unwrapped
+        base, blind, restored = (made(case)().unwrapped for _ in range(3))
         rounds = [
-            (*call_cost(case), step_cost(base, is_blind=False), step_cost(blind, is_blind=True), emulator_cost(base))
+            (
+                *call_cost(case),
+                *(step_cost(base), step_cost(blind, is_blind=True), step_cost(restored, is_restored=True)),
+                emulator_cost(base),
+            )
             for _ in range(3 if args.quick else 6)
         ][1:]
         call, calls, simulated, *alone = (statistics.median(column) for column in zip(*rounds, strict=True))
         report[name] = {"call": call, "calls": calls, "simulated": simulated}
-        report[name] |= dict(zip(("step", "blind", "emulator"), alone, strict=True))
+        report[name] |= dict(zip(("step", "blind", "restored", "emulator"), alone, strict=True))
         times = "".join(f"{'-' if math.isnan(cost) else f'{cost:.1f}':>12}" for cost in (call, *alone))
         ratio = call / (alone[0] if math.isnan(alone[1]) else alone[1])
         print(f"{name:18}{case[3]:3}{calls:12.0f}{simulated:12.0f}{times}{ratio:12.1f}", flush=True)
