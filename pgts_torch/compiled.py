@@ -13,6 +13,7 @@ import importlib.util
 import inspect
 import os
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -59,6 +60,24 @@ def torch_only() -> Iterator[None]:
         _torch_only = before
 
 
+def clock() -> float:
+    """Seconds, of which those in which numba compiles do not count: it does so once on a machine."""
+    if "numba" not in sys.modules:
+        return time.perf_counter()
+    compiling = _compiling()
+    return time.perf_counter() - (compiling.duration if compiling.done else 0.0)
+
+
+@functools.cache
+def _compiling() -> Any:
+    """Adds up the seconds in which numba compiles, from the first call on."""
+    from numba.core import event
+
+    listener = event.TimingListener()
+    event.register("numba:compile", listener)
+    return listener
+
+
 def jit(function: _Function) -> _Function:
     """The function, compiled by numba when it is first called: for numpy arrays and numbers, and with sums in the order
     in which they are written. Divisions by zero are not noticed. It makes no arrays and returns none: numba then counts
@@ -87,6 +106,7 @@ def inlined(function: _Function) -> _Function:
 def _kept(function: _Function, **options: Any) -> _Function:
     import numba
 
+    _compiling()
     function = inspect.unwrap(function)  # without the shape checks of tests, which numba cannot read
     # Numba compares the age of one file, but also finds what it has kept by this name.
     function.__qualname__ += "_" + _digest(Path(function.__code__.co_filename).parent)

@@ -317,8 +317,6 @@ class PGTS:
             while self.num_env_steps < total_steps:
                 iteration = self.iterate()
                 bar.update(iteration.num_steps)
-                if progress:
-                    self.pricing.say()
                 if self.board is not None:
                     self.board.follow(iteration, self.counters)
                 goes_on = False not in [call(self, iteration) for call in callbacks]

@@ -20,7 +20,7 @@ LONG = 30.0
 """An iteration that takes more seconds is said to take long, with what makes it shorter."""
 
 SHORT = 1.0
-"""What an iteration costs that takes fewer seconds is said only to who wants to see progress."""
+"""What an iteration costs that takes fewer seconds is not said."""
 
 _AIM = 10.0
 """So many seconds an iteration are to take with the numbers that are named."""
@@ -44,7 +44,8 @@ class Price:
     def __str__(self) -> str:
         """In a sentence."""
         about = "up to" if self.is_bound else "about"
-        said = f"an iteration takes {about} {round(_round(self.calls, 3)):,} model calls and {_seconds(self.seconds)}"
+        calls = f"{round(_round(self.calls, 3)):,} model calls and " if self.calls else ""
+        said = f"an iteration takes {about} {calls}{_seconds(self.seconds)}"
         said += f", by {self.search}" * bool(self.search)
         return said + (f"; cheaper: {', '.join(self.advice)}" if self.advice else "")
 
@@ -80,7 +81,6 @@ class Pricing:
         self._calls_before, self._seconds_before = 0, 0.0
         self.price: Price | None = None
         self.meter: Meter | None = None
-        self._is_said = False
 
     def begin(self) -> None:
         """An iteration begins."""
@@ -109,10 +109,9 @@ class Pricing:
         self.meter = self._search.meter = None
 
     def say(self) -> None:
-        """Print the price, once, if it is known by now."""
-        if self.price is not None and not self._is_said and self._ranks.leads:
+        """Print the price."""
+        if self._ranks.leads:
             tqdm.write(f"note: {self.price}", file=sys.stderr)
-        self._is_said = self.price is not None
 
     def _foresee(self, states: float, seconds: float) -> None:
         """Say the price of the iteration under way, as long as its episodes are as now.

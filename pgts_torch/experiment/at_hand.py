@@ -1,4 +1,4 @@
-"""What can be trained here: the shipped configurations, and environments by how a lookahead can query them."""
+"""What is at hand: the shipped configurations, environments by how a lookahead can query them, and extras."""
 
 import importlib.util
 import textwrap
@@ -10,12 +10,20 @@ from pgts_torch.config.shipped import comment_of, shipped
 
 _WIDTH = 79
 
-_EXTRAS = {"minigrid": "envs", "ale_py": "atari", "mujoco": "mujoco", "Box2D": "box2d"}
-"""Packages of environments, and the extra that installs them."""
+_EXTRAS = {
+    "envs": (("minigrid",), "MiniGrid"),
+    "atari": (("ale_py", "cv2"), "Atari"),
+    "mujoco": (("mujoco",), "MuJoCo"),
+    "box2d": (("Box2D",), "LunarLander, BipedalWalker, CarRacing"),
+    "video": (("imageio", "imageio_ffmpeg"), "pgts watch --out FILE.mp4"),
+    "onnx": (("onnx", "onnxscript", "onnxruntime"), "pgts export --format onnx"),
+    "tune": (("optuna",), "pgts tune"),
+}
+"""The packages that an extra installs, as they are imported, and what needs them."""
 
 
 def at_hand() -> dict[str, Any]:
-    """Return names with a sentence each: configurations; environments of this package, by model; missing extras."""
+    """Return configurations with a sentence each; environments, by model; extras, what for and whether installed."""
     own = sorted(name for name in gymnasium.registry if name.startswith(("pgts/", "images/")) and "Vector" not in name)
     return {
         "configurations": {name: comment_of(path) for name, path in shipped().items()},
@@ -29,8 +37,9 @@ def at_hand() -> dict[str, Any]:
             "dynamics in torch": ["CartPole-v1", "Acrobot-v1", "MountainCar-v0", "Pendulum-v1"],
             "learned from images": [name for name in own if name.startswith("images/")],
         },
-        "extras that are not installed": {
-            extra: package for package, extra in _EXTRAS.items() if importlib.util.find_spec(package) is None
+        "extras": {
+            extra: {"for": meaning, "installed": all(importlib.util.find_spec(package) for package in packages)}
+            for extra, (packages, meaning) in _EXTRAS.items()
         },
     }
 
@@ -49,10 +58,7 @@ def describe(answer: dict[str, Any]) -> str:
     lines += textwrap.wrap(
         "others: a simulator, if they can be restored; pgts check-model ID says so", _WIDTH, initial_indent="  "
     )
-    missing = answer["extras that are not installed"]
-    if missing:
-        lines += [
-            "",
-            *(f"not installed: {package} (pip install 'pgts_torch[{extra}]')" for extra, package in missing.items()),
-        ]
+    lines += ["", "extras, pip install 'pgts_torch[EXTRA]':"]
+    for extra, about in answer["extras"].items():
+        lines.append(f"  {extra:<8}{'installed' if about['installed'] else 'missing':<11}{about['for']}")
     return "\n".join(lines)

@@ -82,7 +82,6 @@ class Recorder:
         elif iteration.posterior is not None:
             progress.certificate = iteration.posterior
         self._last = iteration
-        algorithm.pricing.say()
         self.movement.follow(algorithm, iteration)
         tags, spread = self.diagnostics(iteration, algorithm.counters, seconds)
         events = None if self.folder is None else self.folder.events

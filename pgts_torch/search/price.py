@@ -1,13 +1,14 @@
 """What a lookahead will cost, foreseen from the first states that it queries."""
 
 import math
-import time
 from collections.abc import Callable
 from typing import final
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
+
+from pgts_torch import compiled
 
 _FIRST, _FEW = 8, 32
 """How many states of a level are queried before the others: the first ones to warm up, the next ones to be measured."""
@@ -38,7 +39,7 @@ class Meter:
         planned: int | None,
         *,
         patience: float = 3.0,
-        clock: Callable[[], float] = time.perf_counter,
+        clock: Callable[[], float] = compiled.clock,
     ) -> None:
         self._tell, self._planned, self._patience, self._clock = tell, planned, patience, clock
         self._begun = clock()
@@ -49,7 +50,7 @@ class Meter:
 
     @property
     def seconds(self) -> float:
-        """Since the iteration began, without what is done once in its first query, as loops are compiled."""
+        """Since the iteration began, without what is done once: compiling, and what else the first query waits for."""
         return self._clock() - self._begun
 
     def update(self) -> None:

@@ -1,14 +1,16 @@
 """What an iteration costs, foreseen from its first states."""
 
 import functools
+import itertools
 import re
+import time
 from typing import Any
 
 import pytest
 import torch
 from gymnasium import spaces
 
-from pgts_torch import PGTS
+from pgts_torch import PGTS, compiled
 from pgts_torch.agent import price
 from pgts_torch.search.price import Meter
 from tests.models.corridors import Corridor
@@ -208,18 +210,19 @@ def _described(search: Any) -> dict[str, Any]:
     return {"type": search} if isinstance(search, str) else search
 
 
-def test_a_cheap_iteration_is_priced_by_the_second_one_and_said_to_who_wants_to_see_progress(capsys, monkeypatch):
-    monkeypatch.setattr(price, "Meter", functools.partial(Meter, clock=lambda: 0.0))
+@pytest.mark.parametrize(("seconds", "said"), [(0.9, 0), (1.1, 1)])
+def test_an_iteration_is_priced_by_the_second_one_and_that_is_said_where_it_takes_more_than_a_second(
+    seconds, said, capsys, monkeypatch
+):
+    times = itertools.count(0, seconds / 2)  # read when an iteration begins, when an update does, and at its end
+    monkeypatch.setattr(price, "Meter", functools.partial(Meter, clock=lambda: next(times), patience=100))
     model = PGTS("pgts/Ladder-v0")
     model.iterate()
     assert model.pricing.price is None
     second = model.iterate()
-    assert model.pricing.price is not None
     assert model.pricing.price.calls == second.model_calls
-    assert "note" not in capsys.readouterr().err
     model.learn(model.num_env_steps + 1, progress=True)
-    model.learn(model.num_env_steps + 1, progress=True)
-    assert capsys.readouterr().err.count("note: an iteration takes about ") == 1
+    assert capsys.readouterr().err.count("note: an iteration takes about ") == said
 
 
 def test_what_fits_a_number_of_model_calls_is_said():
@@ -235,5 +238,18 @@ def test_without_a_lookahead_there_is_no_price():
     assert model.pricing.price is None
 
 
-def test_an_iteration_without_model_calls_is_said_to_have_none():
-    assert str(price.Price(0, 0.014)) == "an iteration takes about 0 model calls and 0.014 s"
+def test_an_iteration_that_is_long_without_model_calls_is_said_to_take_its_time():
+    assert str(price.Price(0, 14.2)) == "an iteration takes about 14 s"
+
+
+def test_the_seconds_in_which_loops_are_compiled_are_no_part_of_the_price():
+    numba = pytest.importorskip("numba")
+    if not compiled.can_compile(torch.device("cpu")):
+        pytest.skip("nothing is compiled")
+    meter, begun = Meter(lambda *told: None, None), time.perf_counter()
+    numba.njit(lambda x: x * x + 1)(3)
+    passed, counted = time.perf_counter() - begun, meter.seconds
+    assert passed > 0.01
+    assert counted < passed / 2
+    time.sleep(0.05)
+    assert meter.seconds - counted >= 0.05

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 import types
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -294,3 +295,14 @@ def test_list_names_every_configuration_in_lines_that_fit(capsys):
         )
     assert main(["list", "--json"]) == 0
     assert "pgts/Ladder-v0" in json.loads(capsys.readouterr().out)["environments"]["table"]
+
+
+def test_list_says_of_every_extra_for_users_whether_it_is_installed(capsys, monkeypatch):
+    found = {"optuna": True, "onnx": True, "onnxscript": True, "onnxruntime": False}
+    monkeypatch.setattr("importlib.util.find_spec", found.get)
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    at = lines.index("extras, pip install 'pgts_torch[EXTRA]':")
+    said = {line.split()[0]: line.split()[1] for line in lines[at + 1 :]}
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert said == dict.fromkeys(declared.keys() - {"dev", "docs", "bench"}, "missing") | {"tune": "installed"}

@@ -104,8 +104,7 @@ def test_a_run_that_is_overwritten_leaves_nothing_of_the_one_before(here, capsys
     saved = {"checkpoints/000000000005.pt"}
     assert after.keys() == new | saved | {"versions.json"}
     assert {"best.pt", "report.html", "checkpoints/.000000000020.pt.77.partial"} < before.keys()
-    notes = [line for line in capsys.readouterr().err.splitlines() if "note" in line]
-    assert all(line.startswith("note: an iteration takes about ") for line in notes)
+    assert "note" not in capsys.readouterr().err
 
 
 @pytest.mark.fault("run of version 0.1")

@@ -6,7 +6,7 @@ from pgts_torch.cli.arguments import Arguments, Parser
 
 
 def list_(arguments: Arguments) -> None:
-    """List configurations, and environments with a model at hand."""
+    """List configurations, environments with a model at hand, and extras."""
     parser = Parser(list_)
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
     given = parser.parse_args(arguments)
