@@ -28,8 +28,8 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ex
 FILES = ["CITATION.cff", "SECURITY.md"]
 html_extra_path = [f"../{name}" for name in FILES]
 html_static_path, html_css_files, html_show_copyright = ["_static"], ["site.css"], False
-html_favicon, pygments_dark_style = "_static/icon.svg", "monokai"
-smartquotes = False  # much of the text is code
+html_favicon, pygments_dark_style = "_static/icon.svg", "github-dark"
+smartquotes_action = "D"  # dashes only: quotes are those of code
 highlight_language = "text"  # of blocks without a language: formulas, what a program prints
 exclude_patterns = ["_build", "figures"]
 # Tutorials are run where they have changed; a cell that fails ends the build.

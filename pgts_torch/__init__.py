@@ -1,8 +1,7 @@
 """Policy gradient with tree search: policies trained toward what an m-step lookahead sees.
 
-A tensor's name ends in its axes:
-`S states, A actions, K outcomes of one (s, a), C children (the values that a backup reads), B batch or roots, N nodes,
-T time, D features`.
+A tensor's name ends in its axes: S states, A actions, K outcomes of one (s, a), C children (the values that a backup
+reads), B batch or roots, N nodes, T time, D features.
 
 Importing this package registers the `pgts/` environments with Gymnasium and does not import torch; the names below
 are loaded when they are first used.
