@@ -36,7 +36,7 @@ from pgts_torch.agent.collect import rollout
 from pgts_torch.agent.critics import TabularCritic
 from pgts_torch.agent.policies import SoftmaxPolicy
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.world import TabularWorld
+from pgts_torch.agent.worlds import TabularWorld
 from pgts_torch.bellman import backup
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.options import FixedHorizon, TabularValues, TDLambda

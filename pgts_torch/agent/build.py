@@ -11,12 +11,14 @@ from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.gaussian_updates import GaussianGradientUpdate, GaussianPPOUpdate, MPOUpdate
 from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.networks import default_network
-from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.agent.neural_updates import GradientUpdate, PPOUpdate
 from pgts_torch.agent.policies import Policy, SimplexPolicy, SoftmaxPolicy, TabularPolicy
 from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate, SoftmaxUpdate, Update
-from pgts_torch.agent.world import TabularWorld, World
+from pgts_torch.agent.world import World
+from pgts_torch.agent.worlds import TabularWorld
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import Model, SamplingModel
 from pgts_torch.models.snapshots import env_name

@@ -14,7 +14,8 @@ from pgts_torch.agent.model_check import ModelCheck
 from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.world import ModelWorld, SimulatedWorld
+from pgts_torch.agent.world import ModelWorld
+from pgts_torch.agent.worlds import SimulatedWorld
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.base import LearningModel
 from pgts_torch.models.replay import ReplayBuffer

@@ -56,7 +56,6 @@ class Explorer:
         return {"policy": self.policy.state_dict(), **learned}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load what `state_dict` returned; PgtsError unless it fits."""
         self.policy.load_state_dict(state["policy"])
         self._critic.load_state_dict(state["critic"])
         self._update.load_state_dict(state["update"])

@@ -18,7 +18,7 @@ from torch import Tensor
 from pgts_torch.agent.gaussian import GaussianPolicy, Normals
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.iteration import Batch
-from pgts_torch.agent.neural_updates import check_numbers, mean
+from pgts_torch.agent.objectives import check_numbers, mean
 from pgts_torch.agent.optimisers import minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.stepped import SteppedUpdate

@@ -9,7 +9,8 @@ from torch import Tensor
 from pgts_torch.agent.collect import check_end, survival
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import COLUMNS, Rollout
-from pgts_torch.agent.world import ModelWorld, SimulatedWorld
+from pgts_torch.agent.world import ModelWorld
+from pgts_torch.agent.worlds import SimulatedWorld
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import SamplingModel
 from pgts_torch.options.rollouts import Horizon

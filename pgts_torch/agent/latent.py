@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from pgts_torch.agent.critics import Critic
 from pgts_torch.agent.latent_losses import Unrolled, consistency_loss, equivalence_losses, outcome_losses
 from pgts_torch.agent.networks import Network, default_network, make_trunk
-from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.agent.optimisers import Optimiser
 from pgts_torch.agent.policies import Policy
 from pgts_torch.errors import NotFinite, PgtsError, check_count

@@ -10,7 +10,8 @@ import torch
 
 from pgts_torch.agent.frequencies import MARGINS, Frequencies
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.world import DynamicsWorld, SimulatedWorld, TabularWorld, World
+from pgts_torch.agent.world import World
+from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import ModelMismatch, PgtsError
 from pgts_torch.models.adapters import methods_for
 from pgts_torch.models.adapters_generic import PickledAttributes

@@ -12,7 +12,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, final
+from typing import final
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,17 +24,24 @@ from pgts_torch.agent.gradients import Forward, through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural import NetworkPolicy
-from pgts_torch.agent.optimisers import minibatches
+from pgts_torch.agent.objectives import (
+    check_numbers,
+    divergence,
+    entropy,
+    log_probs,
+    log_probs_before,
+    log_softmax,
+    mean,
+    passes,
+    size_of,
+    with_legal,
+)
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.stepped import SteppedUpdate
-from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.options.updates import PPO, Gradient
-from pgts_torch.ranks import Ranks, Share
+from pgts_torch.ranks import Ranks
 from pgts_torch.readings import Readings
 from pgts_torch.search.lookahead import check_finite
-
-_LOG_OF_ZERO = -1e4
-"""In place of log pi(a|s) = -inf of an action that is not legal: its exp is 0, and 0 times it is no NaN."""
 
 
 class NetworkUpdate(SteppedUpdate):
@@ -219,7 +226,7 @@ class PPOUpdate(NetworkUpdate):
         share = batch.ranks.share("rows", len(input_N))
         weight_N = batch.weight_N / share.mean("weights", batch.weight_N)
         if self.options.normalize_advantage:
-            advantage_NA = advantage_NA / _scale(old_NA, advantage_NA, weight_N, share)
+            advantage_NA = advantage_NA / size_of(old_NA, advantage_NA, weight_N, share)
         columns, num_steps, clip = [input_N, old_NA, advantage_NA, weight_N], 0, self.now.clip_range
         parts = passes(with_legal(columns, batch.legal_NA), share, self.options, generator)
         clips = 1 - clip, 1 + clip, self.now.entropy_coef
@@ -255,81 +262,3 @@ class PPOUpdate(NetworkUpdate):
         if self.options.target_kl is not None:
             losses.append(mean(weight_N, divergence(old_NA, log_NA), count))
         return -(pi_NA * slope_NA) * (weight_N / count)[:, None], losses
-
-
-def entropy(log_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
-    """H(pi(.|s)) in nats, from log pi."""
-    return -(log_NA.exp() * log_NA).sum(-1)
-
-
-def divergence(log_p_NA: Float[Tensor, "N A"], log_q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
-    """KL(p(.|s) || q(.|s)) in nats, from log p and log q."""
-    return (log_p_NA.exp() * (log_p_NA - log_q_NA)).sum(-1)
-
-
-def log_probs_before(network: Network, input_N: Float[Tensor, "N ..."], batch: Batch) -> Float[Tensor, "N A"]:
-    """log pi of the policy that the batch is of, from which the update starts."""
-    before = batch.policy.network if isinstance(batch.policy, NetworkPolicy) else network
-    return log_probs(before, input_N, batch.legal_NA)
-
-
-def log_probs(
-    network: Network, input_N: Float[Tensor, "N ..."], legal_NA: Bool[Tensor, "N A"] | None
-) -> Float[Tensor, "N A"]:
-    """log pi, without gradient."""
-    return log_softmax(network.plain(input_N), legal_NA)
-
-
-def log_softmax(logit_NA: Float[Tensor, "N A"], legal_NA: Bool[Tensor, "N A"] | None) -> Float[Tensor, "N A"]:
-    """log pi over the legal actions; that of the others is finite, and its exp is 0."""
-    return legal_only(legal_only(logit_NA, legal_NA).log_softmax(-1), legal_NA, _LOG_OF_ZERO)
-
-
-def with_legal(columns: Sequence[Tensor], legal_NA: Bool[Tensor, "N A"] | None) -> Sequence[Tensor]:
-    """The columns, and after them the legal actions where not all are."""
-    return columns if legal_NA is None else [*columns, legal_NA]
-
-
-def passes(
-    columns: Sequence[Tensor], share: Share, options: Any, generator: torch.Generator
-) -> Iterator[tuple[int, tuple[Tensor, ...]]]:
-    """Yield the minibatches of all passes over the columns, as `minibatches`.
-
-    Args:
-        options: of an update, which say how many there are.
-    """
-    for _ in range(options.num_epochs):
-        yield from minibatches(columns, options.minibatch_size, share, generator=generator)
-
-
-def mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"], count: int) -> Float[Tensor, ""]:
-    """The part of these rows in mean_n w_n value_n over `count` rows."""
-    return weight_N @ value_N / count
-
-
-def _scale(
-    old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"], share: Share
-) -> Float[Tensor, ""]:
-    size_N = (old_NA.exp() * advantage_NA.abs()).sum(-1)
-    return share.ranks.sum("advantages", mean(weight_N, size_N.square(), share.total)).sqrt() + 1e-8
-
-
-def check_numbers(batch: Batch, readings: Readings) -> None:
-    """Advantages and weights: NotFinite unless they are finite, PgtsError unless a weight is positive, when read."""
-    advantage_NA, weight_N = batch.advantage_NA, batch.weight_N
-    total, off = batch.ranks.sum("weights of rows", weight_N.sum()), (weight_N < 0).sum()
-    readings.check(advantage_NA.sum(), lambda _: _refuse_off("advantage", "advantage_NA", advantage_NA))
-    readings.check(total, lambda _: _refuse_weights(weight_N), is_good=lambda total: 0 < total < math.inf)
-    readings.check(off, lambda _: _refuse_weights(weight_N), is_good=lambda off: off == 0)
-
-
-def _refuse_off(what: str, name: str, value: Tensor) -> None:
-    off = torch.nonzero(~value.isfinite())
-    if len(off):
-        raise NotFinite(f"{name}{off[0].tolist()} is {float(value[tuple(off[0])])}; it must be finite", what=what)
-
-
-def _refuse_weights(weight_N: Tensor) -> None:
-    _refuse_off("weight", "weight_N", weight_N)
-    if not float(weight_N.sum()) > 0 or float(weight_N.min()) < 0:
-        raise PgtsError(f"weight_N is {weight_N.tolist()[:8]}; weights are at least 0, and one must be positive")

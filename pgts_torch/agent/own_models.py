@@ -14,7 +14,8 @@ from torch import Tensor
 
 from pgts_torch.agent.components import image_shape, num_combinations, with_legal, with_mask
 from pgts_torch.agent.latent import LatentModel
-from pgts_torch.agent.world import ModelWorld, TabularWorld, VectorStates, World
+from pgts_torch.agent.world import ModelWorld, World
+from pgts_torch.agent.worlds import TabularWorld, VectorStates
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.base import Model
 from pgts_torch.models.counts import CountsModel

@@ -3,51 +3,42 @@
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Self, final, overload
+from typing import Any, Literal, Self, final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
-from torch import Tensor
 from tqdm import tqdm
 
-from pgts_torch.agent import exporting, recording, saved, saving
 from pgts_torch.agent.acting import Acting
 from pgts_torch.agent.board import Board, hyperparameters
-from pgts_torch.agent.build import Description, MakesModule, make_device, plain
+from pgts_torch.agent.build import Description, MakesModule, make_device
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.diagnostics import Counters
 from pgts_torch.agent.draws import Draws
-from pgts_torch.agent.gaussian import GaussianPolicy
 from pgts_torch.agent.iteration import Iteration, PolicyBatch
 from pgts_torch.agent.model_check import Mode
 from pgts_torch.agent.parts import make_parts
-from pgts_torch.agent.policies import Policy, exact_probs
+from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.price import Pricing
 from pgts_torch.agent.rollout import Rollout
+from pgts_torch.agent.trained import Trained
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
-from pgts_torch.agent.watching import Watching
-from pgts_torch.agent.world import SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.base import Model
-from pgts_torch.models.environments import Given, close_environments
+from pgts_torch.models.environments import Given
 from pgts_torch.options.arguments import shortest
 from pgts_torch.ranks import present_ranks
-from pgts_torch.search.lookahead import Lookahead
 from pgts_torch.seeding import drawn_seed, stream
-from pgts_torch.tabular.mdp import TabularMDP
 
 Callback = Callable[["PGTS", Iteration], bool | None]
 """A function that is called after each iteration; if it returns False, training ends. See also `agent.callbacks`."""
 
 
 @final
-class PGTS:
+class PGTS(Trained):
     """Trains a policy with the values of a depth-m lookahead at the states that it visits.
 
         pi_{k+1}(.|s) = proj[ pi_k(.|s) + eta d^pi(s) (T^m Q^pi)(s, .) ]        [PGTS Eq. (3)]
@@ -225,13 +216,6 @@ class PGTS:
             losses |= self.update(self.policy, batch, generator=draws.common)
         return batch, losses
 
-    def close(self) -> None:
-        """Close the environments, but not a VectorEnv that was given, which is its owner's. The policy remains."""
-        if self.source.given is None and not self.world.env.closed:
-            close_environments(self.world.env)
-            if isinstance(self.world, SimulatedWorld):
-                self.world.model.env.close()
-
     def __repr__(self) -> str:
         """The call that makes such a training, where the environment is an id; what is queried, and how far it is."""
         others = {name: self._arguments[name] for name in ("gamma", "env_kwargs", "seed", "device")}
@@ -246,36 +230,6 @@ class PGTS:
             *(f"{name}={value!r}" for name, value in given.items()),
         ]
         return f"PGTS({', '.join(arguments)})  # {queried}, {self.num_env_steps:,} steps"
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    @property
-    def mdp(self) -> TabularMDP:
-        """The exact MDP of the environment; PgtsError where it is not known."""
-        if self.world.mdp is None:
-            raise PgtsError(f"nothing exact is known of {self.source.name}")
-        return self.world.mdp
-
-    def policy_table(self) -> Float[Tensor, "S A"]:
-        """pi(.|s) for all states, on the CPU in float64; PgtsError where states are not numbered."""
-        if not isinstance(self.world, TabularWorld):
-            raise PgtsError(f"states of {self.source.name} are not numbered")
-        return exact_probs(self.policy, torch.arange(self.world.mdp_shape[0], device=self.device))
-
-    def lookahead(self, state_N: Int[Tensor, "N"], *, depth: int | None = None) -> Lookahead:
-        """(T^m Q)(s, .) at the given states, with the critic's estimate of Q^pi or v^pi at the leaves. The default of m
-        is the depth of the training, or the largest of an adaptive depth."""
-        if self.depth_choice is None:
-            raise PgtsError("with sampled advantages there is no lookahead")
-        depth = self.depth_choice.depths[-1] if depth is None else depth
-        draws = Draws.of(self.ranks, self.seed, self.num_iterations, self.device)
-        if isinstance(self.policy, GaussianPolicy):
-            self.depth_choice.look.restart(draws.search())
-        return self.depth_choice.look(state_N, depth=depth, generator=draws.search())
 
     def learn(
         self,
@@ -326,11 +280,6 @@ class PGTS:
                 self.board.end()
         return self
 
-    @property
-    def counters(self) -> Counters:
-        """What it has done so far."""
-        return Counters(self.num_iterations, self.num_env_steps, self.num_model_calls)
-
     def _opened(self, folder: str | Path, total_steps: int) -> Board:
         env = {"id": self.source.name, "kwargs": dict(self._arguments["env_kwargs"] or {}), "gamma": self.gamma}
         options = self.options.plain()
@@ -344,167 +293,3 @@ class PGTS:
             total_steps=total_steps,
             counters=self.counters,
         )
-
-    @overload
-    def predict(
-        self,
-        observation: ArrayLike,
-        *,
-        deterministic: bool = True,
-        action_mask: ArrayLike | None = None,
-        generator: torch.Generator | None = None,
-        state: None = None,
-        episode_start: None = None,
-    ) -> np.ndarray | np.generic: ...
-
-    @overload
-    def predict(
-        self, observation: ArrayLike, *, state: Any, episode_start: ArrayLike, deterministic: bool = True
-    ) -> tuple[np.ndarray | np.generic, Any]: ...
-
-    def predict(
-        self,
-        observation: ArrayLike,
-        *,
-        deterministic: bool = True,
-        action_mask: ArrayLike | None = None,
-        generator: torch.Generator | None = None,
-        state: Any = None,
-        episode_start: ArrayLike | None = None,
-    ) -> Any:
-        """Return actions for observations, in the form of the environment; without search.
-
-        Args:
-            observation: an observation of the environment, or an array of them.
-            action_mask: which actions are legal there, as the environment says it: a vector, or a row for each of an
-                array of observations. It is needed where the environment has action masks.
-            deterministic: take the most probable action, of a gaussian policy the mean; else sample from pi.
-            generator: for sampling; default: one with this model's seed, which continues from call to call.
-            state, episode_start: given by `evaluate_policy` of stable-baselines3. With episode_start the pair (actions,
-                state) is returned, as by its models; neither changes the actions.
-
-        Raises:
-            PgtsError: an observation or a mask is none of the environment, or the mask is missing, or of no use.
-        """
-        generator = generator or self._generator
-        actions = self._act(self.policy, observation, action_mask, deterministic=deterministic, generator=generator)
-        return actions if episode_start is None else (actions, state)
-
-    def record(
-        self,
-        path: str | Path,
-        *,
-        episodes: int = 1,
-        seed: int = 0,
-        fps: float | None = None,
-        deterministic: bool = True,
-        depth: int | None = None,
-        steps: int | None = None,
-    ) -> list[recording.Seen]:
-        """Write episodes as a film, beside each picture the lookahead's values and the policy's probabilities in that
-        state; as text where `path` ends in .txt. Training is not affected, but states of simulators and vectors that
-        an iteration has numbered lose their numbers.
-
-        Args:
-            path: a .gif, an .mp4 (with the extra `video`) or a .txt; a file of that kind is replaced.
-            episodes: how many.   seed: episode k begins with reset(seed=seed + k).
-            fps: pictures a second; default: as the environment says, or 10.
-            deterministic: take the most probable action, of a gaussian policy the mean; else sample from pi.
-            depth: m of the lookahead; default: that of the training, or the largest of an adaptive depth.
-            steps: the most steps of an episode; default: the time limit, or 1,000 where there is none.
-
-        Returns:
-            Of each episode the seed, the length, the return and how it ended. If several processes train together all
-            must call it, and the first one watches.
-
-        Raises:
-            PgtsError: an argument out of range; there is another file at `path`; the environment cannot be drawn; or it
-                failed, naming step and seed.
-        """
-        suffix = recording.suffix_of(path)
-        chosen = {"seed": seed, "deterministic": deterministic, "depth": depth, "steps": steps}
-
-        def record() -> list[recording.Seen]:
-            with closing(self.watching(**chosen, mode="ansi" if suffix == ".txt" else "rgb_array")) as watching:
-                return recording.record(path, watching, episodes=episodes, fps=fps, name=self.source.name)
-
-        return self.ranks.first("a recording", record)
-
-    def watching(self, **options: Any) -> Watching:
-        """Episodes of the policy, to be looked at step by step; the arguments are those of `watching.Watching`."""
-        return Watching(self.parts, training_seed=self.seed, **options)
-
-    def export(self, path: str | Path, *, format: exporting.Format | None = None) -> dict[str, Any]:
-        """Write the policy as a program that acts without this package: from observations, as the environment gives
-        them, to probabilities (or mean and standard deviation) and to the action that `predict` returns. It does not
-        check what it is given. If several processes train together all must call it, and the first one writes.
-
-        Args:
-            path: an earlier export there is replaced.
-            format: "torch" (read by torch.export.load) or "onnx"; default: by the end of `path`, .pt2 or .onnx.
-
-        Returns:
-            What the file says of itself: the environment, inputs and outputs by name.
-
-        Raises:
-            PgtsError: the policy is of a class of your own, or a module of it cannot be traced; a package is missing;
-                or there is another file at `path`.
-        """
-        notes = {"environment": self.source.name, "num_env_steps": self.num_env_steps}
-        parts: dict[str, Any] = {"world": self.world, "source": self.source, "policy": self.policy, "notes": notes}
-        return self.ranks.first("an exported policy", lambda: exporting.export(path, format, **parts))
-
-    def save(self, path: str | Path) -> None:
-        """Write arguments and state into one file with a checksum, without an environment that was given as an object.
-        If several processes train together all must call it, and the first one writes.
-
-        Raises:
-            PgtsError: a part was given as an object, which cannot be saved, or an argument is no plain value; or there
-                is another file at `path`, which is not replaced.
-        """
-        content = self.content()
-        self.ranks.first("a saved model", lambda: saving.write(saving.target(path), content))
-
-    def content(self) -> dict[str, Any]:
-        """Return the content of `save`: arguments and state. If several processes train together all must call it."""
-        return {"arguments": plain(self._arguments, self.options), "state": self.state_dict()}
-
-    @classmethod
-    def load(
-        cls,
-        path: str | Path,
-        *,
-        env: Given | None = None,
-        device: torch.device | str | None = None,
-        trust_imports: bool = False,
-    ) -> Self:
-        """Return the model that `save` wrote; it trains exactly as the saved one would have. The outcomes known to its
-        lookahead are queried again, which `num_model_calls` does not count.
-
-        Args:
-            env: the environment, if it was given to the saved model as an object; default: the saved id.
-            device: where to load it; default: the device it was saved from.
-            trust_imports: whether modules that it names are imported, as that of the environment "module:Id-v0" or of
-                the policy "module:Net". Nothing else in a file is executed.
-
-        Raises:
-            PgtsError: no such file, damaged, or no saved model; it names a module that is not trusted; env is missing,
-                or not needed.
-        """
-        return saved.load_training(path, cls, env=env, device=device, trust_imports=trust_imports)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the states of all parts, and the counters. If several processes train together all must call it."""
-        self.check_complete()
-        return saved.state_of(self.parts, self.ranks) | {name: getattr(self, name) for name in saved.COUNTERS}
-
-    def check_complete(self) -> None:
-        """PgtsError where training cannot go on, because several processes have saved this model and not as many have
-        loaded it, while each has kept steps, or episodes, of its own. The policy can be used all the same."""
-        if self._lacks is not None:
-            raise PgtsError(self._lacks)
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load what `state_dict` returned; PgtsError, and nothing is loaded, if it is no state of such a model."""
-        counters, self._lacks = saved.restore(self.parts, self.ranks, state)
-        self.num_iterations, self.num_env_steps, self.num_model_calls = counters

@@ -129,7 +129,6 @@ class SoftmaxPolicy(TabularPolicy):
         self._legal_SA = None if legal_SA is None else legal_SA.to(device)
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
-        """softmax(logits[s])."""
         return self.logits_SA[observation_N].softmax(-1)
 
     def state_dict(self) -> dict[str, Any]:
@@ -163,7 +162,6 @@ class SimplexPolicy(TabularPolicy):
         self.probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy"), legal_SA).to(device)
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
-        """The rows of the table."""
         return self.probs_SA[observation_N]
 
     def state_dict(self) -> dict[str, Any]:

@@ -10,16 +10,8 @@ from torch import Tensor
 
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
-from pgts_torch.agent.neural_updates import (
-    NetworkUpdate,
-    divergence,
-    log_probs,
-    log_probs_before,
-    log_softmax,
-    mean,
-    passes,
-    with_legal,
-)
+from pgts_torch.agent.neural_updates import NetworkUpdate
+from pgts_torch.agent.objectives import divergence, log_probs, log_probs_before, log_softmax, mean, passes, with_legal
 from pgts_torch.options.updates import CMPO, Mirror
 from pgts_torch.ranks import ALONE, Ranks
 from pgts_torch.readings import Readings

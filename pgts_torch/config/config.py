@@ -3,11 +3,11 @@
 import json
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
 from pgts_torch.config import strict_yaml
 from pgts_torch.options.arguments import described
-from pgts_torch.options.fields import Count, Device, Folder, Name, Natural, Positive, conflict
+from pgts_torch.options.fields import Count, Device, Folder, Name, Natural, Positive, checks, conflict
 from pgts_torch.options.part import Part
 from pgts_torch.options.training import Training
 
@@ -65,8 +65,7 @@ class EvalConfig(Part):
     """Save the model as best.pt whenever the mean return of greedy episodes is the highest so far. Only with
     eval.every."""
 
-    @field_validator("stop_at_return", "keep_best")
-    @classmethod
+    @checks("stop_at_return", "keep_best")
     def _only_during_training(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and value is not False and info.data.get("every", 1) is None:
             key = f"eval.{info.field_name}"

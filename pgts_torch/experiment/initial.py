@@ -1,8 +1,6 @@
 """The configuration to begin with in an environment, with the model that was found and the price that was measured."""
 
-import json
 import re
-import textwrap
 import time
 import warnings
 from collections.abc import Iterator, Mapping
@@ -15,18 +13,17 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch import files
-from pgts_torch.agent.iteration import Iteration
 from pgts_torch.agent.observations import fit_keys
 from pgts_torch.agent.pgts import PGTS
-from pgts_torch.agent.world import DynamicsWorld, SimulatedWorld, TabularWorld
-from pgts_torch.config import Config, strict_yaml
+from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
+from pgts_torch.config import Config
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.experiment.resume import flat, plain
+from pgts_torch.experiment.commented import commented
+from pgts_torch.experiment.resume import plain
 from pgts_torch.experiment.run import build
 from pgts_torch.models.base import LearningModel
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.options.rollouts import Rollouts
-from pgts_torch.options.schema import Option, schema_of
 
 PATIENCE = 600.0
 """The seconds that the whole training is to take, as far as its second iteration tells; or twice as long as with the
@@ -52,9 +49,6 @@ TABLE_DEPTHS, OTHER_DEPTHS = (1, 2, 4, 8, 16), (0, 1, 2, 4)
 
 LEARNED_DEPTH = 1
 """Deeper lookaheads add up the errors of a model of vectors that is learned."""
-
-_ALWAYS = ("name", "total_steps", "env.id", "search.depth", "rollout.num_envs", "eval.every")
-_WIDTH = 99
 
 
 @dataclass(frozen=True)
@@ -191,8 +185,9 @@ class _Tried:
                 price=said,
                 seconds=seconds * config.total_steps / max(iteration.num_steps, 1),
             )
+            roots = 0 if iteration.state_N is None else len(iteration.state_N)
             tables = isinstance(algorithm.world, TabularWorld) and algorithm.world.mdp is not None
-            return cls(data, proposal, tables, max(algorithm.world.num_actions, 2), _roots(iteration), seconds)
+            return cls(data, proposal, tables, max(algorithm.world.num_actions, 2), roots, seconds)
 
 
 def _too_slow(general: dict[str, Any], limit: int) -> Proposal | None:
@@ -202,10 +197,6 @@ def _too_slow(general: dict[str, Any], limit: int) -> Proposal | None:
     tried = _Tried.of(general | {"rollout": rollout, "search": {"max_roots": FIRST["max_roots"]}}, 0)
     usual = Rollouts.standing("fixed")["num_envs"] * limit
     return tried.proposal if tried.iteration * usual / (num_envs * length) > SLOW else None
-
-
-def _roots(iteration: Iteration) -> int:
-    return 0 if iteration.state_N is None else len(iteration.state_N)
 
 
 def _deepest(first: _Tried) -> _Tried:
@@ -300,58 +291,8 @@ def to_json(proposal: Proposal, path: Path) -> dict[str, Any]:
     return {"file": str(path)} | asdict(replace(proposal, config=None)) | {"config": plain(proposal.config)}  # type: ignore[arg-type]
 
 
-def text(proposal: Proposal) -> str:
-    """Return the configuration as YAML with comments, from which `load` reads it. Options that are as by default are
-    there, too, commented out."""
-    head = [
-        *describe(proposal),
-        "Options behind # have their defaults: remove the # to change one.",
-    ]
-    lines = [f"# {line}" for each in head for line in textwrap.wrap(each, _WIDTH, break_on_hyphens=False)]
-    values = flat(whole := plain(proposal.config)) | {"env.kwargs": whole["env"]["kwargs"]}
-    tree: dict[str, Any] = {}
-    for option in schema_of(Config).options():
-        if option.exists(values):
-            *above, last = option.key.split(".")
-            section = tree
-            for part in above:
-                section = section.setdefault(part, {})
-            section[last] = option
-    for name, child in tree.items():
-        lines += [""] * (not isinstance(child, Option) or name == "name")
-        lines += _lines(name, child, values, "")
-    return "\n".join(lines) + "\n"
-
-
-def _lines(name: str, child: Any, values: Mapping[str, Any], indent: str) -> Iterator[str]:
-    if isinstance(child, Option):
-        value = values.get(child.key, child.default)
-        is_live = value != child.default or child.key in _ALWAYS or name in ("type", "kind")
-        yield f"{indent}# {_sentence(child.meaning)} ({child.requirement})"
-        yield f"{'' if is_live else '#'}{indent}{name}: {_value(value)}"
-        return
-    within = [line for key, each in child.items() for line in _lines(key, each, values, indent + "  ")]
-    is_live = any(not line.lstrip().startswith("#") for line in within)
-    yield f"{'' if is_live else '#'}{indent}{name}:"
-    yield from within
-
-
-def _sentence(meaning: str) -> str:
-    """The first sentence of a meaning."""
-    return re.split(r"(?<! al)\. ", meaning, maxsplit=1)[0].rstrip(".")
-
-
-def _value(value: Any) -> str:
-    """Return a value as YAML in one line."""
-    if isinstance(value, list | dict):
-        return json.dumps(value)
-    if type(value) is int:
-        return f"{value:_}"
-    return strict_yaml.dump({"key": value}).removeprefix("key: ").strip()
-
-
 def write(path: Path, proposal: Proposal, *, overwrite: bool) -> None:
     """Write the file, unless there is one by now that is not to be replaced."""
     if files.kind(path) is not None and not overwrite:
         raise PgtsError(f"{path} exists by now: give --overwrite to replace it, or another name by -o")
-    files.replace(path, text(proposal).encode())
+    files.replace(path, commented(proposal.config, describe(proposal)).encode())

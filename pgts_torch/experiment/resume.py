@@ -16,14 +16,7 @@ from pgts_torch.agent.pgts import PGTS
 from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment import checkpoint
-from pgts_torch.experiment.ownership import (
-    BEST_FILE,
-    CONFIG_FILE,
-    METRICS_FILE,
-    SUMMARY_FILE,
-    is_events,
-    read_mark,
-)
+from pgts_torch.experiment.ownership import BEST_FILE, CONFIG_FILE, METRICS_FILE, SUMMARY_FILE, is_events, read_mark
 from pgts_torch.experiment.tracking import GrowingDigest, versions
 from pgts_torch.options.own import Own
 

@@ -139,7 +139,6 @@ class DynamicsModel(TensorModel, ExactModel):
     def step(
         self, state_ND: Float[Tensor, "N D"], action_N: Num[Tensor, "N ..."]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
-        """Reward, discount (0 where the episode terminates) and next state."""
         loops = self._squash is None and state_ND.dtype == torch.float64 and pays(self.device, state_ND.shape[0])
         answer = self._step_compiled(state_ND.contiguous().numpy(), action_N.numpy()) if loops else None
         reward_N, discount_N, next_ND = self._step(state_ND, action_N) if answer is None else answer

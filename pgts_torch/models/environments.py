@@ -1,12 +1,9 @@
 """The environment that a user gives, understood once: `EnvSource` makes others of its kind, whatever it is."""
 
 import copy
-import importlib
-import importlib.util
 import warnings
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, final
@@ -14,7 +11,7 @@ from typing import Any, final
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec, find_highest_version, get_env_id, parse_env_id
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
@@ -22,11 +19,11 @@ from pgts_torch.envs.cart_poles import CartPoles, is_cart_pole
 from pgts_torch.errors import PgtsError, check_count, failure
 from pgts_torch.models.actions import Numbered, is_numbered, numbered
 from pgts_torch.models.attributes import Unlike, own_to_each, unlike
+from pgts_torch.models.ids import Maker, import_modules, maker_named, making, registered, spec_of
 from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.squash import Squash, Squashed, squash_of
 from pgts_torch.models.wrappers import wrappers_of
 from pgts_torch.seeding import numpy_stream
-from pgts_torch.trust import import_named
 
 Given = str | EnvSpec | gymnasium.Env | VectorEnv | Callable[[], gymnasium.Env]
 """What a user may give as an environment."""
@@ -36,9 +33,6 @@ _TOGETHER = 8
 
 SLOW = "slow environments are shared out by pgts train --processes N"
 """What is there in place of an AsyncVectorEnv."""
-
-_Maker = Callable[..., gymnasium.Env]
-"""Makes a new environment; takes the arguments of `gymnasium.make`, which it uses if it makes environments by an id."""
 
 
 @final
@@ -57,7 +51,7 @@ class EnvSource:
     """
 
     name: str
-    makers: Sequence[_Maker]
+    makers: Sequence[Maker]
     spec: EnvSpec | None = None
     description: str | None = None
     given: VectorEnv | None = None
@@ -122,7 +116,7 @@ class EnvSource:
         if isinstance(env, gymnasium.Env):
             env = _spec_like(env)
         if isinstance(env, EnvSpec):
-            return cls(env.id, [_registered(env)], spec=env, actions_per_dimension=actions_per_dimension)
+            return cls(env.id, [registered(env)], spec=env, actions_per_dimension=actions_per_dimension)
         if callable(env):
             name, function = getattr(env, "__name__", str(env)), env
             return cls(name, [lambda **_: function()], actions_per_dimension=actions_per_dimension)
@@ -133,16 +127,16 @@ class EnvSource:
 
     @classmethod
     def _of_id(cls, env_id: str, kwargs: dict[str, Any], gamma: float | None, count: int | None) -> "EnvSource":
-        _import(env_id)
-        if (spec := _spec(env_id)) is not None:
+        import_modules(env_id)
+        if (spec := spec_of(env_id)) is not None:
             env_id = f"{env_id[: env_id.rfind(':') + 1]}{spec.id}"  # with its version, so that it means the same later
-        elif (named := _named(env_id)) is not None:
+        elif (named := maker_named(env_id)) is not None:
             return cls(env_id, [lambda **_: named(**kwargs)], description=env_id, actions_per_dimension=count)
         ours = spec is not None and spec.namespace == "pgts"
         if ours and count is not None:
             raise PgtsError(f"actions_per_dimension is {count}; {env_id} has discrete actions")
         kwargs |= {"gamma": gamma} if ours and gamma is not None else {}
-        make = _registered(env_id, **kwargs)
+        make = registered(env_id, **kwargs)
         source = cls(env_id, [make], spec=spec, description=env_id, actions_per_dimension=count)
         if ours:
             modes = {"vectorization_mode": "vector_entry_point", "max_episode_steps": -1}
@@ -174,7 +168,7 @@ class EnvSource:
                 actions cannot be numbered; or a VectorEnv was given, of which no others can be made or others than it.
         """
         check_count("num_envs", num_envs)
-        with _making(self.name):
+        with making(self.name):
             if self.make_together is not None and (self.has_table or not (one_by_one or num_envs < _TOGETHER)):
                 return self.make_together(num_envs)
             makers = [lambda k=k: self.like(k) for k in range(num_envs)]
@@ -197,7 +191,7 @@ class EnvSource:
                 f"{self.name} was given as a VectorEnv of which no others can be made; give a SyncVectorEnv or an id "
                 f"({SLOW})"
             )
-        with _making(self.name):
+        with making(self.name):
             made = self.makers[k % len(self.makers)](**options)
         if not isinstance(made, gymnasium.Env):
             raise PgtsError(f"{self.name} gave {made!r}; it must be a Gymnasium environment")
@@ -276,28 +270,6 @@ def kinds_of(env: gymnasium.Env) -> list[type]:
     return [*map(type, wrappers_of(env)), type(env.unwrapped)]
 
 
-def _registered(env: str | EnvSpec, **kwargs: Any) -> _Maker:
-    return lambda **options: gymnasium.make(env, **(options | kwargs))
-
-
-@contextmanager
-def _making(name: str) -> Iterator[None]:
-    """An error of an environment that is being made, as one of ours."""
-    try:
-        yield
-    except PgtsError:
-        raise
-    except gymnasium.error.DependencyNotInstalled as error:
-        raise PgtsError(f"{name} needs something that is not installed: {error}") from error
-    except gymnasium.error.NameNotFound as error:
-        way_out = f" MODULE:{name} imports the module that registers it" * (":" not in name)
-        raise PgtsError(f"{name} cannot be made: {error}{way_out}") from error
-    except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
-        raise PgtsError(f"{name} cannot be made: {error}") from error
-    except BaseException as error:
-        raise failure(f"{name} cannot be made", error) from error
-
-
 def _spec_like(env: gymnasium.Env) -> EnvSpec:
     """The spec of an instance, from which others are made that are like it, in whatever state it is.
 
@@ -315,7 +287,7 @@ def _spec_like(env: gymnasium.Env) -> EnvSpec:
         return spec
     given, way_out = f"{name} was given as an instance", "give a function that makes it as it is"
     try:
-        with _making(name):
+        with making(name):
             made = gymnasium.make(env.spec)
     except PgtsError as error:
         raise PgtsError(f"{given} that its spec cannot make again ({error}): {way_out}") from error
@@ -328,47 +300,9 @@ def _spec_like(env: gymnasium.Env) -> EnvSpec:
 
 
 def _unlike(
-    envs: Sequence[gymnasium.Env], new: Sequence[gymnasium.Env], make: _Maker, name: str, **apart: Any
+    envs: Sequence[gymnasium.Env], new: Sequence[gymnasium.Env], make: Maker, name: str, **apart: Any
 ) -> Unlike | None:
     try:
         return unlike(envs, new, make, numpy_stream(0, "unlike"), **apart)
     except PgtsError as error:
         raise failure(f"{name} failed in a random walk", error) from error
-
-
-_MODULES = {"MiniGrid-": ("minigrid", "envs"), "BabyAI-": ("minigrid", "envs"), "ALE/": ("ale_py", "atari")}
-"""Environments that are registered by a module, by the start of their ids, and the extra that installs it."""
-
-
-def _import(env_id: str) -> None:
-    """Import what registers an environment with Gymnasium, the module of `MODULE:ID` or a known one; PgtsError if it is
-    not installed, which names the extra, if there is one."""
-    own, colon, _ = env_id.rpartition(":")
-    needed = [(own, "")] if colon else []
-    for module, extra in needed + [needs for start, needs in _MODULES.items() if env_id.startswith(start)]:
-        try:
-            import_named(module)
-        except ModuleNotFoundError as error:
-            why = f"needs {module}: pip install 'pgts_torch[{extra}]'" if extra else f"cannot be made: {error}"
-            raise PgtsError(f"{env_id} {why}") from error
-
-
-def _named(env_id: str) -> Callable[..., gymnasium.Env] | None:
-    """The class or the function of MODULE:NAME, which makes environments; None where a module has no such name."""
-    module, colon, name = env_id.rpartition(":")
-    found = getattr(import_named(module), name, None) if colon else None
-    return found if callable(found) else None
-
-
-def _spec(env_id: str) -> EnvSpec | None:
-    """The spec of an id; that of the latest version where the id has none, as gymnasium.make takes it."""
-    name = env_id.rpartition(":")[2]
-    if name not in gymnasium.registry and importlib.util.find_spec("ale_py"):
-        importlib.import_module("ale_py")  # Atari has ids without a namespace, too
-    try:
-        namespace, short, version = parse_env_id(name)
-    except gymnasium.error.Error:
-        return None
-    if version is None and name not in gymnasium.registry:
-        name = get_env_id(namespace, short, find_highest_version(namespace, short))
-    return gymnasium.registry.get(name)

@@ -101,7 +101,6 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel):
         self._answers = Answers(stepper.at_count if stepper.clock else None)
 
     def clear(self) -> None:
-        """Drop all states. Their numbers are given to other states from here on."""
         super().clear()
         self._answers.clear_if_large()
 
@@ -167,7 +166,6 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel):
         return 0 if self._is_same(step, reward, discount, next_state, follows) else CONTRADICTED
 
     def outcomes_text(self, state: int, action: int) -> str:
-        """The one outcome of a single step."""
         step, child = self._step(state, action, _ANY_KEY, 1)
         then = self.state_text(child) + step.child.snapshot.cut * ", where the episode is truncated"
         text = step_text(step.reward, step.discount, then)

@@ -23,6 +23,7 @@ from pgts_torch.models.provenance import draws_its_own
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
 from pgts_torch.models.stepper import Stepper
 from pgts_torch.seeding import SharedGenerators
+from pgts_torch.tabular.mdp import check_gamma
 
 
 class SnapshotModel(ExactModel):
@@ -50,8 +51,7 @@ class SnapshotModel(ExactModel):
         device: torch.device | str,
         dtype: torch.dtype,
     ) -> None:
-        if not 0 <= gamma <= 1:
-            raise PgtsError(f"gamma is {gamma}; it must be in [0, 1]")
+        check_gamma(gamma)
         check_count("action_repeat", action_repeat)
         self._stepper = stepper = Stepper(
             env, gamma=gamma, actions=actions, adapter=adapter, observe=observe, masks=masks

@@ -108,7 +108,6 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
         return first_N
 
     def state_text(self, state: int) -> str:
-        """Its number."""
         return f"state {state}"
 
     def outcomes_text(self, state: int, action: int) -> str:

@@ -165,12 +165,10 @@ class TensorModel(EnumeratingModel, FollowingModel):
         return torch.where(agrees_N, 0, CONTRADICTED).cpu().numpy()
 
     def state_text(self, state: int) -> str:
-        """The vector."""
         return f"state {self.states(torch.tensor([state], device=self.device))[0].tolist()}"
 
     @torch.no_grad()
     def outcomes_text(self, state: int, action: int) -> str:
-        """The one outcome."""
         state_1D, action_1 = self.states(torch.tensor([state], device=self.device)), torch.tensor([action])
         reward_1, discount_1, next_1D = self.step(state_1D, action_1.to(self.device))
         return step_text(float(reward_1), float(discount_1), f"state {next_1D[0].tolist()}")

@@ -110,7 +110,6 @@ class VectorSimulator(SnapshotModel, FollowingModel):
         return outcome_N
 
     def outcomes_text(self, state: int, action: Any) -> str:
-        """The one outcome of a single step."""
         step = self._step(state, self._taken(np.array([action]))[0], _ANY_KEY, 1)
         return step_text(step.reward, step.discount, self.state_text(self._enter(step.child)))
 

@@ -3,9 +3,9 @@
 from functools import partial
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
+from pydantic import BeforeValidator, Field, ValidationInfo
 
-from pgts_torch.options.fields import Clip, Count, Share, UnitInterval, conflict
+from pgts_torch.options.fields import Clip, Count, Share, UnitInterval, checks, conflict
 from pgts_torch.options.own import OwnModule, by_name
 from pgts_torch.options.part import Part, null
 from pgts_torch.options.policies import CNN, MLP, NatureCNN
@@ -155,8 +155,7 @@ class NetworkValues(Values):
         filled = super().filled(case)
         return filled if self.fresh_targets or not self.lags else filled.model_copy(update={"fresh_targets": False})
 
-    @field_validator("fresh_targets")
-    @classmethod
+    @checks("fresh_targets")
     def _of_a_network_that_lags(cls, value: Any, info: ValidationInfo) -> Any:
         polyak, period = info.data.get("polyak", 1.0), info.data.get("target_period", 1)
         if value and (polyak < 1 or period > 1):

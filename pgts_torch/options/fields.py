@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 from pydantic_core import PydanticCustomError
 
 INT64_MAX = 2**63 - 1
@@ -100,6 +100,12 @@ def conflict(reason: str, *keys: str) -> PydanticCustomError:
     """
     found = keys or re.findall(r"\b[a-z_]+(?:\.[a-z_]+)+", reason)
     return PydanticCustomError("conflict", "{reason}", {"reason": reason, "keys": found})
+
+
+def checks(*names: str) -> Any:
+    """Makes a validator of these options of a method of the class, the value and what is known of the other options:
+    those that are declared before."""
+    return lambda method: field_validator(*names)(classmethod(method))
 
 
 Kwargs = Annotated[dict[str, Any], AfterValidator(_check_kwargs)]

@@ -2,18 +2,9 @@
 
 from typing import Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo
 
-from pgts_torch.options.fields import (
-    Ascending,
-    Between,
-    Count,
-    NonNegative,
-    Positive,
-    Share,
-    Sizes,
-    conflict,
-)
+from pgts_torch.options.fields import Ascending, Between, Count, NonNegative, Positive, Share, Sizes, checks, conflict
 from pgts_torch.options.own import OwnModel
 from pgts_torch.options.part import Part, null
 from pgts_torch.options.policies import CNN, NatureCNN
@@ -62,8 +53,7 @@ class Counts(Part):
     counts leave possible (search/certificate_posterior), which proves nothing; null: there are none. It needs
     model.value_range, as model.confidence does."""
 
-    @field_validator("confidence", "certificate")
-    @classmethod
+    @checks("confidence", "certificate")
     def _has_range(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("value_range", ...) is None:
             raise conflict(
@@ -71,8 +61,7 @@ class Counts(Part):
             )
         return value
 
-    @field_validator("strength")
-    @classmethod
+    @checks("strength")
     def _has_optimism(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("optimism") == "none":
             raise conflict(f"model.strength is {value}, which model.optimism none does not use")

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from pgts_torch.options.fields import KEY, Arguments, Make, conflict
+from pgts_torch.options.fields import KEY, Arguments, Make, checks, conflict
 from pgts_torch.options.part import Part
 
 
@@ -18,8 +18,7 @@ class Own(Part):
     arguments: Arguments = Field(default={})
     """Arguments of that class or function, as in --model.arguments.size 7."""
 
-    @field_validator("make")
-    @classmethod
+    @checks("make")
     def _is_given(cls, value: Any) -> Any:
         if value is None:
             raise conflict(f"{KEY} is missing; it must be MODULE:NAME, a class or a function that makes it", KEY)

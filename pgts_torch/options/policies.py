@@ -3,9 +3,9 @@
 import math
 from typing import Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo
 
-from pgts_torch.options.fields import Natural, PerLayer, Positive, Share, Sizes, conflict
+from pgts_torch.options.fields import Natural, PerLayer, Positive, Share, Sizes, checks, conflict
 from pgts_torch.options.own import OwnModule
 from pgts_torch.options.part import Part
 
@@ -55,8 +55,7 @@ class Softmax(TabularPolicy):
 
     type: Literal["softmax"] = "softmax"
 
-    @field_validator("init")
-    @classmethod
+    @checks("init")
     def _finite_logits(cls, init: Any) -> Any:
         if isinstance(init, Biased) and init.probability == 1:
             raise conflict(
@@ -119,8 +118,7 @@ class CNN(Part):
     scale: Positive | None = None
     """By which images are divided; null: the largest value that they declare. MiniGrid's codes are at most 10."""
 
-    @field_validator("kernel_size", "stride")
-    @classmethod
+    @checks("kernel_size", "stride")
     def _one_for_each(cls, value: Any, info: ValidationInfo) -> Any:
         channels = info.data.get("channels")
         if channels is not None and isinstance(value, list) and len(value) != len(channels):
@@ -178,8 +176,7 @@ class Gaussian(Part):
     min_std: Positive = 0.05
     """The smallest standard deviation; below std."""
 
-    @field_validator("min_std")
-    @classmethod
+    @checks("min_std")
     def _is_smaller(cls, value: Any, info: ValidationInfo) -> Any:
         if value >= info.data.get("std", math.inf):
             raise conflict(f"policy.min_std is {value}; it must be below policy.std, {info.data['std']}")

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from pydantic import ValidationInfo, field_validator
+from pydantic import ValidationInfo
 
-from pgts_torch.options.fields import AtLeastOne, Count, Natural, NonNegative, Samples, UnitInterval, conflict
+from pgts_torch.options.fields import AtLeastOne, Count, Natural, NonNegative, Samples, UnitInterval, checks, conflict
 from pgts_torch.options.part import Part, null
 
 MAX_NODES = 10_000_000
@@ -46,8 +46,7 @@ class Expectimax(Budget):
     """Whether to compute by how much lookahead values may be off because the model is (`search/doubt`); 0 for exact
     models."""
 
-    @field_validator("doubt")
-    @classmethod
+    @checks("doubt")
     def _is_of_full_width(cls, value: Any, info: ValidationInfo) -> Any:
         if value and info.data.get("max_width") is not None:
             raise conflict(
@@ -117,8 +116,7 @@ class MCTS(Budget):
         """Whether paths that meet in a state share one node, also where `merge` is null."""
         return self.backup == "max" and self.widening is None if self.merge is None else self.merge
 
-    @field_validator("widening")
-    @classmethod
+    @checks("widening")
     def _widens_trees_of_maxima(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None:
             for name, allowed in (
@@ -134,29 +132,25 @@ class MCTS(Budget):
                     )
         return value
 
-    @field_validator("widening_power")
-    @classmethod
+    @checks("widening_power")
     def _is_of_widening(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("widening", ...) is None:
             raise conflict(f"search.widening_power is {value}, which only search.widening uses")
         return value
 
-    @field_validator("exploration")
-    @classmethod
+    @checks("exploration")
     def _has_exploration(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("rule") == "gumbel":
             raise conflict(f"search.exploration is {value}; search.rule gumbel has none, it must be puct or uct")
         return value
 
-    @field_validator("prior")
-    @classmethod
+    @checks("prior")
     def _is_used(cls, value: Any, info: ValidationInfo) -> Any:
         if value == "policy" and (info.data.get("root"), info.data.get("rule")) == ("rule", "uct"):
             raise conflict("search.prior is policy, which search.rule uct with search.root rule does not use")
         return value
 
-    @field_validator("merge")
-    @classmethod
+    @checks("merge")
     def _has_returns_of_its_own(cls, value: Any, info: ValidationInfo) -> Any:
         if value and info.data.get("backup") == "mean":
             raise conflict(
@@ -212,8 +206,7 @@ class LookaheadOptions(Part):
         """The depths that an iteration tries, in order."""
         return range(self.filled("adaptive").max_depth + 1) if self.depth == "adaptive" else (self.depth,)
 
-    @field_validator("max_depth", "tolerance")
-    @classmethod
+    @checks("max_depth", "tolerance")
     def _only_adaptive(cls, value: Any, info: ValidationInfo) -> Any:
         if value is not None and info.data.get("depth", "adaptive") != "adaptive":
             name, depth = info.field_name, info.data["depth"]

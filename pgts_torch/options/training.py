@@ -1,35 +1,22 @@
 """All options of a training, and the rules between them."""
 
-from collections.abc import Sequence
 from typing import Any
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
-from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues, TabularValues
+from pgts_torch.options.critics import AutoCritic, Critic, NetworkValues
 from pgts_torch.options.environment import Env
-from pgts_torch.options.fields import conflict
+from pgts_torch.options.fields import checks, conflict
+from pgts_torch.options.inferred import with_types
 from pgts_torch.options.models import LEARNED, AutoModel, Counts, Ensemble, Latent, Model
-from pgts_torch.options.own import Own, OwnModel, OwnModule, by_name
+from pgts_torch.options.own import OwnModule
 from pgts_torch.options.part import Part
-from pgts_torch.options.policies import (
-    CNN,
-    MLP,
-    NETWORKS,
-    TABLES,
-    AutoPolicy,
-    Biased,
-    Gaussian,
-    Network,
-    Simplex,
-    Softmax,
-    Table,
-)
+from pgts_torch.options.policies import CNN, MLP, AutoPolicy, Biased, Gaussian, Network, Simplex, Softmax, Table
 from pgts_torch.options.replay import AutoReplay, NoReplay, Replay, UniformReplay
 from pgts_torch.options.rollouts import (
     AutoHorizon,
     Estimator,
     FixedHorizon,
-    GeometricHorizon,
     LookaheadAdvantages,
     Rollouts,
     SampledAdvantages,
@@ -69,7 +56,7 @@ class Training(Part):
     @model_validator(mode="before")
     @classmethod
     def _infer_types(cls, data: Any) -> Any:
-        return _with_types(data) if isinstance(data, dict) else data
+        return with_types(data) if isinstance(data, dict) else data
 
     def resolved(self) -> "Training":
         """Return the options with replay, horizon and number of environments in place of auto and null."""
@@ -83,8 +70,7 @@ class Training(Part):
             rollout = rollout.model_copy(update={"horizon": rollout.horizon.filled(replay.type)})
         return self.model_copy(update={"replay": replay, "rollout": rollout.filled(rollout.horizon.type)})
 
-    @field_validator("critic")
-    @classmethod
+    @checks("critic")
     def _sees_what_the_policy_sees(cls, critic: Any, info: ValidationInfo) -> Any:
         policy = info.data.get("policy")
         if policy is None or isinstance(critic, AutoCritic):
@@ -118,8 +104,7 @@ class Training(Part):
             )
         return critic
 
-    @field_validator("estimator")
-    @classmethod
+    @checks("estimator")
     def _needs_no_lookahead(cls, estimator: Any, info: ValidationInfo) -> Any:
         search, policy, critic = (info.data.get(name) for name in ("search", "policy", "critic"))
         if isinstance(estimator, LookaheadAdvantages):
@@ -143,8 +128,7 @@ class Training(Part):
             )
         return estimator
 
-    @field_validator("update")
-    @classmethod
+    @checks("update")
     def _fits_policy(cls, update: Any, info: ValidationInfo) -> Any:
         policy = info.data.get("policy")
         if policy is None or isinstance(update, AutoUpdate):
@@ -162,8 +146,7 @@ class Training(Part):
             )
         return update
 
-    @field_validator("search")
-    @classmethod
+    @checks("search")
     def _draws_actions(cls, search: Any, info: ValidationInfo) -> Any:
         policy = info.data.get("policy")
         if not isinstance(policy, Gaussian):
@@ -190,8 +173,7 @@ class Training(Part):
             )
         return search
 
-    @field_validator("model", "replay")
-    @classmethod
+    @checks("model", "replay")
     def _needs_a_lookahead(cls, value: Any, info: ValidationInfo) -> Any:
         if isinstance(info.data.get("estimator"), SampledAdvantages) and isinstance(value, (*LEARNED, UniformReplay)):
             key = f"{info.field_name}.type"
@@ -202,10 +184,9 @@ class Training(Part):
             )
         return value
 
-    @field_validator("model")
-    @classmethod
-    def _proves_nothing(cls, model: Any, info: ValidationInfo) -> Any:
-        search = info.data.get("search")
+    @checks("model")
+    def _does_what_is_asked(cls, model: Any, info: ValidationInfo) -> Any:
+        search, policy, critic = (info.data.get(name) for name in ("search", "policy", "critic"))
         has_bound = not isinstance(model, LEARNED) or (isinstance(model, Counts) and model.certificate is not None)
         if search is not None and search.stop_at is not None and not has_bound:
             way_out = "give model.certificate" if isinstance(model, Counts) else "only one of type counts has bounds"
@@ -215,23 +196,12 @@ class Training(Part):
                 "search.stop_at",
                 "model.type",
             )
-        return model
-
-    @field_validator("model")
-    @classmethod
-    def _takes_vectors(cls, model: Any, info: ValidationInfo) -> Any:
-        if isinstance(info.data.get("policy"), Gaussian) and isinstance(model, Counts | Latent):
+        if isinstance(policy, Gaussian) and isinstance(model, Counts | Latent):
             raise conflict(
                 f"model.type is {model.type}, which learns what follows numbered actions; with policy.type gaussian it "
                 "must be auto, ensemble or a model of your own"
             )
-        return model
-
-    @field_validator("model")
-    @classmethod
-    def _represents_images(cls, model: Any, info: ValidationInfo) -> Any:
-        parts = {"policy": info.data.get("policy"), "critic.network": getattr(info.data.get("critic"), "network", None)}
-        for name, part in parts.items():
+        for name, part in {"policy": policy, "critic.network": getattr(critic, "network", None)}.items():
             if isinstance(model, Latent) and isinstance(part, CNN):
                 raise conflict(
                     f"{name}.type is {part.type}; with model.type latent it takes vectors that represent images: it "
@@ -239,29 +209,11 @@ class Training(Part):
                     f"{name}.type",
                     "model.type",
                 )
+        if isinstance(search, ExpectimaxSection) and search.doubt:
+            _check_doubt(model, search.action_repeat)
         return model
 
-    @field_validator("model")
-    @classmethod
-    def _says_its_error(cls, model: Any, info: ValidationInfo) -> Any:
-        search = info.data.get("search")
-        if not (isinstance(search, ExpectimaxSection) and search.doubt):
-            return model
-        if isinstance(model, Counts) and model.confidence is None:
-            raise conflict(
-                "search.doubt is true, which needs model.confidence and model.value_range where counts are learned"
-            )
-        if isinstance(model, Latent):
-            raise conflict("search.doubt is true, and model.type is latent, which does not know its error")
-        if isinstance(model, Ensemble) and (model.members == 1 or search.action_repeat > 1):
-            raise conflict(
-                f"search.doubt is true, which needs model.members 2 or more and search.action_repeat 1; they are "
-                f"{model.members} and {search.action_repeat}"
-            )
-        return model
-
-    @field_validator("replay")
-    @classmethod
+    @checks("replay")
     def _goes_on(cls, replay: Any, info: ValidationInfo) -> Any:
         rollout, model = info.data.get("rollout"), info.data.get("model")
         if isinstance(model, LEARNED) and isinstance(replay, NoReplay):
@@ -301,6 +253,20 @@ MOVES: dict[type[Part], tuple[type[Table | Network | Gaussian], ...]] = {
 """The policies that each update can move."""
 
 
+def _check_doubt(model: Any, action_repeat: int) -> None:
+    if isinstance(model, Counts) and model.confidence is None:
+        raise conflict(
+            "search.doubt is true, which needs model.confidence and model.value_range where counts are learned"
+        )
+    if isinstance(model, Latent):
+        raise conflict("search.doubt is true, and model.type is latent, which does not know its error")
+    if isinstance(model, Ensemble) and (model.members == 1 or action_repeat > 1):
+        raise conflict(
+            f"search.doubt is true, which needs model.members 2 or more and search.action_repeat 1; they are "
+            f"{model.members} and {action_repeat}"
+        )
+
+
 def _check_mirror(update: Mirror, policy: Any) -> None:
     kind = "table" if isinstance(policy, Table) else "network"
     if kind == "table" and update.floor == "never" and isinstance(policy.init, Biased) and policy.init.probability == 1:
@@ -314,49 +280,3 @@ def _check_mirror(update: Mirror, policy: Any) -> None:
                 f"update.{name} is {value}, which the mirror update of a {kind} does not use; policy.type is "
                 f"{policy.type}"
             )
-
-
-def _with_types(data: dict[str, Any]) -> dict[str, Any]:
-    """Return the values with a type for parts that have other keys but no type.
-
-    It is the first type that goes with the other values and has all these keys; if none has, the first that goes.
-    """
-    kinds: dict[str, type[Own]] = {"model": OwnModel, "policy": OwnModule, "critic": OwnModule}
-    data = data | {name: by_name(data[name], kind) for name, kind in kinds.items() if name in data}
-    if _type(data, "critic") == "module":
-        data |= {"critic": {"type": "network", "network": data["critic"]}}
-    data = _with_type(_with_type(data, "model", [Ensemble, Counts, Latent, OwnModel]), "replay", [UniformReplay])
-    replayed = _type(data, "replay") == "uniform" or _type(data, "model") in ("ensemble", "counts", "latent")
-    sampled = _type(data, "estimator") == "sampled"
-    horizons: list[type[Part]] = [FixedHorizon, GeometricHorizon, *[StepsHorizon] * sampled]
-    if isinstance(rollout := data.get("rollout"), dict):
-        data = data | {"rollout": _with_type(rollout, "horizon", [StepsHorizon] * replayed + horizons)}
-    data = _with_type(data, "policy", [Softmax, MLP, CNN, OwnModule, Gaussian])
-    policy = _type(data, "policy")
-    tables, networks = policy not in NETWORKS, policy not in TABLES
-    for_tables: list[type[Part]] = [Projected if policy == "simplex" else Mirror]
-    for_networks: list[type[Part]] = [PPO] if sampled else [MPO if policy == "gaussian" else CMPO, PPO]
-    critic = data.get("critic") or {}
-    if policy in NETWORKS and isinstance(critic, dict):  # also where states are numbered
-        data = data | {"critic": {"type": "network"} | critic}
-    data = _with_type(data, "critic", [TabularValues] * tables + [NetworkValues] * networks)
-    return _with_type(data, "update", for_tables * tables + for_networks * networks)
-
-
-def _with_type(data: dict[str, Any], name: str, kinds: Sequence[type[Part]]) -> dict[str, Any]:
-    section = data.get(name)
-    if not section or not isinstance(section, dict) or "type" in section:
-        return data
-    kind = next((kind for kind in kinds if section.keys() <= _keys(kind)), kinds[0])
-    return data | {name: {"type": kind.model_fields["type"].default} | section}
-
-
-def _keys(kind: type[Part]) -> set[str]:
-    """Return the keys of a part; of the mirror update only those of tables, because cmpo has the others."""
-    names = {"type", *Mirror.standing("tables")} if kind is Mirror else kind.model_fields
-    return {str(kind.model_fields[name].validation_alias or name) for name in names}
-
-
-def _type(data: dict[str, Any], name: str) -> Any:
-    section = data.get(name)
-    return section.get("type") if isinstance(section, dict) else section

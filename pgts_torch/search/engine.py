@@ -18,11 +18,12 @@ from pgts_torch.readings import Readings
 from pgts_torch.search.empirical import FixedSamples
 from pgts_torch.search.expectimax import search_levels
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_finite
-from pgts_torch.search.mcts import drawn_actions, search_tree
+from pgts_torch.search.mcts import search_tree
 from pgts_torch.search.memory import tree_nodes
 from pgts_torch.search.price import Meter
 from pgts_torch.search.sampled import plan_levels, search_samples
 from pgts_torch.search.topology import Topology
+from pgts_torch.search.widening import drawn_actions
 from pgts_torch.seeding import sample_keys
 
 DEFAULT_SAMPLES = Sampled().samples

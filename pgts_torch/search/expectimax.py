@@ -70,31 +70,25 @@ def search_levels(
     """`expectimax`, with leaves and topology at hand: expand the levels, call the critic at the bottom, back up."""
     topology.table.meter = leaves.meter
     with torch.set_grad_enabled(False):  # half of what `no_grad` costs, which small searches notice
-        return _search_levels(leaves, topology, root_B, max_nodes, max_width)
-
-
-def _search_levels(
-    leaves: Leaves, topology: Topology, root_B: Int[Tensor, "B"], max_nodes: int, max_width: int | None
-) -> Lookahead:
-    if max_width is not None:
-        return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
-    calls_before, expansions = topology.table.model_calls, leaves.expansions
-    levels = topology.levels(root_B, expansions, max_nodes=max_nodes, readings=leaves.readings)
-    plan = levels.plan(expansions)
-    bottom = plan.bottom
-    if expansions:
-        v_N, values = leaves.unchecked(bottom)
-        q_NA = levels.back_up(v_N, expansions, check=lambda: leaves.check(values, bottom))
-    else:
-        q_NA = leaves.q(bottom).clone()
-    doubt_NA = None if leaves.leaf_error is None else _doubt(leaves, levels, topology.model, bottom)
-    return Lookahead.enumerated(
-        levels.of_roots(q_NA),
-        model_calls=topology.table.model_calls - calls_before,
-        critic_calls=leaves.calls,
-        nodes_per_level=plan.nodes_per_level,
-        doubt_BA=None if doubt_NA is None else levels.of_roots(doubt_NA),
-    )
+        if max_width is not None:
+            return pruned(leaves, topology, root_B, max_width=max_width, max_nodes=max_nodes)
+        calls_before, expansions = topology.table.model_calls, leaves.expansions
+        levels = topology.levels(root_B, expansions, max_nodes=max_nodes, readings=leaves.readings)
+        plan = levels.plan(expansions)
+        bottom = plan.bottom
+        if expansions:
+            v_N, values = leaves.unchecked(bottom)
+            q_NA = levels.back_up(v_N, expansions, check=lambda: leaves.check(values, bottom))
+        else:
+            q_NA = leaves.q(bottom).clone()
+        doubt_NA = None if leaves.leaf_error is None else _doubt(leaves, levels, topology.model, bottom)
+        return Lookahead.enumerated(
+            levels.of_roots(q_NA),
+            model_calls=topology.table.model_calls - calls_before,
+            critic_calls=leaves.calls,
+            nodes_per_level=plan.nodes_per_level,
+            doubt_BA=None if doubt_NA is None else levels.of_roots(doubt_NA),
+        )
 
 
 def _doubt(
@@ -102,7 +96,6 @@ def _doubt(
 ) -> Float[Tensor, "N A"] | None:
     """The bound E of the error of all actions in frontier 0, `Lookahead.doubt_BA`: values of an MDP that pays the
     errors of the model, with the errors of the critic at the bottom. 0 where an action is not allowed."""
-
     if _step_error(model, bottom[:1]) is None:
         return None
     error_N, expansions = leaves.errors(bottom), leaves.expansions

@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pgts_torch.errors import NotFinite
+from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.models.base import Model
 from pgts_torch.models.drawn_actions import DrawnActions
 from pgts_torch.options.search import MCTS
 from pgts_torch.search.lookahead import Leaves
@@ -187,3 +188,13 @@ class WideningTrees:
         """`Lookahead.pruned_BA`: 0 where nothing is left to expand below an action, else inf, because a maximum over
         some of the actions is no value that the critic gave."""
         return torch.where(self._open_NA[node_B], torch.inf, 0.0)
+
+
+def drawn_actions(model: Model, options: MCTS) -> DrawnActions:
+    """The model, if its actions are drawn; else PgtsError."""
+    if not isinstance(model, DrawnActions):
+        raise PgtsError(
+            f"search.widening is {options.widening}, which is for actions that are drawn (policy.type gaussian); those "
+            f"of {type(model).__name__} are numbered"
+        )
+    return model

@@ -13,7 +13,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from pgts_torch.agent.make_world import make_world
-from pgts_torch.agent.world import ModelWorld, SimulatedWorld, World
+from pgts_torch.agent.world import ModelWorld, World
+from pgts_torch.agent.worlds import SimulatedWorld
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.options.environment import Observed

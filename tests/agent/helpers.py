@@ -8,7 +8,7 @@ from torch import Tensor
 from pgts_torch.agent.collect import rollout
 from pgts_torch.agent.policies import Policy, SimplexPolicy
 from pgts_torch.agent.rollout import Rollout
-from pgts_torch.agent.world import TabularWorld
+from pgts_torch.agent.worlds import TabularWorld
 from pgts_torch.envs import TabularVectorEnv
 from pgts_torch.models.tabular import tabular_truth
 from pgts_torch.options.rollouts import Horizon

@@ -7,11 +7,12 @@ import pytest
 from pgts_torch import options
 from pgts_torch.agent.build import chosen, make_critic, make_policy, make_update
 from pgts_torch.agent.critics import ExactCritic, RolloutCritic, TabularCritic
-from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.policies import SimplexPolicy, SoftmaxPolicy
 from pgts_torch.agent.updates import MirrorUpdate, ProjectedUpdate
-from pgts_torch.agent.world import TabularWorld
+from pgts_torch.agent.worlds import TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.options import (
     MCTS,

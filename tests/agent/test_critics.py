@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from pgts_torch.agent.advantages import critic_targets, lambda_returns
 from pgts_torch.agent.critics import Critic, ExactCritic, RolloutCritic, TabularCritic
-from pgts_torch.agent.neural import NetworkCritic
+from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models import TabularModel
 from pgts_torch.options import (

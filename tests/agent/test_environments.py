@@ -10,7 +10,8 @@ from gymnasium.wrappers import TimeLimit
 from pgts_torch import PGTS
 from pgts_torch.agent.callbacks import EvalCallback
 from pgts_torch.agent.evaluate import evaluate
-from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld
+from pgts_torch.agent.world import ModelWorld
+from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import check_model
 from pgts_torch.models.environments import EnvSource

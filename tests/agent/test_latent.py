@@ -12,7 +12,8 @@ from torch import nn
 from pgts_torch import PGTS, evaluate
 from pgts_torch.agent.latent import LatentModel
 from pgts_torch.agent.latent_losses import Unrolled, consistency_loss, equivalence_losses, outcome_losses
-from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.envs.images import Catch
 from pgts_torch.errors import MemoryBudgetExceeded, MissingModel, NotFinite, PgtsError
 from pgts_torch.models.base import Experience

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from pgts_torch import PGTS
-from pgts_torch.agent import make_world as worlds
+from pgts_torch.agent import candidates as worlds
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.tabular import exact
 
@@ -106,7 +106,7 @@ def test_the_cliff_is_passed_on_the_shortest_way_at_depth_12_and_feared_at_depth
 @pytest.mark.parametrize("kind", [worlds.DynamicsWorld, worlds.SimulatedWorld])
 def test_a_network_learns_to_balance_a_pole_by_dynamics_in_torch_and_by_a_simulator(kind, monkeypatch):
     if kind is worlds.SimulatedWorld:
-        monkeypatch.setattr(worlds, "_dynamics", lambda sought: None)
+        monkeypatch.setattr(worlds, "dynamics_world", lambda request: None)
     network: dict[str, Any] = {"type": "mlp", "hidden": [32]}
     model = PGTS(
         "CartPole-v1",

@@ -7,7 +7,8 @@ import pytest
 from gymnasium.envs.registration import load_env_creator
 
 from pgts_torch import PGTS
-from pgts_torch.agent.world import SimulatedWorld, World
+from pgts_torch.agent.world import World
+from pgts_torch.agent.worlds import SimulatedWorld
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models.adapters_extra import Ale, Mujoco
 from tests.agent.cells import agrees, world_of

@@ -10,7 +10,7 @@ import pytest
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.wrappers import RepeatAction, TimeLimit, TransformReward
 
-from pgts_torch.agent.world import DynamicsWorld, SimulatedWorld, TabularWorld
+from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import PgtsError
 from pgts_torch.models import SimulatorModel
 from pgts_torch.models.environments import EnvSource

@@ -13,7 +13,8 @@ from gymnasium import wrappers
 from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
-from pgts_torch.agent.world import ModelWorld, SimulatedWorld
+from pgts_torch.agent.world import ModelWorld
+from pgts_torch.agent.worlds import SimulatedWorld
 from pgts_torch.models import check_model
 from tests.agent.cells import Walk, agrees, refusal_of, vector_of, world_of
 from tests.models import corridors

@@ -14,7 +14,8 @@ from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
 
 from pgts_torch import PGTS
-from pgts_torch.agent.world import ModelWorld, SimulatedWorld, TabularWorld
+from pgts_torch.agent.world import ModelWorld
+from pgts_torch.agent.worlds import SimulatedWorld, TabularWorld
 from pgts_torch.envs import TabularEnv
 from pgts_torch.models.attributes import fingerprint
 from pgts_torch.tabular import exact, ladder

@@ -12,7 +12,8 @@ from torch import Tensor
 from pgts_torch.agent import saving
 from pgts_torch.agent.advantages import gae, score_function
 from pgts_torch.agent.iteration import Batch
-from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.agent.neural_updates import GradientUpdate
 from pgts_torch.agent.policies import SimplexPolicy
 from pgts_torch.errors import PgtsError

@@ -13,7 +13,8 @@ from pgts_torch.agent import saving
 from pgts_torch.agent.advantages import gae, score_function
 from pgts_torch.agent.gradients import Forward, through_log_softmax
 from pgts_torch.agent.iteration import Batch
-from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
 from pgts_torch.agent.optimisers import Optimiser
 from pgts_torch.agent.policies import SoftmaxPolicy

@@ -14,7 +14,8 @@ from torch import Tensor
 from pgts_torch.agent import optimisers
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.iteration import Batch
-from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.agent.neural_updates import GradientUpdate, NetworkUpdate, PPOUpdate
 from pgts_torch.agent.optimisers import Optimiser, Undo
 from pgts_torch.agent.target_updates import CMPOUpdate, NetworkMirrorUpdate

@@ -17,7 +17,8 @@ from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.ongoing import OngoingEpisodes
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.target_updates import NetworkMirrorUpdate
-from pgts_torch.agent.world import TabularWorld, World
+from pgts_torch.agent.world import World
+from pgts_torch.agent.worlds import TabularWorld
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import TabularModel
 from pgts_torch.options import (

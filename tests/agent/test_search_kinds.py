@@ -7,7 +7,7 @@ import torch
 
 from pgts_torch import PGTS
 from pgts_torch.agent import make_world
-from pgts_torch.agent.world import TabularWorld
+from pgts_torch.agent.worlds import TabularWorld
 from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.run import build

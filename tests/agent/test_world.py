@@ -12,10 +12,11 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from torch import Tensor
 
 from pgts_torch import PGTS
-from pgts_torch.agent import make_world as worlds
+from pgts_torch.agent import candidates as worlds
 from pgts_torch.agent.build import make_policy
 from pgts_torch.agent.collect import rollout
-from pgts_torch.agent.world import DynamicsWorld, ModelWorld, SimulatedWorld, TabularWorld, World
+from pgts_torch.agent.world import ModelWorld, World
+from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import MissingModel, PgtsError
 from pgts_torch.models import SimulatorModel, with_torques
 from pgts_torch.options import MLP, FixedHorizon

@@ -17,10 +17,11 @@ from torch import nn
 from pgts_torch import PGTS
 from pgts_torch.agent import build
 from pgts_torch.agent.critics import Critic
-from pgts_torch.agent.neural import NetworkCritic, NetworkPolicy
+from pgts_torch.agent.neural import NetworkPolicy
+from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.updates import Update
-from pgts_torch.agent.world import TabularWorld
+from pgts_torch.agent.worlds import TabularWorld
 from pgts_torch.config import Config, dump, load, strict_yaml
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.options import (

@@ -17,7 +17,7 @@ import torch
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.cli.main import main
 from pgts_torch.config import Config, load
-from pgts_torch.experiment import initial, run
+from pgts_torch.experiment import commented, initial, run
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.options.schema import schema_of
 
@@ -176,9 +176,8 @@ def test_every_option_that_applies_stands_there_with_its_meaning_and_range_and_w
     Path("all.yaml").write_text(uncovered)
     assert load("all.yaml") == config
     options = {each.key: each for each in schema_of(Config).options()}
-    assert (
-        f"  # {initial._sentence(options['search.depth'].meaning)} (a whole number >= 0 or adaptive)\n  depth: " in text
-    )
+    depth = commented._sentence(options["search.depth"].meaning)
+    assert f"  # {depth} (a whole number >= 0 or adaptive)\n  depth: " in text
     assert "# Step size of Adam (a number > 0, or linear(FROM, TO, STEPS)" in text
     assert len(re.findall(r"^\s*# .*\)$\n#?\s*\w+:", text, re.MULTILINE)) > 50
     Path("changed.yaml").write_text(uncovered.replace("keep_best: false", "keep_best: true"))

@@ -12,7 +12,7 @@ import pytest
 import torch
 from gymnasium import spaces, wrappers
 
-from pgts_torch.agent.world import DynamicsWorld, SimulatedWorld, TabularWorld
+from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import MissingModel
 from pgts_torch.models import SimulatorModel
 from pgts_torch.options.environment import Observed
