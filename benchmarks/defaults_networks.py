@@ -1,9 +1,8 @@
-"""The defaults of networks: CartPole, Acrobot and a sparse puzzle seen as an image, beside the default of before."""
+"""The defaults of networks: CartPole, Acrobot and a sparse puzzle seen as an image."""
 
 import statistics
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import key_and_door
 
@@ -29,19 +28,6 @@ class Task:
 
 TASKS = (Task("CartPole-v1", 475, 10), Task("Acrobot-v1", -100, 10), Task(key_and_door.ID, 0.95, 8))
 
-BEFORE: dict[str, Any] = {
-    "update": "ppo",
-    "critic": {"type": "network", "fresh_targets": False},
-    "num_envs": 32,
-    "horizon": {"type": "fixed", "length": 100},
-}
-FORMS: dict[str, dict[str, Any]] = {"after": {}, "before": BEFORE}
-"""Options of `PGTS`: the defaults, and PPO on the same lookahead as it was before them."""
-
-
-BEFORE_SEEDS = 3
-"""So many seeds are enough to see how it was."""
-
 
 @dataclass(frozen=True)
 class Outcome:
@@ -51,9 +37,9 @@ class Outcome:
     steps: int | None
 
 
-def trained(task: Task, options: dict[str, Any], seed: int, most_steps: int) -> Outcome:
+def trained(task: Task, seed: int, most_steps: int) -> Outcome:
     """Train until the target is reached in a look and then in fresh episodes, or the steps are used up."""
-    model = PGTS(task.env_id, seed=seed, **options)
+    model = PGTS(task.env_id, seed=seed)
     looks = range(EVERY, most_steps - EVERY + 1, EVERY)
     for total in looks:
         model.learn(total)
@@ -65,26 +51,23 @@ def trained(task: Task, options: dict[str, Any], seed: int, most_steps: int) -> 
     return Outcome(value, None)
 
 
-def row(task: Task, form: str, outcomes: list[Outcome]) -> str:
+def row(task: Task, outcomes: list[Outcome]) -> str:
     steps = [each.steps for each in outcomes if each.steps is not None]
     needed = f"{statistics.median(steps):,.0f} ({min(steps):,} to {max(steps):,})" if steps else "-"
     values = [each.value for each in outcomes]
     return (
-        f"| {task.env_id} | {form} | {len(steps)} of {len(outcomes)} | {needed} "
+        f"| {task.env_id} | {len(steps)} of {len(outcomes)} | {needed} "
         f"| {statistics.median(values):.4g} ({min(values):.4g} to {max(values):.4g}) |"
     )
 
 
 def lines(seeds: list[int], *, short: bool, only: list[str]) -> Iterator[str]:
-    yield "| environment | default | learned | steps: median (range) | greedy return: median (range) |"
-    yield "|---|---|---|---|---|"
+    yield "| environment | learned | steps: median (range) | greedy return: median (range) |"
+    yield "|---|---|---|---|"
     most = 2 * EVERY if short else MOST_STEPS
-    for form, options in FORMS.items():
-        made = seeds[:BEFORE_SEEDS] if form == "before" else seeds
-        for task in TASKS:
-            if only and not task.env_id.startswith(tuple(only)):
-                continue
-            yield row(task, form, [trained(task, options, seed, most) for seed in made])
+    for task in TASKS:
+        if not only or task.env_id.startswith(tuple(only)):
+            yield row(task, [trained(task, seed, most) for seed in seeds])
 
 
 def table(seeds: list[int], *, short: bool, only: list[str]) -> None:
