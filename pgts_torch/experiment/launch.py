@@ -109,7 +109,7 @@ class _Attempt:
         ended = running.result()
         if not ended.is_failed():
             return int(self._report(0)["code"])
-        self.loss, self.is_said = self._first_loss(ended.failures)
+        self.loss, self.is_said = min(self._losses(ended.failures))[1:]
         return LOST
 
     def signal(self, number: signal.Signals, *, beside: set[int] = frozenset()) -> set[int]:  # type: ignore[assignment]
@@ -119,9 +119,6 @@ class _Attempt:
             with suppress(ProcessLookupError):
                 os.kill(each, number)
         return ids
-
-    def _first_loss(self, failures: Any) -> tuple[str, bool]:
-        return min(self._losses(failures))[1:]
 
     def _losses(self, failures: Any) -> Iterator[tuple[int, str, bool]]:
         """What is known of each lost process, with how little it says of the cause."""

@@ -104,15 +104,12 @@ class Recorder:
         elif step >= self.config.total_steps:
             progress.ended_by = "total_steps"
         every = self.config.log.checkpoint_every
-        is_due = every and (k % every == 0 or algorithm.ranks.first("the time", self._is_checkpoint_due))
+        is_late = lambda: time.perf_counter() - self._saved_clock > MOST_SECONDS  # noqa: E731
+        is_due = every and (k % every == 0 or algorithm.ranks.first("the time", is_late))
         if is_due and not self.finished:  # the last one waits until the training has ended
             self.save()
         self._clock = time.perf_counter()
         return not self.finished and self.stop.signal is None
-
-    def _is_checkpoint_due(self) -> bool:
-        """Whether the last checkpoint is more than `MOST_SECONDS` old."""
-        return time.perf_counter() - self._saved_clock > MOST_SECONDS
 
     def save(self) -> None:
         """Write a checkpoint, unless there is one of this step."""

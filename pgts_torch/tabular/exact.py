@@ -198,7 +198,9 @@ def _solve(
     _check_ends(mdp.outcomes, pi_SA, forward)
     matrix, b = forward.T if transpose else forward, b_S.numpy()
     if mdp.num_states <= DENSE_LIMIT:
-        return torch.from_numpy(_solve_dense(matrix, b))
+        # By torch, which keeps to the threads it was given: on busy cores those of numpy make it much slower.
+        identity = torch.eye(len(b), dtype=torch.float64)
+        return torch.linalg.solve(identity - torch.from_numpy(matrix.toarray()), b_S)
     return torch.from_numpy(_solve_iterative(matrix, b, np.zeros_like(b) if near_S is None else near_S.numpy()))
 
 
@@ -241,12 +243,6 @@ def _closure(matrix: Matrix, found: np.ndarray) -> np.ndarray:
             break
         found = grown
     return found
-
-
-def _solve_dense(matrix: Matrix, b: np.ndarray) -> np.ndarray:
-    # By torch, which keeps to the threads it was given: on busy cores those of numpy made it hundreds of times slower.
-    identity = torch.eye(len(b), dtype=torch.float64)
-    return torch.linalg.solve(identity - torch.from_numpy(matrix.toarray()), torch.from_numpy(b)).numpy()
 
 
 def _solve_iterative(matrix: Matrix, b: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pgts_torch.bellman import Outcomes, backup, policy_mean, sweep
+from pgts_torch.bellman import backup, policy_mean, sweep
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.tabular import exact
 from pgts_torch.tabular.mdp import TabularMDP
@@ -70,7 +70,7 @@ def finite_step_bound(
         off_S = torch.where(best_SA, 0.0, pi_SA).sum(-1)
         distance_S = (off_S.square() / best_SA.sum(-1) + torch.where(best_SA, 0.0, pi_SA).square().sum(-1)) / 2
     paid = mdp.outcomes.paying((distance_S / step_S)[:, None].expand_as(pi_SA))
-    return lack_S + exact.policy_values(_with(mdp, paid), next_SA)
+    return lack_S + exact.policy_values(TabularMDP(paid, mdp.start_S), next_SA)
 
 
 # Depths at which every policy is moved toward optimal actions
@@ -176,10 +176,6 @@ def _moved(mdp: TabularMDP, best_SA: Tensor, here_S: Tensor) -> Float[Tensor, "S
     share_SA = here_S[:, None] * best_SA / best_SA.sum(-1, keepdim=True)
     flow_SAK = share_SA[:, :, None] * outcomes.prob_NAK * outcomes.discount_NAK
     return torch.zeros_like(here_S).index_add(0, outcomes.child_NAK.flatten(), flow_SAK.flatten())
-
-
-def _with(mdp: TabularMDP, outcomes: Outcomes) -> TabularMDP:
-    return TabularMDP(outcomes, mdp.start_S)
 
 
 # Samples
