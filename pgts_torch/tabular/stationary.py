@@ -128,14 +128,13 @@ def gap_bound(
 
 def _behind(mdp: TabularMDP, lack_S: Float[Tensor, "S"], depth: int) -> float:
     """mu^T U^{m+1} x, with x what is lacking after m + 1 steps."""
-    legal_NA = mdp.outcomes.legal_NA
-    free = replace(mdp.outcomes, reward_NA=torch.where(legal_NA, 0.0, -math.inf).to(mdp.outcomes.reward_NA))
+    free = mdp.outcomes.paying(torch.zeros_like(mdp.outcomes.reward_NA))
     return float(mdp.start_S @ sweep(free, lack_S, check_count("depth", depth, least=0) + 1))
 
 
 def worst_policy(mdp: TabularMDP) -> Float[Tensor, "S A"]:
     """A deterministic policy with the least value in every state: the optimum of the negated rewards."""
-    negated = replace(mdp.outcomes, reward_NA=torch.where(mdp.outcomes.legal_NA, -mdp.outcomes.reward_NA, -math.inf))
+    negated = mdp.outcomes.paying(-mdp.outcomes.reward_NA)
     return exact.optimal(replace(mdp, outcomes=negated, reward_SAK=None)).pi_SA
 
 

@@ -32,7 +32,7 @@ NEVER = -1
 class StationarySets:
     """Pi^0, Pi^1, ... among the deterministic policies of an MDP.
 
-    A policy is in Pi^m forevery m below its escape depth (Pi^m shrinks, [PGTS Thm. 1]). The worst return b^m over all
+    A policy is in Pi^m for every m below its escape depth (Pi^m shrinks, [PGTS Thm. 1]). The worst return b^m over all
     policies, stochastic ones too, is attained by a deterministic one (docs/theory.md, Prop. 2).
 
     num_states, num_actions: of the MDP.
