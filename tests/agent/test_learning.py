@@ -106,7 +106,7 @@ def test_the_cliff_is_passed_on_the_shortest_way_at_depth_12_and_feared_at_depth
 @pytest.mark.parametrize("kind", [worlds.DynamicsWorld, worlds.SimulatedWorld])
 def test_a_network_learns_to_balance_a_pole_by_dynamics_in_torch_and_by_a_simulator(kind, monkeypatch):
     if kind is worlds.SimulatedWorld:
-        monkeypatch.setattr(worlds, "dynamics_world", lambda request: None)
+        monkeypatch.setattr(worlds, "CLASSIC", ())
     network: dict[str, Any] = {"type": "mlp", "hidden": [32]}
     model = PGTS(
         "CartPole-v1",
