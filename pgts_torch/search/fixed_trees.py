@@ -6,7 +6,7 @@ go down side by side; a "lane" is an action of a root with a simulation under wa
 less than others, works on one more node, which is nobody's.
 """
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from typing import final
 
 import torch
@@ -38,6 +38,7 @@ class FixedTrees:
         bottom: nodes at this level are never expanded.
         options: of a search with maxima, in trees that are not merged.
         num_roots, num_nodes: B and S.
+        legal: how many actions are allowed in a state, all such counts; None: all are allowed in each.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class FixedTrees:
         *,
         num_roots: int,
         num_nodes: int,
+        legal: Sequence[int] | None = None,
     ) -> None:
         self._bottom, self._options, self._child_SAK = bottom, options, outcomes.child_NAK
         self._selection = Selection(options.rule, 1.25 if options.exploration is None else options.exploration)
@@ -69,6 +71,10 @@ class FixedTrees:
         self.place_N2 = torch.zeros(len(self.arm_NAC), 2, dtype=torch.int64, device=device)
         self.root_B = torch.arange(num_roots, device=device) * num_nodes
         self.nodes_B, self._nobody = torch.ones_like(self.root_B), num_roots * num_nodes
+        # How many actions have a simulation in each wave: by how many are allowed at the root, and all that occur.
+        widths_A = [self._widths(count) for count in range(1, self.A + 1)]
+        self._width_TA = torch.tensor(widths_A, dtype=torch.int64, device=device).t()
+        self._widths_T = [*zip(*(widths_A[count - 1] for count in legal or [self.A]), strict=True)]
 
     def search(
         self, state_B: Int[Tensor, "B"], preference_BA: Float[Tensor, "B A"]
@@ -83,38 +89,40 @@ class FixedTrees:
         self.nodes_B.fill_(1)
         self._expand(self.root_B, state_B, torch.zeros_like(self.root_B))
         left_B = torch.full_like(self.root_B, self._options.simulations - 1)  # the first one has expanded the root
-        survives_BA, before = torch.ones_like(preference_BA, dtype=torch.bool), 0
-        for number, width in enumerate(self._widths()):
-            arm_BAC = self.arm_NAC.index_select(0, self.root_B)
+        survives_BA = torch.ones_like(preference_BA, dtype=torch.bool)
+        place_A = torch.arange(self.A, device=left_B.device)
+        allowed_B = (self.arm_NAC.index_select(0, self.root_B)[..., _Q] > -torch.inf).sum(1)
+        width_TB = self._width_TA.index_select(1, allowed_B - 1)
+        for number, widths in enumerate(self._widths_T):
+            arm_BAC, width_B = self.arm_NAC.index_select(0, self.root_B), width_TB[number]
             if self._options.root == "rule":
                 action_BW = self._select(arm_BAC).unsqueeze(1)
             else:
-                if width != before:  # a new round: the best `width` actions of those that are left go on
-                    order_BA, before = _order(arm_BAC, preference_BA, survives_BA), width
-                    survives_BA = torch.zeros_like(survives_BA).scatter_(1, order_BA[:, :width], True)
-                action_BW = _order(arm_BAC, preference_BA, survives_BA)[:, :width]
-            count_B = (arm_BAC[..., _OPEN] > 0).sum(1).clamp_max_(width).minimum(left_B)
+                if not number or widths != self._widths_T[number - 1]:
+                    # A new round of some roots: the best actions of those that are left go on.
+                    order_BA = _order(arm_BAC, preference_BA, survives_BA)
+                    best_BA = torch.zeros_like(survives_BA).scatter_(1, order_BA, place_A < width_B.unsqueeze(1))
+                    is_new_B = width_B != (width_TB[number - 1] if number else 0)
+                    survives_BA = torch.where(is_new_B.unsqueeze(1), best_BA, survives_BA)
+                action_BW = _order(arm_BAC, preference_BA, survives_BA)[:, : max(widths)]
+            count_B = (arm_BAC[..., _OPEN] > 0).sum(1).minimum(width_B).minimum(left_B)
             left_B -= count_B
             # A wave goes at most a level deeper than the one before it.
             self._wave(action_BW, count_B, min(self._bottom - 1, number + 1))
         return self.arm_NAC.index_select(0, self.root_B)[..., _Q], self._open_mass()
 
-    def _widths(self) -> Iterator[int]:
-        """How many actions of a root have a simulation in each wave, if so many are open.
+    def _widths(self, count: int) -> list[int]:
+        """How many actions of a root with so many allowed ones have a simulation in each wave, if so many are open.
 
         Each wave uses at least one simulation, so there are as many waves; those at the end may have nothing to do.
         """
-        left = simulations = self._options.simulations - 1 if self._bottom > 1 else 0
+        simulations, widths = self._options.simulations - 1 if self._bottom > 1 else 0, list[int]()
         by_rule = self._options.root == "rule"
-        width, phases = (1, 1) if by_rule else (self.A, max(1, (self.A - 1).bit_length()))
+        width, phases = (1, 1) if by_rule else (count, max(1, (count - 1).bit_length()))
         for _ in range(phases - 1):
-            for _ in range(max(1, simulations // (phases * width))):
-                if left > 0:
-                    yield width
-                left -= 1
+            widths += [width] * max(1, simulations // (phases * width))
             width = max(2, width // 2)
-        for _ in range(left):
-            yield width
+        return [*widths, *([width] * simulations)][:simulations]
 
     def _wave(self, action_BW: Int[Tensor, "B W"], count_B: Int[Tensor, "B"], levels: int) -> None:
         """A simulation by each of the first actions of each root, through at most so many levels."""

@@ -14,7 +14,7 @@ from pgts_torch.options.search import MAX_NODES, MCTS
 from pgts_torch.search.fixed_trees import FixedTrees
 from pgts_torch.search.forest import Forest
 from pgts_torch.search.halving import divide, preference
-from pgts_torch.search.known import KnownStates
+from pgts_torch.search.known import KnownStates, prior_of_allowed
 from pgts_torch.search.lookahead import Leaf, Leaves, Lookahead, check_roots, unexpanded
 from pgts_torch.search.memory import check_memory, check_nodes, tree_nodes
 from pgts_torch.search.split import Rule
@@ -182,8 +182,6 @@ def _fits_arrays(model: EnumeratingModel, roots: int, options: MCTS) -> bool:
     critic values all its states."""
     if model.table is None or options.wave != 1 or options.backup != "max" or options.merges:
         return False
-    if not (model.table.reward_NA > -torch.inf).all():  # roots differ in how often their actions are halved
-        return False
     return model.num_states <= roots * options.simulations * model.num_actions * model.table.num_outcomes
 
 
@@ -198,8 +196,10 @@ def _grow_fixed(
     needed = topology.bytes(0, fixed=2 * S + B * (num_nodes + 2 * A) + 1, places=2 * bottom)
     check_memory(needed, topology.max_bytes, f"the search ({B * num_nodes} nodes, {S} states of {A} actions)")
     state_S = torch.arange(S, device=model.device)
-    prior_SA = leaves.prior(state_S)
-    trees = FixedTrees(table, leaves.v(state_S), prior_SA, bottom, options, num_roots=B, num_nodes=num_nodes)
+    prior_SA = prior_of_allowed(leaves.prior(state_S), table.reward_NA, state_S)
+    legal = (table.reward_NA > -torch.inf).sum(1).unique().tolist()
+    shape = {"num_roots": B, "num_nodes": num_nodes, "legal": legal}
+    trees = FixedTrees(table, leaves.v(state_S), prior_SA, bottom, options, **shape)
     values = trees.search(state_B, preference(prior_SA[state_B].double(), state_B, generator))
     state_N, level_N = trees.expanded().unbind(1)
     topology.table.read(state_N.unique())

@@ -21,6 +21,16 @@ from tests.counting import Counting
 from tests.search.models import all_states, assert_close, some_v
 from tests.support import random_policy
 
+
+def masked(mdp: TabularMDP) -> TabularMDP:
+    """The same, but of each state only 1 to A actions are allowed."""
+    S, A = mdp.outcomes.reward_NA.shape
+    count_S1 = 1 + torch.arange(S)[:, None] % A
+    place_SA = torch.rand(S, A, generator=stream(0, "allowed")).argsort(1).argsort(1)
+    reward_SA = mdp.outcomes.reward_NA.masked_fill(place_SA >= count_S1, -math.inf)
+    return replace(mdp, outcomes=replace(mdp.outcomes, reward_NA=reward_SA))
+
+
 MDPS = {
     "random": random_mdp(40, 4, branching=3, seed=3),
     "one action": random_mdp(20, 1, branching=4, seed=3),
@@ -28,6 +38,8 @@ MDPS = {
     "deep sea": deep_sea(5),
     "ladder": ladder(6),
     "grid": grid(),
+    "five actions, some of them allowed": masked(random_mdp(40, 5, branching=2, seed=4)),
+    "nine actions, some of them allowed": masked(random_mdp(30, 9, branching=1, seed=5)),
 }
 KINDS = {
     "halving": {},
@@ -73,14 +85,15 @@ def test_enough_simulations_give_T_to_the_m_and_fewer_do_not():
     assert (few.q_BA - full.q_BA).abs().max() > 0.1
 
 
-def grown(outcomes: Outcomes, roots: int, seed: int) -> tuple[Counting, Tensor]:
+def grown(outcomes: Outcomes, roots: int, seed: int, legal: list[int] | None = None) -> tuple[Counting, Tensor]:
     """The operations of a whole search with new values, and what it finds."""
     generator, (S, A) = stream(seed, "values"), outcomes.reward_NA.shape
     value_S = torch.randn(S, dtype=torch.float64, generator=generator)
     prior_SA = torch.rand(S, A, dtype=torch.float64, generator=generator) + 0.1
     state_B = torch.randperm(S, generator=generator)[:roots]
     with Counting() as counts:
-        trees = FixedTrees(outcomes, value_S, prior_SA, 4, MCTS(simulations=20), num_roots=roots, num_nodes=20)
+        shape = {"num_roots": roots, "num_nodes": 20, "legal": legal}
+        trees = FixedTrees(outcomes, value_S, prior_SA, 4, MCTS(simulations=20), **shape)
         q_BA, _ = trees.search(state_B, prior_SA[state_B].log())
     return counts, q_BA
 
@@ -97,6 +110,13 @@ def test_operations_depend_neither_on_the_number_of_roots_nor_on_numbers_and_not
         assert counts.reads == Counter()
         assert counts.operations == one[0].operations
     assert not torch.equal(other[1], many[1][:7])
+    # Where some actions are not allowed, whichever they are at these roots.
+    forbidding = [
+        grown(MDPS["nine actions, some of them allowed"].outcomes, roots, seed, [*range(1, 10)])
+        for roots, seed in ((1, 3), (30, 4))
+    ]
+    assert [counts.reads for counts, _ in forbidding] == [Counter()] * 2
+    assert forbidding[0][0].operations == forbidding[1][0].operations
 
 
 def test_searches_in_waves_read_and_so_does_one_that_looks_whether_it_is_over(monkeypatch):
