@@ -191,7 +191,8 @@ class Network(nn.Module):
         one."""
         place, theta_D = self._packed
         if self.weights[0].data_ptr() != place:
-            vector_D = torch.cat([weight.detach().view(-1) for weight in self.weights])
+            with torch.inference_mode(False):  # or it could not be changed outside of that mode
+                vector_D = torch.cat([weight.detach().view(-1) for weight in self.weights])
             pieces = vector_D.split([weight.numel() for weight in self.weights])
             for weight, piece in zip(self.weights, pieces, strict=True):
                 weight.data = piece.view_as(weight)

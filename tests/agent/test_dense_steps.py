@@ -174,6 +174,17 @@ def test_a_policy_acts_as_by_torch_and_compiled_as_its_steps_are(network, monkey
         policy.sample(observation_N, generator=stream(0, "actions"))
 
 
+def test_weights_have_gradients_also_where_a_policy_was_first_asked_in_inference_mode(calls):
+    policy, update = NetworkPolicy(VECTORS, 4, MLP(hidden=[8]), seed=1), UPDATES["gradient"]()
+    update.check(policy)
+    with torch.inference_mode():
+        policy.probs(batch().observation_N)
+    policy.network(batch().observation_N).square().sum().backward()
+    for weight in policy.network.weights:
+        assert weight.grad is not None
+        assert weight.grad.abs().sum() > 0
+
+
 def test_a_trunk_that_two_networks_share_and_copies_of_them_have_the_weights_that_were_last_learned(calls):
     policy = NetworkPolicy(VECTORS, 4, MLP(hidden=[8]), seed=1)
     critic = NetworkCritic(VECTORS, 4, NetworkValues(network="shared"), trunk=policy.network.trunk, seed=1)
