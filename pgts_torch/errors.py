@@ -1,5 +1,8 @@
 """The errors that a caller can cause. Each message names what is wrong, its value and what is required."""
 
+import sys
+import traceback
+import warnings
 from numbers import Integral
 
 LOST = 75
@@ -54,6 +57,15 @@ class Failed(PgtsError):
 class ModelMismatch(PgtsError):
     """A step of the environment is impossible in its model, or more or less frequent than the model says: one of the
     two is wrong, and so may be a lookahead. The policy has not been updated with it."""
+
+
+def warn(text: str) -> None:
+    """Warn the caller: a UserWarning at the line outside of this package, and of torch's decorators, that called it."""
+    called = 1
+    for level, (frame, _) in enumerate(traceback.walk_stack(sys._getframe(1)), start=2):
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in ("pgts_torch", "torch"):
+            called = level
+    warnings.warn(text, stacklevel=called + 1)
 
 
 def text_of(error: BaseException) -> str:

@@ -114,7 +114,7 @@ def test_another_number_than_the_printed_one_is_noticed():
 def test_commands_and_links_of_a_page_exist(page, capsys):
     text = LINKED[page].read_text(encoding="utf-8")
     for block in blocks(text):
-        for line in block.text.splitlines() if block.language == "sh" else ():
+        for line in block.text.replace("\\\n", "").splitlines() if block.language == "sh" else ():
             program, command, *arguments = shlex.split(line)
             if program == "pgts":
                 with contextlib.suppress(SystemExit):

@@ -1,7 +1,6 @@
 """The models that an environment may have: its table, its dynamics in torch, or itself as a simulator."""
 
 import itertools
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from pgts_torch.agent.observations import Observations
 from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
-from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError
+from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError, warn
 from pgts_torch.models.actions import all_actions
 from pgts_torch.models.adapters import known_adapter, not_restored
 from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside
@@ -117,10 +116,9 @@ def table_world(request: Request) -> TabularWorld | None:
     mdp, starts_known = table_of(request.fresh(), gamma=request.gamma, generator=request.random)
     check_single(request.action_repeat, "in a table")
     if not starts_known:
-        warnings.warn(
+        warn(
             f"{request.name} has a table P and no initial_state_distrib: its start distribution is estimated from up "
-            "to 1,000 resets",
-            stacklevel=4,
+            "to 1,000 resets"
         )
     masks = "off" if mdp.outcomes.legal_NA.all() else request.masks
     return TabularWorld(request.env, mdp, starts_known=starts_known, masks=masks, device=request.device)
@@ -186,10 +184,9 @@ def simulator_world(request: Request, *, reasons: Sequence[str], layered: bool) 
         if known is None or layered:
             what = "has wrappers that are part of the model: their" if layered else "has no get_state: its"
             size, other = len(setup.snapshot(setup.fresh()).key), f" ({'; '.join(reasons)})" if reasons else ""
-            warnings.warn(
+            warn(
                 f"{request.name} {what} attributes are pickled, {size} bytes and {1e6 * seconds:.0f} us a call; "
-                f"get_state and set_state of its own could take less{other}",
-                stacklevel=5,
+                f"get_state and set_state of its own could take less{other}"
             )
     except PgtsError as error:
         if known is None:

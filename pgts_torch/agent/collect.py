@@ -1,6 +1,5 @@
 """Episodes of a policy in the environments of a world, each from a reset."""
 
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,7 +13,7 @@ from pgts_torch.agent.episodes import Episodes
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.rollout import COLUMNS, Rollout
 from pgts_torch.agent.world import ModelWorld, World
-from pgts_torch.errors import PgtsError
+from pgts_torch.errors import PgtsError, warn
 from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.rollouts import FixedHorizon, GeometricHorizon, Horizon
 from pgts_torch.seeding import SharedGenerators, seed_sequence
@@ -81,10 +80,9 @@ def shared_generators(world: World, seed: int, names: tuple[str | int, ...]) -> 
         yield
     if shared.used and not world.warned:
         world.warned = True
-        warnings.warn(
+        warn(
             f"{env_name(world.env)} uses the generator of {shared.used[0]}, which the whole process shares: it is "
-            "seeded for each iteration and restored afterwards; better use self.np_random",
-            stacklevel=4,
+            "seeded for each iteration and restored afterwards; better use self.np_random"
         )
 
 

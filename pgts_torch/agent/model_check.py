@@ -1,7 +1,6 @@
 """Checks the steps of an environment against the model that a lookahead queries."""
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import Any, Literal, final, get_args
 
@@ -12,7 +11,7 @@ from pgts_torch.agent.frequencies import MARGINS, Frequencies
 from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.world import World
 from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
-from pgts_torch.errors import ModelMismatch, PgtsError
+from pgts_torch.errors import ModelMismatch, PgtsError, warn
 from pgts_torch.models.adapters import methods_for
 from pgts_torch.models.adapters_generic import PickledAttributes
 from pgts_torch.models.exact_model import CONTRADICTED, RANDOM, ExactModel, Happened
@@ -223,7 +222,7 @@ class ModelCheck:
         if kind not in self._warned:
             self._warned.append(kind)
             if self._ranks.leads:
-                warnings.warn(text, stacklevel=4)
+                warn(text)
 
     @property
     def _name(self) -> str:

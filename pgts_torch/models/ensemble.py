@@ -2,7 +2,6 @@
 
 import copy
 import math
-import warnings
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -10,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor, nn
 
-from pgts_torch.errors import NotFinite, PgtsError, check_count
+from pgts_torch.errors import NotFinite, PgtsError, check_count, warn
 from pgts_torch.models.base import Experience, FallibleModel, Transitions
 from pgts_torch.models.ensemble_networks import EnsembleNetworks
 from pgts_torch.models.fitted import SELDOM, FittedModel
@@ -244,11 +243,10 @@ class EnsembleModel(FittedModel, FallibleModel):
         errors = prediction_errors(self.replay, held_out, self.step, self._deviations, ranks)
         if errors.get("unexplained", 0.0) > _UNEXPLAINED and len(self.replay) >= _ENOUGH_STEPS and not self._warned:
             self._warned = True
-            warnings.warn(
+            warn(
                 f"after {self.replay.num_added:,} steps {errors['unexplained']:.0%} of what changes in an observation "
                 "is not predicted from the one before: the observation may not be the state (give it what is missing, "
-                "as speeds or earlier observations), or chance decides what follows",
-                stacklevel=2,
+                "as speeds or earlier observations), or chance decides what follows"
             )
         return errors
 

@@ -1,7 +1,6 @@
 """The environment that a user gives, understood once: `EnvSource` makes others of its kind, whatever it is."""
 
 import copy
-import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
 from pgts_torch.envs.cart_poles import CartPoles, is_cart_pole
-from pgts_torch.errors import PgtsError, check_count, failure
+from pgts_torch.errors import PgtsError, check_count, failure, warn
 from pgts_torch.models.actions import Numbered, is_numbered, numbered
 from pgts_torch.models.attributes import Unlike, own_to_each, unlike
 from pgts_torch.models.ids import Maker, import_modules, maker_named, making, registered, spec_of
@@ -261,7 +260,7 @@ def close_environments(env: VectorEnv) -> None:
         try:
             one.close()
         except BaseException as error:
-            warnings.warn(str(failure(f"{env_name(env)} failed in close", error)), stacklevel=2)
+            warn(str(failure(f"{env_name(env)} failed in close", error)))
     env.closed = True
 
 
