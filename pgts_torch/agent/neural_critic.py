@@ -1,6 +1,7 @@
 """Critics that are networks."""
 
 import copy
+import math
 from typing import Any, final
 
 import torch
@@ -44,6 +45,13 @@ class NetworkCritic(Critic):
     first fit targets are bootstrapped with 0, unless v was queried before. So rewards times 2^k give values times 2^k,
     bit for bit.
 
+    Values are in the range that all rewards and discounts of the fits so far allow,
+
+        min(0, least r) / (1 - largest gamma)  to  max(0, greatest r) / (1 - largest gamma)
+
+    because outside it they can only be errors, which feed on themselves where targets are bootstrapped in states that
+    are none of the visits, as after imagined episodes that were cut off where the model knows too little.
+
     Args:
         observation_space, num_actions: of the environment.
         trunk: the trunk of a policy, which is then shared, in place of `options.network`. Both train it; its running
@@ -83,6 +91,9 @@ class NetworkCritic(Critic):
         self._queried: tuple[Rollout, tuple[Tensor, Tensor]] | None = None
         self._mean, self._scale = (torch.tensor(x, dtype=torch.float64, device=device) for x in (0.0, 1.0))
         self._num_fits = 0
+        # The least reward, minus the greatest one and minus the largest discount; infinite before any was seen.
+        self._seen_3 = torch.full((3,), math.inf, dtype=torch.float64, device=device)
+        self._low, self._high = (torch.tensor(x, dtype=torch.float64, device=device) for x in (-math.inf, math.inf))
 
     def fit(self, policy: Policy, rollout: Rollout, *, generator: torch.Generator) -> dict[str, float]:
         """Fit the network to the targets of all visits.
@@ -99,7 +110,7 @@ class NetworkCritic(Critic):
         self._policy = policy
         self._optimiser.learning_rate = value_at(self._rate, self.num_env_steps)
         num_fits, tensors = self._num_fits, [*self.network.tensors, self._mean, self._scale]
-        tensors += self._target_network.tensors if self._lags else []
+        tensors += [self._seen_3, self._low, self._high, *(self._target_network.tensors if self._lags else [])]
         try:
             with self._optimiser.attempt(tensors) as readings:
                 v_TB, target_V = self._targets(rollout, readings)
@@ -107,6 +118,7 @@ class NetworkCritic(Critic):
                 error, unexplained = mean_and_variance("errors", error_V, rollout.ranks)
                 readings.add(value=error_V.square().mean() if rollout.ranks.size == 1 else error**2 + unexplained)
                 readings.add(spread=mean_and_variance("targets", target_V, rollout.ranks)[1], unexplained=unexplained)
+                self._see(rollout)
                 self._fit_all(rollout, target_V, generator, readings)
         except PgtsError:
             self._num_fits = num_fits
@@ -117,6 +129,21 @@ class NetworkCritic(Critic):
             "explained_variance": 1 - found["unexplained"] / found["spread"] if found["spread"] else 0.0,
             "value_grad_norm": found["value_grad_norm"],
         }
+
+    def _see(self, rollout: Rollout) -> None:
+        """Widen the range of values to what these rewards and discounts allow, and 0 after an end."""
+        columns = rollout.reward_TB, -rollout.reward_TB, -rollout.discount_TB
+        least = [torch.cat([x, x.new_zeros(1)]).amin() for x in map(rollout.of_visits, columns)]
+        seen_3 = rollout.ranks.least("rewards and discounts", torch.stack(least).to(self._seen_3))
+        self._keep_within(torch.minimum(self._seen_3, seen_3))
+
+    def _keep_within(self, seen_3: Float[Tensor, "3"]) -> None:
+        """Take these as seen, and the range of values that follows: `value_range`."""
+        self._seen_3.copy_(seen_3)
+        size_2 = -seen_3[:2].clamp(max=0)  # how far below and above 0 a reward can be
+        reach_2 = torch.where(size_2 > 0, size_2 / (1 + seen_3[2]), 0.0)
+        self._low.copy_(-reach_2[0])
+        self._high.copy_(reach_2[1])
 
     def _before_fit(self, rollout: Rollout, v_TB: Float[Tensor, "T B"]) -> Float[Tensor, "V"]:
         """The values of the visits that the fit changes; v_TB are those of the target network."""
@@ -210,13 +237,14 @@ class NetworkCritic(Critic):
             "scale": float(self._scale),
             "num_fits": self._num_fits,
         }
+        if self._seen_3.isfinite().all():
+            state["seen"] = self._seen_3.tolist()
         return state | ({"target_network": self._target_network.plain_state()} if self._lags else {})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         lagging = {"target_network"} if self._lags else set()
-        check_keys(
-            "the state of a network critic", state, {"network", "optimiser", "mean", "scale", "num_fits", *lagging}
-        )
+        names = {"network", "optimiser", "mean", "scale", "num_fits", *lagging}
+        check_keys("the state of a network critic", state, names, others={"seen"})
         if not isinstance(state["mean"], float):
             raise PgtsError(f"mean is {state['mean']!r}; it must be a number")
         if not (isinstance(state["scale"], float) and state["scale"] >= 0):
@@ -230,11 +258,14 @@ class NetworkCritic(Critic):
         self._queried, self._num_fits = None, state["num_fits"]
         self._mean.fill_(state["mean"])
         self._scale.fill_(state["scale"])
+        if "seen" in state:
+            self._keep_within(torch.tensor(state["seen"], dtype=torch.float64))
 
     def _values(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N D"]:
         """The network's outputs in reward units."""
         outputs_ND = network.outputs(observation_N)
-        return self._mean + self._scale * outputs_ND if self.options.normalize_returns else outputs_ND
+        values_ND = self._mean + self._scale * outputs_ND if self.options.normalize_returns else outputs_ND
+        return values_ND.clamp(self._low, self._high)
 
     def _v(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N"]:
         if self.target == "v":

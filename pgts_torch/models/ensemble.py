@@ -72,7 +72,7 @@ class EnsembleModel(FittedModel, FallibleModel):
         )
         self.options = options
         self._warned, self._end_share = False, 0.0
-        self._reward_limits: tuple[float, float] | None = None  # where others have seen rewards as well
+        self._reward_limits: tuple[float, float] | None = None
         self._networks = EnsembleNetworks(
             state_size,
             num_actions,
@@ -137,9 +137,8 @@ class EnsembleModel(FittedModel, FallibleModel):
         state_ND, next_ND, reward_N = (self.replay.rows(name) for name in ("state", "next_state", "reward"))
         seen = {"state": state_ND, "change": next_ND - state_ND, "reward": reward_N[:, None]}
         self._networks.measure(seen, ranks, rescale=self.generation > 0)  # before nothing is predicted
-        if ranks.size > 1:
-            limits = ranks.least("limits of rewards", torch.stack([reward_N.min(), -reward_N.max()]))
-            self._reward_limits = float(limits[0]), -float(limits[1])
+        limits = ranks.least("limits of rewards", torch.stack([reward_N.min(), -reward_N.max()]))
+        self._reward_limits = float(limits[0]), -float(limits[1])
 
     def _fit(
         self,
@@ -207,11 +206,13 @@ class EnsembleModel(FittedModel, FallibleModel):
     def step(
         self, state_ND: Float[Tensor, "N D"], action_N: Num[Tensor, "N ..."]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
-        """The means over members; the discount is gamma (1 - p)."""
+        """The means over members, rewards within those seen; the discount is gamma (1 - p)."""
         return self._means(self.members(state_ND, action_N))
 
     def _means(self, said: Prediction) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N D"]]:
-        return said.reward_EN.mean(0).double(), self.gamma * (1 - said.end_EN.mean(0).double()), said.next_END.mean(0)
+        low, high = self._reward_limits or (-math.inf, math.inf)
+        reward_N = said.reward_EN.mean(0).double().clamp(low, high)
+        return reward_N, self.gamma * (1 - said.end_EN.mean(0).double()), said.next_END.mean(0)
 
     def sample(
         self, state_N: Int[Tensor, "N"], action_N: Num[Tensor, "N ..."], *, key_N: Int[Tensor, "N"]

@@ -16,6 +16,7 @@ from pgts_torch.agent.neural import NetworkPolicy
 from pgts_torch.agent.neural_critic import NetworkCritic
 from pgts_torch.agent.neural_updates import GradientUpdate
 from pgts_torch.agent.policies import SimplexPolicy
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.errors import PgtsError
 from pgts_torch.options import CNN, MLP, FixedHorizon, NetworkValues, OwnModule, TDLambda
 from pgts_torch.seeding import stream
@@ -171,6 +172,56 @@ def test_a_new_scale_of_the_targets_leaves_learned_values_where_they_were(option
     assert critic.state_dict()["scale"] > 100 * learned.state_dict()["scale"]
     torch.testing.assert_close(critic.v(POINTS_SD), learned.v(POINTS_SD), rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(lagging(critic).v(POINTS_SD), lagging(learned).v(POINTS_SD), rtol=1e-3, atol=1e-3)
+
+
+def w_to_2w(reward: float = 1.0, ends: bool = False) -> Rollout:
+    """64 episodes of one step, each from the state 1 to the state 2, where no episode begins (Tsitsiklis and Van Roy
+    1996): a linear value of 2 is twice that of 1."""
+    ones_TB = torch.ones(1, 64, dtype=torch.float64)
+    observation_UB = torch.tensor([1.0, 2.0])[:, None].expand(2, 64)[..., None]
+    discount_TB = torch.zeros_like(ones_TB) if ends else 0.9 * ones_TB
+    return Rollout(
+        observation_UB,
+        ones_TB.long(),
+        reward * ones_TB,
+        discount_TB,
+        ones_TB.bool(),
+        ones_TB,
+        torch.zeros_like(ones_TB),
+    )
+
+
+LINE = spaces.Box(-math.inf, math.inf, (1,))
+FAR_N1 = torch.tensor([[1e9], [-1e9]])
+
+
+@pytest.mark.parametrize("target", ["v", "q"])
+@pytest.mark.parametrize(("reward", "values"), [(1.0, (0.0, 10.0)), (-3.0, (-30.0, 0.0))])
+def test_values_in_states_without_visits_do_not_feed_on_themselves(target, reward, values):
+    options = {"network": MLP(hidden=()), "normalize_returns": False, "learning_rate": 0.3, "target": target}
+    critic, policy = NetworkCritic(LINE, 2, NetworkValues(**options)), NetworkPolicy(LINE, 2)
+    policy.load_state_dict(
+        {name: torch.zeros_like(x) for name, x in policy.state_dict().items()}
+        | {"head.bias": torch.tensor([-99.0, 99.0])}
+    )
+    for k in range(60):
+        critic.fit(policy, w_to_2w(reward), generator=stream(k, "critic"))
+    assert float(critic.v(torch.ones(1, 1))) == pytest.approx(10 * reward, rel=0.02)
+    assert sorted(critic.v(FAR_N1).tolist()) == pytest.approx(values)
+    assert critic.network.outputs(FAR_N1).abs().min() > 1e6  # what the network itself says far away
+    other = NetworkCritic(LINE, 2, NetworkValues(**options), seed=1)
+    other.load_state_dict(critic.state_dict())
+    if target == "v":
+        assert torch.equal(other.v(FAR_N1), critic.v(FAR_N1))
+
+
+def test_the_range_of_values_is_that_of_all_rewards_and_discounts_so_far():
+    critic, policy = NetworkCritic(LINE, 2, NetworkValues(network=MLP(hidden=()))), NetworkPolicy(LINE, 2)
+    assert critic.v(FAR_N1).abs().min() > 1e6  # before the first fit nothing is known
+    critic.fit(policy, w_to_2w(5.0, ends=True), generator=stream(0, "critic"))
+    assert sorted(critic.v(FAR_N1).tolist()) == pytest.approx([0.0, 5.0])
+    critic.fit(policy, w_to_2w(-1.0), generator=stream(0, "critic"))
+    assert sorted(critic.v(FAR_N1).tolist()) == pytest.approx([-10.0, 50.0])
 
 
 @pytest.mark.parametrize(("polyak", "target_period"), [(0.25, 1), (1.0, 2), (0.25, 3)])
