@@ -4,7 +4,7 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, final
@@ -53,12 +53,6 @@ def hyperparameters(parts: Parts, *, env_kwargs: Mapping[str, Any] | None, seed:
     as `PGTS` calls them. Options of a part are dotted, as in "update.step_size"."""
     made = {"env": parts.source.name, "env_kwargs": env_kwargs or {}, "gamma": parts.world.gamma, "seed": seed}
     return {name: _scalar(value) for name, value in _flat(made | shortest(parts.options))}
-
-
-def tags_of_results(parts: Parts) -> tuple[str, ...]:
-    """The tags of what stands beside the hyper-parameters of any training."""
-    found = ("charts/episodic_return", "final/env_steps", "final/model_calls", "final/seconds")
-    return found if parts.world.mdp is None else (*found, "final/J", "final/optimality_gap")
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -126,14 +120,16 @@ class Events:
         with files.named(f"{self._folder / 'events'} cannot be written to"):
             yield
 
-    def begin(self, options: Mapping[str, float | str], text: str, *, results: Sequence[str]) -> None:
-        """Write the hyper-parameters, the tags of the results that stand beside them, and the configuration as text."""
+    def begin(self, options: Mapping[str, float | str], text: str) -> None:
+        """Write the hyper-parameters, and the configuration as text.
+
+        TensorBoard shows all scalars beside hyper-parameters, and those of all runs. A list of our own of what to show
+        would hide options that the first run of a folder does not have.
+        """
         from torch.utils.tensorboard.summary import hparams
 
-        experiment, start, _ = hparams(dict(options), dict.fromkeys(results, 0.0))
         with self._writing():
-            for summary in (experiment, start):
-                self._writer._get_file_writer().add_summary(summary)
+            self._writer._get_file_writer().add_summary(hparams(dict(options), {})[1])
             self._writer.add_text("configuration", f"```\n{text.strip()}\n```", 0)
 
     def scalars(self, step: int, tags: Mapping[str, float | None]) -> None:
@@ -240,7 +236,7 @@ class Board:
             path = _folder(folder, begins=counters.env_steps == 0)
             events = Events(path, after_step=counters.env_steps or None)
             if events.is_new:
-                events.begin(options, text, results=tags_of_results(parts))
+                events.begin(options, text)
             return events
 
         self._events = ranks.together("the folder of TensorBoard", opened)

@@ -105,7 +105,13 @@ class Trained(ABC):
 
     @overload
     def predict(
-        self, observation: ArrayLike, *, state: Any, episode_start: ArrayLike, deterministic: bool = True
+        self,
+        observation: ArrayLike,
+        *,
+        state: Any,
+        episode_start: ArrayLike,
+        deterministic: bool = True,
+        action_masks: ArrayLike | None = None,
     ) -> tuple[np.ndarray | np.generic, Any]: ...
 
     def predict(
@@ -117,6 +123,7 @@ class Trained(ABC):
         generator: torch.Generator | None = None,
         state: Any = None,
         episode_start: ArrayLike | None = None,
+        action_masks: ArrayLike | None = None,
     ) -> Any:
         """Return actions for observations, in the form of the environment; without search.
 
@@ -126,13 +133,16 @@ class Trained(ABC):
                 array of observations. It is needed where the environment has action masks.
             deterministic: take the most probable action, of a gaussian policy the mean; else sample from pi.
             generator: for sampling; default: one with this model's seed, which continues from call to call.
-            state, episode_start: given by `evaluate_policy` of stable-baselines3. With episode_start the pair (actions,
-                state) is returned, as by its models; neither changes the actions.
+            state, episode_start, action_masks: given by `evaluate_policy` of stable-baselines3 and sb3-contrib. With
+                episode_start the pair (actions, state) is returned, as by their models; the masks are as `action_mask`.
 
         Raises:
             PgtsError: an observation or a mask is none of the environment, or the mask is missing, or of no use.
         """
         generator = generator or self._generator
+        if action_masks is not None and action_mask is not None:
+            raise PgtsError("action_mask and action_masks are the same: give one of them")
+        action_mask = action_masks if action_mask is None else action_mask
         actions = self._act(self.policy, observation, action_mask, deterministic=deterministic, generator=generator)
         return actions if episode_start is None else (actions, state)
 

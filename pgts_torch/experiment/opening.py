@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pgts_torch import files
-from pgts_torch.agent.board import hyperparameters, tags_of_results
+from pgts_torch.agent.board import hyperparameters
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.config import Config, dump, load
 from pgts_torch.errors import PgtsError
@@ -140,7 +140,6 @@ def opened(config: Config, lock: RunLock, start: Start | None, algorithm: PGTS) 
         folder.events.begin(
             hyperparameters(algorithm.parts, env_kwargs=config.env.kwargs, seed=algorithm.seed),
             text.decode(),
-            results=(*tags_of_results(algorithm.parts), "final/deterministic_return", "final/sampled_return"),
         )
     folder.json(VERSIONS_FILE, versions() | {"threads": config.threads})
     return folder

@@ -370,3 +370,34 @@ def test_masks_in_info_are_said_once(capsys):
     assert capsys.readouterr().err.count("masked by info['action_mask']; action_masks 'off' ignores it") == 1
     PGTS(ByMethod, **(SHORT | SAMPLED))
     assert capsys.readouterr().err == ""
+
+
+def test_masks_are_taken_by_the_name_that_sb3_contrib_gives_them():
+    model = trained(**SAMPLED)
+    own, other = np.arange(5), LEGAL_SA.astype(bool)
+    actions, state = model.predict(own, state=None, episode_start=np.ones(5, bool), action_masks=other)
+    assert state is None
+    assert np.array_equal(actions, model.predict(own, action_mask=other))
+    with pytest.raises(PgtsError, match="action_mask and action_masks are the same: give one of them"):
+        model.predict(own, action_mask=other, action_masks=other)
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_policies_with_masks_are_evaluated_by_sb3_contrib_as_its_own_are(vector):
+    evaluation = pytest.importorskip("sb3_contrib.common.maskable.evaluation")
+    monitor = pytest.importorskip("stable_baselines3.common.monitor")
+    model = trained(lambda: ByMethod(vector=vector), **SAMPLED)
+    env, other = (TimeLimit(ByMethod(vector=vector), 20) for _ in range(2))
+    env.reset(seed=3)  # the generators go on from here, when they are reset without a seed
+    other.reset(seed=3)
+    found = evaluation.evaluate_policy(model, monitor.Monitor(env), n_eval_episodes=5, return_episode_rewards=True)
+    returns = []
+    for _ in range(5):
+        total, over = 0.0, False
+        observation, _ = other.reset()
+        while not over:
+            action = model.predict(observation, action_mask=other.unwrapped.action_masks())
+            observation, reward, terminated, truncated, _ = other.step(action)
+            total, over = total + reward, terminated or truncated
+        returns.append(total)
+    np.testing.assert_allclose(found[0], returns, rtol=1e-5)

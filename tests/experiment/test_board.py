@@ -60,9 +60,21 @@ def hyperparameters(folder: Path) -> dict[str, Any]:
     return {name: getattr(field, field.WhichOneof("kind")) for name, field in fields.items()}
 
 
-def results_beside(folder: Path) -> list[str]:
-    raw = events_in(folder).summary_metadata["_hparams_/experiment"].plugin_data.content
-    return [each.name.tag for each in HParamsPluginData.FromString(raw).experiment.metric_infos]
+def shown_beside(logdir: Path) -> tuple[dict[str, bool], set[str]]:
+    """The columns of TensorBoard's table of runs, as its server finds them: hyper-parameters, and whether they differ
+    between runs; and the numbers that can stand beside them."""
+    from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
+    from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
+    from tensorboard.context import RequestContext
+    from tensorboard.plugins.base_plugin import TBContext
+    from tensorboard.plugins.hparams.backend_context import Context
+
+    read = EventMultiplexer().AddRunsFromDirectory(str(logdir)).Reload()
+    context = Context(TBContext(data_provider=MultiplexerDataProvider(read, str(logdir))))
+    found = context.experiment_from_metadata(
+        RequestContext(), "", True, context.hparams_metadata(RequestContext(), ""), []
+    )
+    return {each.name: each.differs for each in found.hparam_infos}, {each.name.tag for each in found.metric_infos}
 
 
 def text(folder: Path) -> str:
@@ -106,8 +118,18 @@ def test_hyper_parameters_are_what_differs_from_the_defaults_with_the_results_of
     assert last["final/deterministic_return"][1] == pytest.approx(summary.deterministic.episodic_return.mean)
     assert last["final/model_calls"][1] == summary.model_calls
     tags = events_in(by_command).Tags()["scalars"]
-    assert set(results_beside(by_command)) < set(tags)
-    assert "final/seconds" in results_beside(by_command)
+    assert shown_beside(by_command.parent) == (dict.fromkeys(found, False), set(tags))
+
+
+@pytest.mark.filterwarnings("ignore:html5lib")
+def test_options_that_only_one_of_several_runs_names_have_a_column_and_what_differs_comes_first(by_command, tmp_path):
+    shutil.copytree(by_command, tmp_path / "logs/second")
+    PGTS("pgts/Ladder-v0", **SMALL, seed=1).learn(60, tensorboard=tmp_path / "logs/first")
+    columns, numbers = shown_beside(tmp_path / "logs")
+    assert next(iter(columns)) == "seed"
+    assert [name for name, differs in columns.items() if differs] == ["seed"]
+    assert columns.keys() == hyperparameters(by_command).keys() > hyperparameters(tmp_path / "logs/first").keys()
+    assert {"final/J", "final/optimality_gap", "final/model_calls", "charts/episodic_return"} < numbers
 
 
 @pytest.mark.filterwarnings("ignore:html5lib")
@@ -154,7 +176,6 @@ def test_without_a_lookahead_there_are_no_histograms(tmp_path):
     tags = events_in(tmp_path / "tb").Tags()
     assert tags["histograms"] == tags["images"] == []
     assert "final/J" not in tags["scalars"]
-    assert results_beside(tmp_path / "tb")[0] == "charts/episodic_return"
 
 
 @pytest.mark.parametrize("logs", [1, 2])
