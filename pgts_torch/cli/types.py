@@ -10,7 +10,7 @@ from typing import Any
 
 from pgts_torch import files
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.ownership import is_earlier
+from pgts_torch.experiment.ownership import MARK_FILE, is_earlier
 from pgts_torch.options.fields import INT64_MAX
 
 
@@ -127,12 +127,14 @@ def film_path(text: str) -> Path:
 
 
 def run_folder(text: str) -> Path:
-    """An argparse type: a folder that has the config.yaml of a run."""
+    """An argparse type: a folder that has the mark of a run and its config.yaml."""
     path = Path(text)
     if path_kind(text) != "folder":
         raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
     if not (path / "config.yaml").is_file():
         raise argparse.ArgumentTypeError(f"{text!r} is not the folder of a run: it has no config.yaml")
+    if not (path / MARK_FILE).is_file() and not is_earlier(path):
+        raise argparse.ArgumentTypeError(f"{text!r} is not the folder of a run: it has no {MARK_FILE}")
     if is_earlier(path):
         raise argparse.ArgumentTypeError(
             f"{text!r} is the folder of a run of version 0.1: read it with that, or train again"

@@ -142,6 +142,22 @@ def test_train_passes_on_the_file_with_its_overrides(
     assert capsys.readouterr() == ("mean: 0.5\n", "")
 
 
+@pytest.mark.parametrize("command", ["evaluate", "report", "watch", "export"])
+def test_a_configuration_of_the_user_makes_no_run_of_a_folder(
+    here: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    (here / "config.yaml").write_text("name: mine\n")
+    assert main([command, "."]) == 2
+    mistake = f"argument RUN_DIR: '.' is not the folder of a run: it has no .pgts_run (see pgts {command} --help)"
+    assert capsys.readouterr() == ("", f"error: {mistake}\n")
+    assert [path.name for path in here.iterdir()] == ["config.yaml"]
+
+
+def test_train_with_an_environment_says_nothing_of_defaults(run: FakeRun, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--env.id", "CartPole-v1"]) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_train_without_a_file_says_that_the_defaults_apply(run: FakeRun, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "--json"]) == 0
     assert run.calls == [Config()]
@@ -166,6 +182,7 @@ def test_evaluate_passes_on_its_arguments_and_prints_for_people_or_programs(
     fake = FakeEvaluation()
     monkeypatch.setitem(sys.modules, "pgts_torch.experiment.evaluate", fake)
     (here / "config.yaml").write_text(dump(Config()))
+    (here / ".pgts_run").write_text("{}")
     assert main(["evaluate", ".", "--episodes", "7", "--seed", "3", "--checkpoint", "40"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "sampled.mean              0.25",

@@ -389,6 +389,8 @@ MISTAKES = {
     "--option search.depth=1,2 --trials 0": "--trials: '0'",
     "--option search.depth=1,2 --prune 2": "--prune: '2' is not a number in [0, 1]",
     "--option search.depth=1,2 --env.id CartPole-v1 --policy softmax": "the policy 'softmax' is a table",
+    "--option search.depth=1,2 --storage nowhere/x.db": "error: --storage nowhere/x.db: nowhere is not a folder",
+    "--option search.depth=1,2 --config none.yaml": "error: none.yaml: the configuration cannot be read: No such file",
     "--option search.depth=1,2 --env.id CartPole-v1 --metric exact/J": "the exact return is not known in CartPole-v1",
 }
 

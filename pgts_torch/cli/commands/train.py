@@ -63,7 +63,8 @@ def train(arguments: Arguments) -> None:
         own = Parser(train, add_help=False)
         _add_launch(own)
         raise SystemExit(launch(own.parse_known_args(arguments)[1], **processes))
-    if fixed.config is None and fixed.resume is None and rank() == 0:
+    is_named = fixed.config or fixed.resume or any(override.startswith("--env") for override in overrides)
+    if not is_named and rank() == 0:
         print(f"no --config: starting from the defaults ({config.env.id})", file=sys.stderr)
     from pgts_torch.experiment import run
     from pgts_torch.experiment.summary import describe

@@ -158,9 +158,9 @@ def plan(
             try:
                 made.config(first | {each.key: end})
             except ConfigError as error:
-                raise PgtsError(
-                    "\n".join(f"--option {each.key}={each.spec}: {line}" for line in error.mistakes)
-                ) from None
+                where = f"--option {each.key}={each.spec}: "  # mistakes in a file name it themselves
+                in_file = path is not None and all(line.startswith(f"{path}:") for line in error.mistakes)
+                raise PgtsError("\n".join(f"{'' if in_file else where}{line}" for line in error.mistakes)) from None
     base = made.base
     if base.eval.every is None:
         every = max(1, base.total_steps // _EVALUATIONS)

@@ -97,6 +97,9 @@ def check(plan: Plan, storage: Path) -> None:
     found = files.kind(storage, follow=True)
     if found not in (None, "file"):
         raise PgtsError(f"--storage {storage} is a {found}; it must be a file, or not exist")
+    parent = storage.parent
+    if parent != plan.out and files.kind(parent, follow=True) != "folder":
+        raise PgtsError(f"--storage {storage}: {parent} is not a folder")
     with _refused(storage):
         tables = sqlalchemy.inspect(sqlalchemy.create_engine(_url(storage))).get_table_names() if found else []
     if tables and "trials" not in tables:
