@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from pgts_torch.agent.optimisers import BETAS
 from pgts_torch.compiled import allocating, jit
 
 VALUES, CLIPPED, FREE, TARGETS = range(4)
@@ -235,7 +236,7 @@ def descend(theta_D, gradient_D, first_D, second_D, longest, epsilon, rate):  # 
     epsilon, rate = np.float32(epsilon), np.float32(rate)
     for d in range(len(theta_D)):
         gradient = gradient_D[d] * scale
-        first_D[d] += np.float32(0.1) * (gradient - first_D[d])
-        second_D[d] = second_D[d] * np.float32(0.999) + np.float32(0.001) * gradient * gradient
+        first_D[d] += np.float32(1 - BETAS[0]) * (gradient - first_D[d])
+        second_D[d] = second_D[d] * np.float32(BETAS[1]) + np.float32(1 - BETAS[1]) * gradient * gradient
         theta_D[d] += first_D[d] / (np.sqrt(second_D[d]) + epsilon) * rate
     return norm, _square(theta_D)

@@ -16,7 +16,7 @@ from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.ranks import Share
 from pgts_torch.readings import Readings
 
-_BETAS = 0.9, 0.999
+BETAS = 0.9, 0.999
 _EPSILON = 1e-8
 
 _SHORT, _MANY = 2**15, 200
@@ -37,7 +37,6 @@ class Optimiser:
     Args:
         learning_rate: above 0.
         max_grad_norm: gradients longer than this are shortened to it; None: never.
-        method: "adam" or "sgd".
     """
 
     def __init__(
@@ -131,8 +130,8 @@ class Optimiser:
         if self.method == "sgd":
             return torch.mul(gradient_D, -self.learning_rate, out=self._step_D).sum()
         first_D, second_D = self._moments(gradient_D)
-        first_D.lerp_(gradient_D, 1 - _BETAS[0])
-        second_D.mul_(_BETAS[1]).addcmul_(gradient_D, gradient_D, value=1 - _BETAS[1])
+        first_D.lerp_(gradient_D, 1 - BETAS[0])
+        second_D.mul_(BETAS[1]).addcmul_(gradient_D, gradient_D, value=1 - BETAS[1])
         epsilon, rate = self._corrected()
         return torch.div(first_D, second_D.sqrt().add_(epsilon), out=self._step_D).mul_(rate).sum()
 
@@ -142,7 +141,7 @@ class Optimiser:
 
         first_D, second_D, longest, epsilon, rate = self.next_step(gradient_D)
         first, second, total = first_D.numpy(), second_D.numpy(), torch.empty_like(norm)
-        rates = 1 - _BETAS[0], _BETAS[1], 1 - _BETAS[1]
+        rates = 1 - BETAS[0], BETAS[1], 1 - BETAS[1]
         step_kernels.move_moments(gradient_D.numpy(), norm.numpy(), longest, first, second, *rates)
         torch.sqrt(second_D, out=self._step_D)
         step_kernels.steps(first, self._step_D.numpy(), epsilon, rate, total.numpy())
@@ -156,7 +155,7 @@ class Optimiser:
 
     def _corrected(self) -> tuple[float, float]:
         """e and c for which c m / (sqrt(v) + e) is the step: the corrections of moments, taken out of the vectors."""
-        mean_correction, square_correction = (1 - beta**self.num_steps for beta in _BETAS)
+        mean_correction, square_correction = (1 - beta**self.num_steps for beta in BETAS)
         root = math.sqrt(square_correction)
         return _EPSILON * root, -self.learning_rate * root / mean_correction
 
