@@ -22,7 +22,6 @@ class Acting:
     """Takes actions by a policy.
 
     Args:
-        world: what observations are.
         source: the environment, whose form actions have.
     """
 

@@ -19,7 +19,6 @@ def lambda_returns(
     """G_t = r_t + gamma_t ((1 - lambda) V(s_{t+1}) + lambda G_{t+1}), with G_{t+1} = V(s_{t+1}) at the last step.
 
     Args:
-        rollout: B episodes.
         next_v_TB: V(s_{t+1}).
         discount_TB: gamma_t; 0 after a terminated step, so that nothing is bootstrapped there.
         lambda_: in [0, 1]; 1 gives Monte-Carlo returns.

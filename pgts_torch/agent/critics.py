@@ -127,7 +127,6 @@ class TabularCritic(Critic):
     Cells that were never visited have the mean value of the iteration's visits, or a given one.
 
     Args:
-        num_states, num_actions: the shape of the table.
         options: with `step_size` "mean" alpha is the number of new visits divided by that of all visits so far, so that
             the estimate is the mean of all targets; this suits a policy that is not updated. With `initial` "mean"
             cells that were never visited have the value w for which the mean of the iteration's targets is w, where
@@ -233,7 +232,6 @@ class RolloutCritic(Critic):
     Nothing is learned: each query samples new episodes.
 
     Args:
-        model: samples outcomes.
         options: both v and Q can be queried, whatever the target. With a fixed horizon returns end at the horizon.
     """
 

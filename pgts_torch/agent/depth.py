@@ -47,7 +47,6 @@ class DepthChoice:
     with the upper bound v_hat >= v* of the certificate, or until the certificate is at most `stop_at`.
 
     Args:
-        look: the lookahead.
         certificates: upper bounds from the outcomes that it has queried.
         depths: the depths that are tried, in this order; a single one if it is fixed.
         tolerance: the fraction of the bound that the gap must exceed for a depth to be chosen.

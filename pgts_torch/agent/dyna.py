@@ -38,8 +38,6 @@ class Dyna:
     num_due: how many updates of this iteration are not over.
 
     Args:
-        world: the environments and their model.
-        trained: the policy that is trained.
         model_check: compares steps of the environment with a model that claims to be exact, before it is queried.
         explorer: a policy that visits states in place of the trained one, which does if this is None.
     """

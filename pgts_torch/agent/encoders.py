@@ -117,7 +117,6 @@ class Values(nn.Module):
 
     Args:
         image: the height, width and channels that it is seen as; None: as a vector.
-        keeps_shape: whether what is no image keeps its shape.
         normalize: whether there are running statistics.
         scale: by which values are divided; None: the largest that is possible in bytes and in images, else 1.
     """

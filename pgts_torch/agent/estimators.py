@@ -31,11 +31,7 @@ class Estimator(ABC):
 
     @abstractmethod
     def evaluate(self, experience: Rollout, draws: Draws) -> dict[str, float]:
-        """Fit the critic to the policy that collected these episodes. Return its losses, by name.
-
-        Args:
-            draws: the random generators of the iteration.
-        """
+        """Fit the critic to the policy that collected these episodes. Return its losses, by name."""
 
     @abstractmethod
     def __call__(self, experience: Rollout, draws: Draws) -> PolicyBatch:

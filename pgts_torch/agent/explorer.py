@@ -23,7 +23,6 @@ class Explorer:
     Args:
         world: its model has optimism.
         policy: is trained by lookaheads of `estimator`, with the values of `critic` at the leaves.
-        search: computes these lookaheads.
     """
 
     def __init__(

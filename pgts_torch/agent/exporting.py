@@ -81,7 +81,6 @@ class Exported(nn.Module):
     returns. mean and std are those of the vectors before they are squashed.
 
     Args:
-        world: what observations are.
         source: the environment, whose form actions have.
 
     Raises:

@@ -34,7 +34,6 @@ def imagine(
 
     Args:
         world: its model is stepped, and gives the observations of its states.
-        start_B: states of the model.
         search_every: a lookahead starts from the visits at t = -b, search_every - b, ... of episode b.
         generator: for actions and outcomes.
 

@@ -66,7 +66,6 @@ def make_world(
     Args:
         source: makes `num_envs` environments, unless it was given a VectorEnv.
         gamma: discount; None: the environment's own (pgts/*), else 0.99.
-        observed: what is seen of observations.
         plain: whether no model is needed: then only a table is looked for, and without one the world has no model.
         action_repeat: how often an action is taken in one outcome of the model (`TensorModel`).
         other: makes the world of environments, their discount and how their action masks are read (`World.masks`), with

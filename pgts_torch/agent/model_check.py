@@ -65,8 +65,6 @@ class ModelCheck:
     model_calls: the queries made for this check alone; the calls of the lookahead do not include them.
 
     Args:
-        world: the environments and their model.
-        mode: "error", "warn" or "off".
         is_queried: whether a lookahead queries the model; else nothing is checked.
         seed: for the sample of steps.
         ranks: the processes that train together; a contradiction stops all of them.

@@ -158,7 +158,6 @@ class Network(nn.Module):
 
     Args:
         trunk: may be shared with another network.
-        num_outputs: of the head.
         gain: of the head's orthogonal weights; its biases are 0.
     """
 

@@ -23,8 +23,6 @@ class NetworkPolicy(Policy):
 
     Args:
         observation_space: of the rows, which may end with the legal actions.
-        num_actions: A.
-        options: of the trunk.
         seed: the initial weights are from the stream (seed, "policy"), the same on every device.
 
     Raises:

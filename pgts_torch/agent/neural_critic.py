@@ -53,7 +53,6 @@ class NetworkCritic(Critic):
     are none of the visits, as after imagined episodes that were cut off where the model knows too little.
 
     Args:
-        observation_space, num_actions: of the environment.
         trunk: the trunk of a policy, which is then shared, in place of `options.network`. Both train it; its running
             statistics of observations are changed by the policy's update alone.
         seed: the initial weights are from the stream (seed, "critic").

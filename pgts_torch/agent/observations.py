@@ -96,7 +96,6 @@ class Observations:
     as_given: whether rows, without legal actions, are the observations themselves, in their dtype.
 
     Args:
-        env: the environments.
         options: what is seen of dictionaries, and where images have their channels.
         numbered: whether the combinations of several numbers are numbered in their turn: then rows are Discrete.
         masked: how many actions there are, where observations are `Masked`; None: they are not.

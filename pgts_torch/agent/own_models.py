@@ -38,9 +38,7 @@ class VectorWorld(VectorStates):
     """Environments whose observations are vectors, or are represented as vectors, which are the states of a model.
 
     Args:
-        env: the environments.
         model: its states are observations, or what it makes of them.
-        observed: what is seen of observations.
     """
 
     def __init__(self, env: VectorEnv, model: TensorModel, *, gamma: float, **options: Any) -> None:

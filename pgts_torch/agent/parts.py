@@ -89,7 +89,6 @@ def make_parts(arguments: Mapping[str, Any], ranks: Ranks) -> Parts:
 
     Args:
         arguments: all arguments of `PGTS`.
-        ranks: the processes that train together.
 
     Raises:
         PgtsError, MissingModel, ModelMismatch: as `PGTS`.

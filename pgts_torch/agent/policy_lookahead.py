@@ -25,7 +25,6 @@ class PolicyLookahead:
         world: gives the observations of states, for policy and critic.
         policy: gives the prior of a tree search.
         critic: gives the values of this policy.
-        search: computes the lookahead.
         scale: of the proposal from which actions are drawn where the policy is Gaussian (`MixtureProposal`).
     """
 

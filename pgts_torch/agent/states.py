@@ -29,8 +29,6 @@ def load_checked(
 
     Args:
         name: of the part, as in the saved state.
-        state: what was saved.
-        load: loads a state into the part.
         own: returns the current state of the part.
         has_bounds: whether numbers in it may be infinite.
         is_all: whether all of it is loaded; else the part may have another state afterwards.

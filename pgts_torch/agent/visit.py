@@ -20,7 +20,6 @@ def visit(
         episodes: the episodes that go on; None: each environment runs one episode, from a reset.
         horizon: when they end; for episodes that go on, how many steps an iteration takes.
         world: its states are numbered from 0 again, unless they keep their numbers.
-        draws: the random generators of the iteration.
 
     Raises:
         PgtsError, RankLost: as `rollout` and `Ranks`.

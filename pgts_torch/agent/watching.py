@@ -70,7 +70,6 @@ class Watching:
     numbers of states, which get other ones where they are no table.
 
     Args:
-        parts: of the training.
         training_seed: of the training; what a lookahead samples is from the stream (training_seed, "watch").
         seed: episode k begins with reset(seed=seed + k).
         deterministic: take the most probable action, of a gaussian policy the mean; else sample from pi.

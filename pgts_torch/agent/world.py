@@ -54,7 +54,6 @@ class World:
     Args:
         env: the environments, with numbered actions, or vectors (`Squashed`).
         gamma: discount of a step that names none.
-        observed: what is seen of observations.
         numbered: whether the combinations of several numbers are numbered, so that observations are Discrete.
         device: where observations and states are.
     """

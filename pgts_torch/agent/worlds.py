@@ -96,7 +96,6 @@ class SimulatedWorld(ModelWorld):
     """Environments that can be restored from snapshots. A state is the number of a snapshot.
 
     Args:
-        model: a simulator of the same environment.
         env, observed, numbered, masks, device: as in `World`.
     """
 

@@ -13,7 +13,6 @@ class Reporter:
     """A progress bar on a terminal; elsewhere about `PLAIN_LINES` lines in all.
 
     Args:
-        total_steps: of the training.
         shown: False: print nothing.
     """
 

@@ -38,7 +38,6 @@ class Recorder:
     The logged metrics describe the policy that collected the episodes, which is the one before the update.
 
     Args:
-        path: of the run folder.
         folder: None: another process writes.
     """
 

@@ -64,7 +64,6 @@ def find(
 
     Args:
         strict: refuse a last checkpoint that is damaged or of other versions, and lost events or a lost best model.
-        world_size: the number of processes.
         any_world_size: whether the run may have had another number of processes before.
 
     Raises:

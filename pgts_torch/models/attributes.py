@@ -122,7 +122,6 @@ def unlike(
     ever.
 
     Args:
-        envs: the environments.
         new: instances that are not changed.
         make: makes an instance for this alone; it is stepped, and rendered if it can be.
         apart: attributes of which each instance has its own.

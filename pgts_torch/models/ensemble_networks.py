@@ -29,8 +29,6 @@ class EnsembleNetworks:
         state_size: D.
         num_actions: A; 0 where actions are vectors.   action_size: X, of these.
         members: E.
-        hidden: the sizes of the hidden layers.
-        generator: of the initial weights.
     """
 
     def __init__(

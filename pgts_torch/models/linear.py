@@ -21,7 +21,6 @@ class LinearQuadratic(TensorModel):
 
     Args:
         F_DD, G_DX, M_DD, N_XX: the matrices; N is positive definite.
-        gamma: discount.
         action_AX: the actions, in the order of their numbers; None: actions are vectors.
     """
 

@@ -87,7 +87,6 @@ def posterior_certificate(
     of `sampled_tables`.
 
     Args:
-        pi_SA: pi(a|s).
         start_S: start distribution mu, or the frequencies of start states among `num_starts` episodes. Then mu is
             sampled as the probabilities of a pair are, from these episodes.
         num_starts: None: mu is known.

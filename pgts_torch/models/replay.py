@@ -30,9 +30,6 @@ class ReplayBuffer:
     The columns and their types are those of the first call of `add`, which may add none. Memory is taken then.
 
     num_added: the number of all rows so far.
-
-    Args:
-        capacity: the largest number of rows.
     """
 
     def __init__(self, capacity: int) -> None:

@@ -75,7 +75,6 @@ class StateIndex:
     Args:
         num_columns: D, how many numbers a row has.
         dtype: of the rows: floating, where -0.0 equals 0.0, or an integer type.
-        device: where rows and table lie.
         merge: whether equal rows get one number. False: never; every row is a new one.
     """
 

@@ -33,8 +33,6 @@ class TabularModel(EnumeratingModel, SamplingModel, ExactModel):
     """The transitions of a `TabularMDP`, on a device and in a floating dtype of choice.
 
     Args:
-        mdp: the MDP.
-        device: where the tables lie.
         dtype: float64 keeps the exact values; float32 halves the memory.
     """
 

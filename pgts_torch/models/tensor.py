@@ -51,7 +51,6 @@ class TensorModel(EnumeratingModel, FollowingModel):
         num_actions: A; 0: actions are vectors.
         state_dtype: of the vectors: floating, or int64.
         dtype: of rewards, discounts and values.
-        device: where everything lies.
         merge: whether equal states get one number (`StateIndex`).
         action_repeat: k, how often an action is taken in one outcome, at least 1.
     """

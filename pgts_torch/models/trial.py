@@ -74,7 +74,6 @@ class Trial:
     be none.
 
     Args:
-        actions: those that are taken.
         masks: how action masks say which of them are legal; None: all are.
     """
 

@@ -37,9 +37,6 @@ class AutoSearch(Search):
       to 32; for more roots or levels the number is chosen again, and a search that turns out too large is done again
       with half.
 
-    Args:
-        model: enumerates or samples outcomes.
-
     Raises:
         NodeBudgetExceeded: from a search, where even one state a level, or one sample of each action, is too much.
         PgtsError: from a search, where that takes more than `max_calls`.

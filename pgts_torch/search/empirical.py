@@ -153,8 +153,6 @@ class FixedSamples(EnumeratingModel):
     """C samples of each (state, action) of a model as all its outcomes, the same ones in each query.
 
     Args:
-        model: samples outcomes.
-        samples: C.
         key: decides all of them, shape [1].
     """
 

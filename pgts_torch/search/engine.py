@@ -170,11 +170,7 @@ class Search(ABC):
 
 @final
 class ExpectimaxSearch(Search):
-    """`expectimax` over one topology: each (state, action) is queried once in however many searches.
-
-    Args:
-        model: enumerates outcomes.
-    """
+    """`expectimax` over one topology: each (state, action) is queried once in however many searches."""
 
     defers_checks = True
 
@@ -203,11 +199,7 @@ class ExpectimaxSearch(Search):
 
 @final
 class SampledSearch(Search):
-    """`sampled`, with fresh samples in each search, and with standard errors from a few replicates.
-
-    Args:
-        model: samples outcomes.
-    """
+    """`sampled`, with fresh samples in each search, and with standard errors from a few replicates."""
 
     def __init__(self, model: Model, options: Sampled = Sampled()) -> None:  # noqa: B008 - frozen
         super().__init__(model)
@@ -232,11 +224,7 @@ class SampledSearch(Search):
 
 @final
 class MCTSSearch(Search):
-    """`mcts`, by default with maximum backups and uniform priors: those of the policy prefer where it goes already.
-
-    Args:
-        model: enumerates outcomes, or samples them.
-    """
+    """`mcts`, by default with maximum backups and uniform priors: those of the policy prefer where it goes already."""
 
     def __init__(self, model: Model, options: MCTS = MCTS()) -> None:  # noqa: B008 - frozen
         super().__init__(model)

@@ -37,7 +37,6 @@ def expectimax(
     queries. The result is exact, also in stochastic models.
 
     Args:
-        model: enumerates the outcomes of a state.
         root_B: states of the model, int64; repeated ones cost nothing extra.
         depth: m, a finite whole number of at least 0.
         q_leaf: an estimate of Q^pi: states [N] to [N, A].

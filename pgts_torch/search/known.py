@@ -46,9 +46,6 @@ class KnownStates(Table):
     def rows(self, state_N: Int[Tensor, "N"], **tree: int) -> Int[Tensor, "N"]:
         """The rows T of these states; the model and the critic are first called for the new ones, together.
 
-        Args:
-            tree: as in `check_memory`.
-
         Raises:
             PgtsError: the model, the critic or the prior returns something that cannot be used.
             NodeBudgetExceeded: it would be too much, and the model has not been queried.

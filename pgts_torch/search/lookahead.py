@@ -146,7 +146,6 @@ class Leaves:
     expansions: how many levels are expanded: with Q at the bottom m, with v one more, for Q = r + gamma P v.
 
     Args:
-        model: of the states.
         depth: m, a finite whole number of at least 0.
         q_leaf: an estimate of Q^pi: states [N] to [N, A]; -inf where an action is not allowed.
         v_leaf: an estimate of v^pi: states [N] to [N]. Exactly one of the two is given.

@@ -33,7 +33,6 @@ class Nodes(Table):
     most_arms: the most (node, action) that a wave has passed on one level.
 
     Args:
-        known: what is known of states.
         bottom: nodes at this level are never expanded.
         merge: whether the nodes are a graph: one for each (state, level), whatever the path (Czech et al. 2021).
         revisits: whether a node may be passed though nothing below it is left to expand, as for averages.

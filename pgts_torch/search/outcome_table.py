@@ -38,9 +38,6 @@ class OutcomeTable(Table):
         be longer than there are states.
     num_queried: for how many states the model was queried.   model_calls: for how many (state, action).
     meter: measures what queries cost; None: nothing does.
-
-    Args:
-        model: enumerates outcomes.
     """
 
     axis = "R"

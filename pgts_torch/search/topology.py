@@ -43,7 +43,6 @@ class Topology:
     forest: what the last tree search has left for the next one, if it is little.
 
     Args:
-        model: enumerates outcomes.
         max_bytes: the most memory that a search may take, with all that is remembered here (`memory.search_bytes`).
     """
 

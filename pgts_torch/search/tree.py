@@ -55,7 +55,6 @@ class Tree:
     """Selects, expands and backs up nodes.
 
     Args:
-        known: what is known of states.
         bottom: nodes at this level are never expanded.
         options: how actions are selected; maxima or averages; with `merges` a node is a (level, state), whatever the
             path that led to it (Czech et al. 2021).
@@ -285,9 +284,6 @@ class Tree:
 
     def backup_all(self, node_B: Int[Tensor, "B"]) -> Float[Tensor, "B A"]:
         """Back up a whole graph once from the bottom, for what the waves could not reach.
-
-        Args:
-            node_B: the roots.
 
         Returns:
             `Lookahead.pruned_BA`; inf for averages, which have no bound and are as the waves left them.

@@ -37,8 +37,6 @@ class WideningTrees:
     Args:
         model: in which each action has one outcome.
         bottom: nodes at this level are never expanded.
-        num_roots: B.
-        max_bytes: the most memory of all trees.
 
     Raises:
         NodeBudgetExceeded: there would not be room.

@@ -31,7 +31,6 @@ def centred(
 
     Args:
         q_NA: (T^m Q)(s, .); -inf where an action is not allowed, and so is its advantage.
-        pi_NA: the policy.
         rounding: advantages of at most this size are 0.
     """
     below_NA = q_NA - q_NA.amax(-1, keepdim=True)
@@ -155,11 +154,9 @@ def ascend(
     """Algorithm 1 with exact quantities: only states with d^pi(s) > 0 move.        [PGTS Alg. 1]
 
     Args:
-        mdp: the MDP.
         pi_SA: the initial policy pi_0.
         depth: m, how often T is applied to Q^pi. 0 is plain policy gradient [PGTS Eq. (2)].
         step_size: eta, finite and at least 0; the same in every iteration.
-        iterations: how many updates.
         step: `projected_step` (the paper's, default), `softmax_step` or `mirror_step`.
         patience: m grows by 1 after so many iterations without a new largest return. With a fixed m the iteration may
             go round for ever (`zoo.roundabout`); with growing m its returns converge to J*, by projected and by mirror

@@ -55,10 +55,6 @@ class Optimum:
 def evaluate(mdp: TabularMDP, pi_SA: Float[Tensor, "S A"]) -> Evaluation:
     """v^pi, Q^pi, d^pi and J^pi.        [PGTS Sec. 2]
 
-    Args:
-        mdp: the MDP.
-        pi_SA: pi(a|s), each row a distribution.
-
     Raises:
         PgtsError: a row of pi is not a distribution, or the policy neither discounts nor ends (no finite value).
     """
@@ -121,7 +117,6 @@ def optimal(mdp: TabularMDP, tolerance: float | None = None) -> Optimum:
     v* and J*; so is q_SA of Q*, and pi_SA loses at most twice as much in any state (`improvement.improve`).
 
     Args:
-        mdp: the MDP.
         tolerance: in reward units. Default: none, and errors are those of rounding.
 
     Raises:

@@ -42,10 +42,7 @@ def foresee(
     those of `PGTS` for tables.
 
     Args:
-        mdp: the MDP.
-        pi_SA: the initial policy.
         depth: m.
-        iterations: how many.
         update: its options; the step size must be a number.
         num_envs, length: rollouts of an iteration, with a fixed horizon.
         trace, critic_step_size: lambda and step size of the critic.

@@ -109,7 +109,6 @@ def compare(
         by: what makes runs one group: config, all of it up to the seed; name, the key of this name; folder, the one
             that they lie in; or a regular expression, by what it matches in their paths (its first group, if any).
         metric: the tag that is compared; None: the first of exact J, greedy and training episodes that there is.
-        finished: leave out runs that are not finished.
         scale: the returns that count as 0 and as 1, by the id of the environment.
 
     Raises:
