@@ -38,7 +38,7 @@ from pgts_torch.search import Lookahead, Topology, expectimax, mcts
 from pgts_torch.seeding import stream
 
 ROOTS, SIMULATIONS, DEPTH, HIDDEN, GAMMA = 128, 64, 8, 64, 0.99
-OURS, HALF = "mcts, tree", "mcts, tree, half as many"
+OURS, HALF, MERGED = "mcts, tree", "mcts, tree, half as many", "mcts, merged"
 
 Critic = Callable[[torch.Tensor], torch.Tensor]
 
@@ -55,17 +55,13 @@ def leaf_of(model: CartPole, critic: Critic) -> Critic:
 
 
 def our_search(
-    model: CartPole,
-    critic: Critic,
-    root_BD: torch.Tensor,
-    simulations: int = SIMULATIONS,
-    known: Topology | None = None,
+    model: CartPole, critic: Critic, root_BD: torch.Tensor, known: Topology | None = None, **options: Any
 ) -> Lookahead:
     """A search that knows no state at first, or those of a topology."""
     if known is None:
         model.clear()
-    root_B, leaf = model.number(root_BD), leaf_of(model, critic)
-    return mcts(model, root_B, depth=DEPTH, v_leaf=leaf, simulations=simulations, topology=known)
+    given: dict[str, Any] = {"depth": DEPTH, "v_leaf": leaf_of(model, critic), "simulations": SIMULATIONS}
+    return mcts(model, model.number(root_BD), topology=known, **given | options)
 
 
 def peer_search(critic: Network, root_BD: torch.Tensor, policy: Policy) -> Form | None:
@@ -143,7 +139,8 @@ def neural_leaves(repeats: int) -> dict[str, Any]:
 
     forms: dict[str, Form] = {
         OURS: lambda: our_search(model, compiled, root_BD),
-        HALF: lambda: our_search(model, compiled, root_BD, SIMULATIONS // 2),
+        HALF: lambda: our_search(model, compiled, root_BD, simulations=SIMULATIONS // 2),
+        MERGED: lambda: our_search(model, compiled, root_BD, merge=True),
         f"{OURS}, states known": lambda: our_search(other, compiled, root_BD, known=known),
         "the critic alone": lambda: alone(compiled),
         f"{OURS}, critic by torch": lambda: our_search(model, critic.outputs, root_BD),
@@ -153,7 +150,9 @@ def neural_leaves(repeats: int) -> dict[str, Any]:
     peers = {f"mctx, {policy}": peer_search(critic, root_BD, policy) for policy in POLICIES}
     forms |= {name: peer for name, peer in peers.items() if peer}
     times = take_turns(forms, repeats)
-    searches = {OURS: forms[OURS], HALF: forms[HALF]} | {name: peer for name, peer in peers.items() if peer}
+    searches = {form: forms[form] for form in (OURS, HALF, MERGED)} | {
+        name: peer for name, peer in peers.items() if peer
+    }
     found_BA = {name: _q_values(search()) for name, search in searches.items()}
     return {
         "critic_calls": found.critic_calls,

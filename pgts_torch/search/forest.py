@@ -14,7 +14,19 @@ from pgts_torch.search.memory import GROWTH, check_nodes, tree_nodes
 from pgts_torch.search.split import Rule
 from pgts_torch.search.state_records import NOTHING, StateRecords, records
 from pgts_torch.search.topology import Topology
-from pgts_torch.search.tree_records import ARM, EDGE, FULL, LANE, NODE, NOT_FINITE, SLOT, STEP, TOO_MANY, UNKNOWN
+from pgts_torch.search.tree_records import (
+    ARM,
+    EDGE,
+    FULL,
+    LANE,
+    NODE,
+    NOT_FINITE,
+    SLOT,
+    STEP,
+    TOO_MANY,
+    UNKNOWN,
+    as_bytes,
+)
 
 _ROOM = 2**20
 """The most edges for which there is room at first, if there is more than one tree."""
@@ -137,9 +149,10 @@ class Forest:
         for old, new in zip(before, self._nodes, strict=False):
             rows = new[:, : old.shape[1]]
             if new.ndim == 4:
-                rows[...] = (0.0, 0.0, -1.0, 0, 0)  # outcomes beyond those that there were have no weight
+                as_bytes(rows)[...] = 0
+                rows["prob"] = -1.0  # outcomes beyond those that there were have no weight
                 rows = rows[..., : old.shape[3]]
-            rows[...] = old
+            as_bytes(rows)[...] = as_bytes(old)
         self._rows = [*(x.reshape(-1, *x.shape[2:]) for x in self._nodes), records((room,), _FLOAT)]
         if not self._slots:
             slots = B if options.merges else trees
@@ -163,12 +176,12 @@ class Forest:
     def _run_ahead(self, rest: Sequence[Any]) -> int:
         """How many states the simulations of a round may want; what has grown meanwhile is taken back."""
         grown = [*(x[: self._turn[0]] for x in self._rows[:3]), *self._slots, rest[-1]]
-        before = [x.copy() for x in grown]
+        before = [as_bytes(x).copy() for x in grown]
         self._turn[4] = 1
         count: int = self._kernels.search(*self._known.arrays, *rest)
         self._turn[4] = 0
         for x, old in zip(grown, before, strict=True):
-            x[...] = old
+            as_bytes(x)[...] = old
         return count
 
 

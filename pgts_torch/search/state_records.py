@@ -14,7 +14,7 @@ from pgts_torch.search.known import prior_of_allowed
 from pgts_torch.search.lookahead import Leaves, check_roots
 from pgts_torch.search.memory import check_memory
 from pgts_torch.search.topology import Topology
-from pgts_torch.search.tree_records import NEW, STATE
+from pgts_torch.search.tree_records import NEW, STATE, as_bytes
 from pgts_torch.seeding import draw_keys
 
 _UNKNOWN = np.array([(math.nan, NEW)], STATE)
@@ -162,7 +162,8 @@ class StateRecords:
     def _make_room(self) -> None:
         more = self._table.row_S.shape[0] - len(self.state_S)
         if more:
-            self.state_S = np.concatenate([self.state_S, _UNKNOWN.repeat(more)])
+            both = as_bytes(self.state_S), as_bytes(_UNKNOWN.repeat(more))
+            self.state_S = np.concatenate(both).view(STATE)
             self._child_S = records((len(self.state_S),), self._child_S.dtype)
 
     def _learned(self, leaves: Leaves, state_N: Int[np.ndarray, "N"], child_C: Int[np.ndarray, "C"]) -> Learned:

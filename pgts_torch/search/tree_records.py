@@ -1,5 +1,7 @@
 """What compiled loops know of states and nodes, as records."""
 
+from typing import Any
+
 import numpy as np
 
 NEW, WANTED = -1, -2
@@ -41,3 +43,8 @@ root that one of the simulations under way has taken.   node, action, k: the edg
 
 STEP = np.dtype([(name, "i8") for name in ("node", "action", "k")])
 """The edge that a simulation takes, one for each level of a graph."""
+
+
+def as_bytes(x: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """The same memory, for copies: numpy copies records field by field, which takes a hundred times as long."""
+    return x.view(np.uint8)
