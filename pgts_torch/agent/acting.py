@@ -19,11 +19,7 @@ from pgts_torch.models.masks import ActionMasks, Masked
 
 @final
 class Acting:
-    """Takes actions by a policy.
-
-    Args:
-        source: the environment, whose form actions have.
-    """
+    """Takes actions by a policy."""
 
     def __init__(self, world: World, source: EnvSource) -> None:
         self._world, self._name = world, source.name

@@ -150,7 +150,6 @@ class Certificates:
         lookahead starts from them.
 
         Args:
-            experience: the episodes of the iteration.
             roots: the visited states that this process looks ahead from.
             v_N: v there, from the lookahead of depth 0.
         """
@@ -201,9 +200,7 @@ class Certificates:
 
         Args:
             starts: what `starts` returned.
-            roots: the visited states.
             root_v_N: v where this process looks ahead.
-            look: the lookahead.
             depth: its depth m; n is m, or m + 1 where the critic learns v.
             number: of the iteration, from 1.
         """

@@ -69,9 +69,6 @@ class DepthChoice:
         """Return the lookahead from distinct visited states. All processes choose the same depth.
 
         Args:
-            experience: episodes of the policy.
-            roots: the states.
-            pi_NA: the policy there.
             draws: the random generators of the iteration; all its searches get the same samples, so that their
                 differences are not noise.
 

@@ -21,7 +21,6 @@ class Explorer:
     trained in the same model without it.
 
     Args:
-        world: its model has optimism.
         policy: is trained by lookaheads of `estimator`, with the values of `critic` at the leaves.
     """
 

@@ -80,9 +80,6 @@ class Exported(nn.Module):
     `action` is the most probable action, or the squashed mean, in the form of the environment: what `PGTS.predict`
     returns. mean and std are those of the vectors before they are squashed.
 
-    Args:
-        source: the environment, whose form actions have.
-
     Raises:
         PgtsError: the policy is of a class of the caller's own.
     """

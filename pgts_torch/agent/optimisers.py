@@ -84,7 +84,6 @@ class Optimiser:
 
         Args:
             gradients: of the loss, one for each parameter.
-            loss: what is minimised.
             name: of the loss, in errors.
 
         Raises:

@@ -76,10 +76,6 @@ def learned_world(
 ) -> ModelWorld:
     """Return the environments with a model that has learned nothing yet.
 
-    Args:
-        capacity: the number of steps that the model keeps.
-        seed: of its initial weights.
-
     Raises:
         MissingModel: it does not learn from such observations.
     """

@@ -24,7 +24,6 @@ class PolicyLookahead:
     Args:
         world: gives the observations of states, for policy and critic.
         policy: gives the prior of a tree search.
-        critic: gives the values of this policy.
         scale: of the proposal from which actions are drawn where the policy is Gaussian (`MixtureProposal`).
     """
 

@@ -88,7 +88,6 @@ def weight_factors(
     Args:
         count_N: c(s) of the states of this process.
         share: which of the V visits these are.
-        num_drawn: n, at most V.
     """
     place_n = torch.randperm(share.total, generator=generator)[:num_drawn].to(count_N.device)
     # Visits are numbered state by state: those to the first one are `share.first` and those that follow.

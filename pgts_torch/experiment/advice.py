@@ -36,9 +36,6 @@ class Movement:
     """How far a policy has moved since the first iteration, and how much better a lookahead still finds its actions.
 
     before: the policy before the next iteration; set it before the first one of this process.
-
-    Args:
-        first: the initial policy.
     """
 
     def __init__(self, first: Policy) -> None:

@@ -66,7 +66,6 @@ def make(what: str, **options: Any) -> TabularMDP:
 
     Args:
         what: ladder, tightrope, random, grid, deep_sea, or the path of a file that `TabularMDP.load_npz` reads.
-        options: those of the command that were given.
 
     Raises:
         PgtsError: it has too many policies to enumerate, or an option or the file is wrong.

@@ -89,7 +89,6 @@ def changing(
 
     Args:
         env: an instance for this alone; it is stepped.
-        but: as in `attributes`.
     """
     now, found, age = attributes(env, but=but), collections.Counter[str](), 0
     for taken in random_walk(env, actions, generator, steps=0, longest=_LONGEST, seconds=_SECONDS):

@@ -54,7 +54,6 @@ def table_of(env: gymnasium.Env, *, gamma: float, generator: np.random.Generator
     Args:
         env: an instance for this alone; it is stepped.
         gamma: discount of a P table; ours carry their own.
-        generator: of the walk.
 
     Raises:
         MissingModel: P is no table, or it was not written for this `step` and `reset`, has other states or actions than

@@ -37,7 +37,6 @@ class Nodes(Table):
         merge: whether the nodes are a graph: one for each (state, level), whatever the path (Czech et al. 2021).
         revisits: whether a node may be passed though nothing below it is left to expand, as for averages.
         max_nodes: the most nodes, see `Lookahead.nodes_per_level`.
-        room: for how many nodes there is room at first.
     """
 
     axis = "N"

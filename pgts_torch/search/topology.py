@@ -66,7 +66,6 @@ class Topology:
 
         Args:
             root_B: states of the model, in any order, repeated or not.
-            expansions: how many levels are to be expanded.
             max_nodes: the most nodes, summed over levels 0 .. expansions.
             readings: with them roots in the tensor of an earlier search are taken to be the same without being read,
                 and the check of that waits.

@@ -48,7 +48,6 @@ class UpperBound:
     and the division that it came from.
 
     Args:
-        topology: what is known of the model.
         highest: w, the model's `highest_value`.
         gamma: the largest discount of the model.
     """

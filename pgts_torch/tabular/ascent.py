@@ -154,7 +154,6 @@ def ascend(
     """Algorithm 1 with exact quantities: only states with d^pi(s) > 0 move.        [PGTS Alg. 1]
 
     Args:
-        pi_SA: the initial policy pi_0.
         depth: m, how often T is applied to Q^pi. 0 is plain policy gradient [PGTS Eq. (2)].
         step_size: eta, finite and at least 0; the same in every iteration.
         step: `projected_step` (the paper's, default), `softmax_step` or `mirror_step`.

@@ -42,7 +42,6 @@ def foresee(
     those of `PGTS` for tables.
 
     Args:
-        depth: m.
         update: its options; the step size must be a number.
         num_envs, length: rollouts of an iteration, with a fixed horizon.
         trace, critic_step_size: lambda and step size of the critic.
