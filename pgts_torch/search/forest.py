@@ -112,8 +112,8 @@ class Forest:
         while True:
             if known.num_outcomes > self._nodes[2].shape[3]:
                 self._make_room()
-            if graph:
-                missing = len(known.state_S) * (self._bottom + 1) - len(graph[0])
+            missing = len(known.state_S) * (self._bottom + 1) - len(graph[0]) if graph else 0
+            if missing:
                 graph[0] = np.concatenate([graph[0], np.zeros(missing, np.int32)])
             *rows, mass_N = self._rows
             rest = *rows, *self._slots, self._rules, *found, mass_N, *self._scratch
