@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import final
 
 from pgts_torch.errors import Stopped
@@ -24,14 +24,14 @@ def train_all(
     trainings: Mapping[str, Sequence[str]],
     *,
     jobs: int,
-    is_over: Callable[[Mapping[str, str]], bool] = lambda failures: False,
+    unwanted: Callable[[Mapping[str, str]], Collection[str]] = lambda failures: (),
 ) -> dict[str, str]:
     """Run `pgts train` with each of these arguments, `jobs` at once.
 
     Args:
         trainings: the arguments, by the name of the training.
-        is_over: whether none of them is wanted any more, given the failures so far. It is looked at all the time; then
-            those that run save and end, which is no failure, and no other begins.
+        unwanted: the names of those that are not wanted any more, given the failures so far. It is asked all the time;
+            then those that run save and end, which is no failure, and those that wait do not begin.
 
     Returns:
         The last line on stderr of each training that failed, by name.
@@ -44,19 +44,19 @@ def train_all(
     waiting, running, finished = deque(trainings.items()), list[_Training](), 0
     with StopFlag(at_once=lambda: _kill(running)) as stop:
         try:
-            over = False
-            while running or (waiting and stop.signal is None and not over):
-                over = over or is_over(failures)
-                stops = over or stop.signal is not None
-                while waiting and len(running) < jobs and not stops:
+            while running or (waiting and stop.signal is None):
+                off = unwanted(failures)
+                waiting = deque(each for each in waiting if each[0] not in off)
+                while waiting and len(running) < jobs and stop.signal is None:
                     running.append(_Training(*waiting.popleft()))
-                for training in [each for each in running if each.ended(terminate=stops)]:
+                stopped = {each.name for each in running if stop.signal is not None or each.name in off}
+                for training in [each for each in running if each.ended(terminate=each.name in stopped)]:
                     running.remove(training)
                     code, seconds, last = training.outcome()
                     if code == 0:
                         ending = f"done in {seconds:.0f} s"
                         finished += 1
-                    elif stops and code in _STOPPED:
+                    elif training.name in stopped and code in _STOPPED:
                         ending = f"stopped after {seconds:.0f} s"
                     else:
                         ending, failures[training.name] = f"FAILED: {last}", last

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -167,6 +167,19 @@ def hang_ups() -> Iterator[None]:
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)
+
+
+def test_a_run_that_is_not_wanted_any_more_ends_and_the_others_go_on(trainer, capsys):
+    pids = trainer("echo asked >> pids; exit 143")
+
+    def unwanted(failures: Mapping[str, str]) -> set[str]:
+        said = lines(pids)
+        return {"a", "b", "c"} if "asked" in said else {"a"} if len(said) == 2 else set()
+
+    assert train_all({name: [] for name in "abc"}, jobs=2, unwanted=unwanted) == {}
+    assert lines(pids)[2:] == ["asked", "asked"]
+    said = [line.partition(" after")[0] for line in capsys.readouterr().err.splitlines()]
+    assert [line.split()[1:] for line in said] == [["a:", "stopped"], ["b:", "stopped"]]
 
 
 @pytest.mark.usefixtures("hang_ups")

@@ -7,7 +7,7 @@ import signal
 import sqlite3
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from pgts_torch.experiment.compare.comparison import compare
 from pgts_torch.experiment.compare.text import to_json
 from pgts_torch.experiment.locking import RunLock
 from pgts_torch.experiment.statistics import estimate
-from pgts_torch.experiment.tune import result, space
+from pgts_torch.experiment.tune import result, space, watch
 from tests.experiment import finished
 from tests.experiment.runs import tree
 from tests.forks import ForkedCommand, in_child
@@ -63,33 +63,37 @@ class Trainer:
         trainings: Mapping[str, Sequence[str]],
         *,
         jobs: int,
-        is_over: Callable[[Mapping[str, str]], bool] = lambda failures: False,
+        unwanted: Callable[[Mapping[str, str]], Collection[str]] = lambda failures: (),
     ) -> dict[str, str]:
         failures: dict[str, str] = {}
         waiting = list(trainings.items())
-        while waiting and not is_over(failures):
+        while waiting := [each for each in waiting if each[0] not in unwanted(failures)]:
             started, waiting = waiting[:jobs], waiting[jobs:]
             self.trained += [name for name, _ in started]
             running = [(name, load(None, arguments)) for name, arguments in started]
             for step in range(250, 1001, 250):
+                off = unwanted(failures)
                 for name, config in running:
-                    worth = self.worth(config)
-                    if isinstance(worth, str):
-                        failures[name] = worth
-                        continue
-                    points = [(at, worth * at / 1000) for at in range(250, step + 1, 250)]
-                    lines = [{"step": at, "eval/deterministic_return": value} for at, value in points]
-                    place = Path(str(config.run.dir))
-                    if not (place / "config.yaml").exists():
-                        finished.leave(place, config, lines)
-                    (place / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-                    self.evaluations += 1
-                    if step == 1000:
-                        what = finished.summary(config, J=None, env_steps=1000, greedy=worth)
-                        (place / "summary.json").write_text(json.dumps(asdict(what)))
-                if is_over(failures):
-                    return failures
+                    if name not in off:
+                        self.train(name, config, step, failures)
         return failures
+
+    def train(self, name: str, config: Any, step: int, failures: dict[str, str]) -> None:
+        """Train a run up to its next evaluation."""
+        worth = self.worth(config)
+        if isinstance(worth, str):
+            failures[name] = worth
+            return
+        points = [(at, worth * at / 1000) for at in range(250, step + 1, 250)]
+        lines = [{"step": at, "eval/deterministic_return": value} for at, value in points]
+        place = Path(str(config.run.dir))
+        if not (place / "config.yaml").exists():
+            finished.leave(place, config, lines)
+        (place / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        self.evaluations += 1
+        if step == 1000:
+            what = finished.summary(config, J=None, env_steps=1000, greedy=worth)
+            (place / "summary.json").write_text(json.dumps(asdict(what)))
 
 
 def near_one(config: Any) -> float:
@@ -115,7 +119,7 @@ def trainer(here: Path, unsynced: None, monkeypatch: pytest.MonkeyPatch) -> Trai
     monkeypatch.setattr(result, "png", lambda drawn: b"a picture")
     monkeypatch.setattr(studies, "train_all", made)
     monkeypatch.setattr(result, "train_all", made)
-    monkeypatch.setattr(studies, "_LOOK", 0.0)
+    monkeypatch.setattr(watch, "_LOOK", 0.0)
     return made
 
 
@@ -152,7 +156,8 @@ def test_the_best_trial_is_that_of_the_best_configuration_and_the_file_of_it_tra
 def test_values_are_proposed_from_what_earlier_ones_came_to():
     def mean_distance(sampler: str) -> float:
         study, distances = optuna.create_study(direction="maximize"), []
-        while (trial := studies._next(study, 60, sampler)) is not None:
+        for number in range(60):
+            trial = studies._proposed(study, number, sampler)
             distances.append(abs(np.log10(studies._suggested(trial, space.option(STEP)))))
             study.tell(trial, -distances[-1])
         return float(np.mean(distances[30:]))
@@ -191,10 +196,38 @@ def test_no_trial_is_pruned_before_the_steps_that_it_is_given(trainer):
     assert min(late) >= 1500  # the second evaluation of the second seed
 
 
-def test_how_many_seeds_run_at_once_changes_nothing(trainer):
-    one, both = (tuned("--trials=9", f"--jobs={jobs}", out=f"j{jobs}") for jobs in (1, 2))
-    assert without(one, "out") == without(both, "out")
+@pytest.mark.parametrize("batch", [1, 3])
+def test_how_many_runs_there_are_at_once_changes_nothing(batch, trainer):
+    one, all_at_once = (tuned("--trials=14", f"--batch={batch}", f"--jobs={jobs}", out=f"j{jobs}") for jobs in (1, 6))
+    assert without(one, "out") == without(all_at_once, "out")
     assert any(trial["state"] == "pruned" for trial in one["trials"])
+
+
+def test_trials_of_a_batch_run_side_by_side_and_are_proposed_without_each_other(trainer):
+    alone = tuned("--trials=14", "--prune=0", out="alone")
+    begun = len(trainer.trained)
+    batch = tuned("--trials=14", "--prune=0", "--batch=7", "--jobs=3")
+    assert trainer.trained[begun : begun + 3] == ["trial-0000, seed 0", "trial-0000, seed 1", "trial-0001, seed 0"]
+    values = [[trial["values"]["update.step_size"] for trial in each["trials"]] for each in (alone, batch)]
+    assert values[0][:10] == values[1][:10]  # which are drawn at random
+    study = optuna.create_study(direction="maximize")
+    for trial in batch["trials"][:7]:
+        known = studies._proposed(study, trial["number"], "tpe")
+        assert studies._suggested(known, space.option(STEP)) == trial["values"]["update.step_size"]
+        study.tell(known, trial["score"]["mean"])
+    for trial in batch["trials"][7:]:
+        found = studies._suggested(studies._proposed(study, trial["number"], "tpe"), space.option(STEP))
+        assert found == trial["values"]["update.step_size"]
+
+
+def test_one_trial_of_a_batch_may_fail_or_be_pruned_while_the_others_go_on(trainer):
+    trainer.worth = lambda config: "loss is nan" if config.update.step_size > 10 else near_one(config)
+    answer = tuned("--trials=16", "--batch=4", "--jobs=8", "--prune-trials=3")
+    for trial in answer["trials"]:
+        assert (trial["values"]["update.step_size"] > 10) == (trial["state"] == "failed")
+    mixed = [{trial["state"] for trial in answer["trials"][at : at + 4]} for at in range(0, 16, 4)]
+    assert {"complete", "failed"} <= set.union(*(states for states in mixed if len(states) > 1))
+    assert any(trial["state"] == "pruned" for trial in answer["trials"])
 
 
 class Killed(BaseException):
@@ -202,11 +235,13 @@ class Killed(BaseException):
 
 
 @pytest.mark.fault("tuning killed at any moment")
+@pytest.mark.parametrize("batch", [1, 3])
 @pytest.mark.parametrize("where", ["ask", "report", "train", "tell"])
 def test_a_tuning_that_is_killed_goes_on_with_the_same_trial_and_ends_as_if_it_had_not_been(
-    where, trainer, monkeypatch
+    where, batch, trainer, monkeypatch
 ):
-    whole = tuned("--trials=8", "--prune-trials=3", out="whole")
+    options = ["--trials=9", "--prune-trials=3", f"--batch={batch}"]
+    whole = tuned(*options, out="whole")
     assert any(trial["state"] == "pruned" for trial in whole["trials"])
     calls = {"n": 0}
     owner, name = {
@@ -219,7 +254,7 @@ def test_a_tuning_that_is_killed_goes_on_with_the_same_trial_and_ends_as_if_it_h
 
     def dies(*args: Any, **kwargs: Any) -> Any:
         calls["n"] += 1
-        if calls["n"] in (3, 7, 30) and where != "ask":
+        if calls["n"] in (2, 4, 7, 30) and where != "ask":
             raise Killed
         answer = plain(*args, **kwargs)
         if calls["n"] in (3, 7) and where == "ask":
@@ -230,7 +265,7 @@ def test_a_tuning_that_is_killed_goes_on_with_the_same_trial_and_ends_as_if_it_h
     deaths = 0
     while not Path("out/tune.json").exists():
         try:
-            tuned("--trials=8", "--prune-trials=3")
+            tuned(*options)
         except Killed:
             deaths += 1
     assert deaths >= 2
@@ -419,6 +454,7 @@ def test_another_tuning_or_something_else_in_the_storage_is_refused(trainer, cap
     assert refused("--seeds=3") == (
         "error: out/tune.db holds another tuning: --seeds is 3, and was 2; choose another --out\n"
     )
+    assert "--batch is 2, and was 1" in refused("--seeds=2", "--batch=2")
     assert "search.depth is 2, and was 4" in refused("--seeds=2", "--search.depth=2")
     assert "update.step_size is log(0.1,1), and was log(0.01,100)" in refused(
         "--seeds=2", options=["update.step_size=log(0.1,1)"]
@@ -450,7 +486,7 @@ def test_two_processes_do_not_tune_in_one_folder(trainer, capsys):
 @pytest.mark.fault("tuning killed at any moment")
 def test_trainings_are_really_made_pruned_and_gone_on_with_after_kill_9(here, monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", ForkedCommand)
-    monkeypatch.setattr(studies, "_LOOK", 0.0)
+    monkeypatch.setattr(watch, "_LOOK", 0.0)
     small = ["--total_steps=120", "--rollout.num_envs=2", "--rollout.horizon.length=10", "--eval.episodes=1"]
     more = ["--eval.every=40", "--log.checkpoint_every=1", "--run.tensorboard=false", "--update.type=mirror"]
     options = ["--option=search.depth=int(0,2)", "--option", STEP]

@@ -35,7 +35,21 @@ def tune(arguments: Arguments) -> None:
     parser.add_argument(
         "--seeds", metavar="N", type=whole(1), default=3, help="of each trial, 0 to N - 1 (default: %(default)s)"
     )
-    parser.add_argument("--jobs", metavar="N", type=whole(1), default=1, help="seeds at once (default: %(default)s)")
+    parser.add_argument(
+        "--batch",
+        metavar="N",
+        type=whole(1),
+        default=1,
+        help="trials that are proposed at once, without knowing of each other, and trained side by side (default: "
+        "%(default)s)",
+    )
+    parser.add_argument(
+        "--jobs",
+        metavar="N",
+        type=whole(1),
+        default=1,
+        help="runs at once: no more than seeds times --batch are of use (default: %(default)s)",
+    )
     parser.add_argument(
         "--metric",
         choices=TUNED_METRICS,
@@ -77,7 +91,7 @@ def tune(arguments: Arguments) -> None:
         parser.error("the following arguments are required: --out")
     from pgts_torch.experiment.tune import space
 
-    settings = {name: getattr(given, name) for name in ("seeds", "metric", "out")}
+    settings = {name: getattr(given, name) for name in ("seeds", "metric", "out", "batch")}
     plan = space.plan(given.config, overrides, options=given.option, **settings)
     from pgts_torch.experiment.tune import result
     from pgts_torch.experiment.tune.study import Pruning

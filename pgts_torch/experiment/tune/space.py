@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +105,7 @@ class Plan:
     path, overrides: of the configuration, as `load` takes them.
     seeds: so many runs make a trial, with the seeds 0, 1, ...
     metric: the tag of metrics.jsonl by which trials are compared, higher is better.
+    batch: so many trials are proposed at once, and trained side by side.
     """
 
     path: str | None
@@ -113,6 +114,7 @@ class Plan:
     seeds: int
     metric: str
     out: Path
+    batch: int = 1
 
     def arguments(self, values: Values, own: Mapping[str, Any]) -> tuple[str, ...]:
         """The overrides of a run with these values, and keys of its own."""
@@ -130,7 +132,14 @@ class Plan:
 
 
 def plan(
-    path: str | None, overrides: Sequence[str], *, options: Sequence[str], seeds: int, metric: str, out: Path
+    path: str | None,
+    overrides: Sequence[str],
+    *,
+    options: Sequence[str],
+    seeds: int,
+    metric: str,
+    out: Path,
+    batch: int,
 ) -> Plan:
     """A tuning whose values are all in the ranges of their options.
 
@@ -151,7 +160,7 @@ def plan(
             raise PgtsError(f"--option {each.key} would change what is measured, so trials could not be compared")
         if any(given.partition("=")[0] == f"--{each.key}" for given in overrides):
             raise PgtsError(f"--{each.key} is tuned by --option {each.key}={each.spec}; give one of the two")
-    made = Plan(path, tuple(overrides), found, seeds, metric, out)
+    made = Plan(path, tuple(overrides), found, seeds, metric, out, batch)
     first = {each.key: each.ends[0] for each in found}
     for each in found:
         for end in each.ends:
@@ -164,7 +173,7 @@ def plan(
     base = made.base
     if base.eval.every is None:
         every = max(1, base.total_steps // _EVALUATIONS)
-        made = Plan(path, (*overrides, f"--eval.every={every}"), found, seeds, metric, out)
+        made = replace(made, overrides=(*overrides, f"--eval.every={every}"))
     return made
 
 

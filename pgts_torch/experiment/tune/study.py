@@ -1,17 +1,17 @@
 """The trials of a tuning: proposed by Optuna, trained over several seeds, pruned by what the runs log, kept in SQLite.
 
-A trial is a function of those before it: the sampler is seeded by its number, and evaluations are reported in the order
-of seeds and steps, however many runs there are at once. A trial that was cut off is begun again where it was.
+A trial is a function of those of the batches before its own: the sampler is seeded by its number, evaluations are
+reported in the order of seeds and steps, and trials told in the order of their numbers when a batch is over, however
+many runs there are at once. A batch that was cut off is begun again where it was.
 """
 
 import sys
-import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -21,22 +21,19 @@ from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.compare.runs import GREEDY, SAMPLED, J
 from pgts_torch.experiment.locking import wait_for
 from pgts_torch.experiment.processes import train_all
-from pgts_torch.experiment.report.facts import metrics
 from pgts_torch.experiment.resume import flat, plain
 from pgts_torch.experiment.run import build
 from pgts_torch.experiment.statistics import interquartile_mean
 from pgts_torch.experiment.summary import Summary, summary_in
 from pgts_torch.experiment.tune.space import Option, Plan, Values
+from pgts_torch.experiment.tune.watch import Watch
 
 if TYPE_CHECKING:
     import optuna
 
 STUDY = "pgts tune"
 FAILURE, SCORES, ABOUT = "failure", "scores", "about"
-_LOOK = 0.5
-"""Seconds between two looks at what runs have logged."""
-
-_BEFORE = ("the configuration", "the options", "--seeds", "--metric")
+_BEFORE = ("the configuration", "the options", "--seeds", "--metric", "--batch")
 
 
 @dataclass(frozen=True)
@@ -79,8 +76,8 @@ def run_trials(
             if pruning.share
             else optuna.pruners.NopPruner()
         )
-        while (trial := _next(study, trials, sampler)) is not None:
-            _train(study, trial, plan, jobs)
+        while batch := _batch(study, plan, trials, sampler):
+            _train(study, batch, plan, jobs)
     return study
 
 
@@ -147,7 +144,7 @@ def _opened(plan: Plan, storage: Path) -> "optuna.Study":
     study = optuna.create_study(storage=kept, study_name=name, direction="maximize", load_if_exists=True)
     options = {option.key: option.spec for option in plan.options}
     config = {key: value for key, value in flat(plain(plan.base)).items() if key not in options}
-    now = dict(zip(_BEFORE, (config, options, plan.seeds, plan.metric), strict=True))
+    now = dict(zip(_BEFORE, (config, options, plan.seeds, plan.metric, plan.batch), strict=True))
     before = study.user_attrs.get(ABOUT)
     if before is None and not study.trials:
         study.set_user_attr(ABOUT, now)
@@ -169,18 +166,43 @@ def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     return "it is not of pgts tune"
 
 
-def _next(study: "optuna.Study", trials: int, sampler: str) -> "optuna.Trial | None":
-    """The trial that was cut off, else a new one; None: there are enough."""
+@dataclass
+class _Trial:
+    """A trial that is trained.
+
+    failure: why it has failed; empty where it has not.
+    names: of its runs that are not finished.
+    """
+
+    trial: "optuna.Trial"
+    values: Values
+    folders: Mapping[int, Path]
+    failure: str = ""
+    names: Collection[str] = ()
+
+
+def _batch(study: "optuna.Study", plan: Plan, trials: int, sampler: str) -> list[_Trial]:
+    """The trials of a batch that was cut off, else of a new one; none: there are enough."""
+    known = study.get_trials(deepcopy=False)
+    first = next((trial.number for trial in known if not trial.state.is_finished()), len(known))
+    first = first // plan.batch * plan.batch
+    found = []
+    for number in range(first, min(first + plan.batch, trials)):
+        if number >= len(known) or not known[number].state.is_finished():
+            trial = _proposed(study, number, sampler)
+            values = {option.key: _suggested(trial, option) for option in plan.options}
+            found.append(_Trial(trial, values, {seed: folder(plan, number, seed) for seed in range(plan.seeds)}))
+    return found
+
+
+def _proposed(study: "optuna.Study", number: int, sampler: str) -> "optuna.Trial":
+    """The trial of this number, a new one where there is none."""
     optuna = imported()
     known = study.get_trials(deepcopy=False)
-    cut = next((trial.number for trial in known if trial.state == optuna.trial.TrialState.RUNNING), None)
-    number = len(known) if cut is None else cut
-    if number >= trials:
-        return None
     seed = int(np.random.SeedSequence([0, number]).generate_state(1)[0])
     samplers = optuna.samplers
     study.sampler = samplers.TPESampler(seed=seed) if sampler == "tpe" else samplers.RandomSampler(seed=seed)
-    return study.ask() if cut is None else optuna.Trial(study, known[cut]._trial_id)
+    return study.ask() if number == len(known) else optuna.Trial(study, known[number]._trial_id)
 
 
 def _suggested(trial: "optuna.Trial", option: Option) -> float | int | str:
@@ -206,28 +228,44 @@ def trainings(plan: Plan, values: Values, folders: Mapping[int, Path]) -> dict[s
     return found
 
 
-def _train(study: "optuna.Study", trial: "optuna.Trial", plan: Plan, jobs: int) -> None:
-    """Train a trial, and tell the study what it is worth."""
-    states = imported().trial.TrialState
-    values = {option.key: _suggested(trial, option) for option in plan.options}
-    folders = {seed: folder(plan, trial.number, seed) for seed in range(plan.seeds)}
-    watch = Watch(trial, folders, plan)
-    failures: Mapping[str, str] = {}
-    try:
-        plan.config(values)
-        wait_for(folders.values())
-        failures = train_all(trainings(plan, values, folders), jobs=jobs, is_over=watch)
-    except ConfigError as error:
-        failures = {"the values do not go together": error.mistakes[0]}
-    if failures:
-        where, what = next(iter(failures.items()))
-        trial.set_user_attr(FAILURE, f"{where}: {what}")
+def _train(study: "optuna.Study", batch: Sequence[_Trial], plan: Plan, jobs: int) -> None:
+    """Train the trials of a batch, and tell the study what they are worth, in their order."""
+    watches = {each.trial.number: Watch(each.trial, each.folders, plan) for each in batch}
+    runs: dict[str, tuple[str, ...]] = {}
+    for each in batch:
+        try:
+            plan.config(each.values)
+        except ConfigError as error:
+            each.failure = f"the values do not go together: {error.mistakes[0]}"
+            continue
+        wait_for(each.folders.values())
+        own = trainings(plan, each.values, each.folders)
+        runs, each.names = runs | own, own.keys()
+
+    def unwanted(failures: Mapping[str, str]) -> set[str]:
+        over = (each for each in batch if failures.keys() & each.names or watches[each.trial.number].looked().is_pruned)
+        return {name for each in over for name in each.names}
+
+    failures = train_all(runs, jobs=jobs, unwanted=unwanted)
+    for watch in watches.values():
+        watch.looked(at_once=True)  # before any trial is told, by which the others would be judged
+    for each in batch:
+        failed = (f"{name}: {what}" for name, what in failures.items() if name in each.names)
+        each.failure = each.failure or next(failed, "")
+        _tell(study, each, watches[each.trial.number], plan)
+
+
+def _tell(study: "optuna.Study", each: _Trial, watch: Watch, plan: Plan) -> None:
+    """Tell the study what a trial is worth, and print it."""
+    states, trial = imported().trial.TrialState, each.trial
+    if each.failure:
+        trial.set_user_attr(FAILURE, each.failure)
         study.tell(trial, state=states.PRUNED)  # not FAIL, which the sampler would not learn from
-    elif watch.looked(at_once=True).is_pruned:
+    elif watch.is_pruned:
         study.tell(trial, state=states.PRUNED)
     else:
-        summaries = [summary_in(place) for place in folders.values()]
-        scores = [score(each, plan.metric) for each in summaries if each is not None]
+        summaries = [summary_in(place) for place in each.folders.values()]
+        scores = [score(summary, plan.metric) for summary in summaries if summary is not None]
         trial.set_user_attr(SCORES, scores)
         study.tell(trial, float(interquartile_mean(np.array(scores, dtype=np.float64))))
     told = study.get_trials(deepcopy=False)[trial.number]
@@ -235,58 +273,3 @@ def _train(study: "optuna.Study", trial: "optuna.Trial", plan: Plan, jobs: int) 
         f"pruned at step {told.last_step:,}" if told.state == states.PRUNED else f"{told.value:.4g}"
     )
     print(f"trial {trial.number}: {worth}", file=sys.stderr, flush=True)
-
-
-@final
-class Watch:
-    """Reports the evaluations that the runs of a trial log, in the order of seeds and steps, and says when it is over:
-    it is pruned, or a run has failed.
-
-    What is reported at a step of a seed is the interquartile mean over this seed and those before it, at this step.
-    """
-
-    def __init__(self, trial: "optuna.Trial", folders: Mapping[int, Path], plan: Plan) -> None:
-        self._trial, self._folders, self._plan = trial, folders, plan
-        self._every, self._total = plan.base.eval.every or 1, plan.base.total_steps
-        self._told = set(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
-        self._looked_at = 0.0
-        self.is_pruned = max(self._told, default=self._last) < self._last and trial.should_prune()
-
-    def __call__(self, failures: Mapping[str, str]) -> bool:
-        return bool(failures) or self.looked().is_pruned
-
-    def looked(self, *, at_once: bool = False) -> "Watch":
-        """Report what is new, unless it was looked for a moment ago."""
-        if at_once or time.monotonic() - self._looked_at > _LOOK:
-            for step, value in self._evaluations():
-                if self.is_pruned:
-                    break
-                if step not in self._told:
-                    self._told.add(step)
-                    self._trial.report(value, step)
-                    self.is_pruned = step < self._last and self._trial.should_prune()
-            self._looked_at = time.monotonic()
-        return self
-
-    @property
-    def _last(self) -> int:
-        """The last step of all: nothing is saved by pruning there."""
-        return len(self._folders) * self._total
-
-    def _evaluations(self) -> Iterator[tuple[int, float]]:
-        """Steps and values, up to the first seed that is still being trained."""
-        curves: list[tuple[list[int], list[float]]] = []
-        for number, place in enumerate(self._folders.values()):
-            lines = metrics(place, [])
-            points = {
-                line["step"]: line[self._plan.metric] for line in lines if line.get(self._plan.metric) is not None
-            }
-            curves.append((list(points), list(points.values())))
-            for at, value in points.items():
-                if at < self._every:
-                    continue
-                earlier = [float(np.interp(at, *curve)) for curve in curves[:-1]]
-                step = number * self._total + min(at // self._every * self._every, self._total)
-                yield step, float(interquartile_mean(np.array([*earlier, value])))
-            if summary_in(place) is None or not points:
-                return
