@@ -131,18 +131,20 @@ class NetworkCritic(Critic):
 
     def _see(self, rollout: Rollout) -> None:
         """Widen the range of values to what these rewards and discounts allow, and 0 after an end."""
-        columns = rollout.reward_TB, -rollout.reward_TB, -rollout.discount_TB
-        least = [torch.cat([x, x.new_zeros(1)]).amin() for x in map(rollout.of_visits, columns)]
-        seen_3 = rollout.ranks.least("rewards and discounts", torch.stack(least).to(self._seen_3))
-        self._keep_within(torch.minimum(self._seen_3, seen_3))
+        lowest, highest = rollout.of_visits(rollout.reward_TB).aminmax()
+        discount = rollout.of_visits(rollout.discount_TB).amax()
+        least_3 = torch.stack([lowest, -highest, -discount]).clamp_(max=0).to(self._seen_3)
+        seen_3 = rollout.ranks.least("rewards and discounts", least_3)
+        if not (seen_3.is_cpu and bool((seen_3 >= self._seen_3).all())):  # to ask a GPU takes longer than to compute
+            self._keep_within(torch.minimum(self._seen_3, seen_3))
 
     def _keep_within(self, seen_3: Float[Tensor, "3"]) -> None:
         """Take these as seen, and the range of values that follows: `value_range`."""
         self._seen_3.copy_(seen_3)
-        size_2 = -seen_3[:2].clamp(max=0)  # how far below and above 0 a reward can be
-        reach_2 = torch.where(size_2 > 0, size_2 / (1 + seen_3[2]), 0.0)
-        self._low.copy_(-reach_2[0])
-        self._high.copy_(reach_2[1])
+        size_2 = seen_3[:2].clamp(max=0)  # minus how far below and above 0 a reward can be
+        reach_2 = torch.where(size_2 < 0, size_2 / (1 + seen_3[2]), 0.0)
+        self._low.copy_(reach_2[0])
+        self._high.copy_(-reach_2[1])
 
     def _before_fit(self, rollout: Rollout, v_TB: Float[Tensor, "T B"]) -> Float[Tensor, "V"]:
         """The values of the visits that the fit changes; v_TB are those of the target network."""
