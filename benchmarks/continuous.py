@@ -54,7 +54,7 @@ OURS: dict[str, dict[str, Any]] = {
     "MountainCarContinuous-v0": UPHILL,
     "InvertedPendulum-v5": SIMULATED | {"horizon": {"type": "fixed", "length": 100}},
     "InvertedPendulum-v5 ensemble": {"policy": "gaussian", "depth": 0, "model": "ensemble"},
-    "Hopper-v5": SIMULATED,
+    "Hopper-v5": SIMULATED | {"gamma": 0.995, "num_envs": 2, "horizon": {"type": "fixed", "length": 500}},
     "HalfCheetah-v5": SIMULATED,
 }
 """Our settings, by environment, and model where it is not the given one; all others are the defaults."""

@@ -132,7 +132,7 @@ def test_the_shipped_configurations_are_those_of_the_paper_and_of_gymnasium() ->
     images = {"catch", "minigrid_door_key", "minigrid_empty"}
     learned = {f"learned_{name}" for name in (toy_text | {"acrobot", "cartpole", "deep_sea", "mountain_car"} | images)}
     games = {f"atari_{name}" for name in ("breakout", "freeway", "montezuma_revenge", "pong")}
-    emulators = games | {"mujoco_inverted_pendulum", "mujoco_hopper"}
+    emulators = games | {"mujoco_inverted_pendulum", "mujoco_hopper", "mujoco_half_cheetah"}
     assert set(SHIPPED) == own | others | learned | emulators
     assert own | {"learned_deep_sea"} == {
         name for name, path in SHIPPED.items() if load(path).env.id.startswith("pgts/")
