@@ -153,14 +153,15 @@ def main() -> None:
     if not with_peer:
         print('QuantEcon is not installed (pip install "pgts_torch[bench]"): only our own figures')
     memory = peak_memory_bytes()
+    peers = {"quantecon_sweep_s": "peer_s", "quantecon_optimal_s": "peer_s", "within_ratio": "ratio"}
     columns = ["sweep_s", "quantecon_sweep_s", "ratio", "evaluate_s", "optimal_s"]
     columns += ["within_s", "quantecon_optimal_s", "within_ratio"]
-    print(f"{'states':>9}" + "".join(f"{column:>21}" for column in columns))
+    print(f"{'states':>9}" + "".join(f"{peers.get(column, column):>11}" for column in columns))
     results = []
     for num_states in SIZES:
         result = sweep(num_states, with_peer) | (solve(num_states, with_peer) if num_states in SOLVE_SIZES else {})
         results.append(result)
-        cells = (f"{result[column]:>21.5f}" if column in result else f"{'-':>21}" for column in columns)
+        cells = (f"{result[column]:>11.5f}" if column in result else f"{'-':>11}" for column in columns)
         print(f"{num_states:>9}" + "".join(cells), flush=True)
     print(f"peak resident memory with {SIZES[-1]} states: {memory / 1e9:.2f} GB")
     if args.json:
