@@ -121,8 +121,8 @@ def main(arguments: list[str] | None = None) -> None:
     args = common.parser(__doc__).parse_args(arguments)
     common.use_one_core()
     report: dict[str, Any] = {"about": common.about(args)}
-    columns = "calls", "simulated", "a call", "a step", "blind", "restored", "emulator", "call / step"
-    print(f"{'us':18}{'m':>3}" + "".join(f"{column:>12}" for column in columns))
+    columns = "calls", "simulated", "a call", "a step", "blind", "restored", "emulator", "ratio"
+    print(f"{'us':18}{'m':>3}" + "".join(f"{column:>10}" for column in columns))
     for name, case in CASES.items():
         if not importlib.util.find_spec(case[0]):
             print(f"{case[0]} is not installed: {name} is left out", file=sys.stderr)
@@ -139,9 +139,9 @@ def main(arguments: list[str] | None = None) -> None:
         call, calls, simulated, *alone = (statistics.median(column) for column in zip(*rounds, strict=True))
         report[name] = {"call": call, "calls": calls, "simulated": simulated}
         report[name] |= dict(zip(("step", "blind", "restored", "emulator"), alone, strict=True))
-        times = "".join(f"{'-' if math.isnan(cost) else f'{cost:.1f}':>12}" for cost in (call, *alone))
+        times = "".join(f"{'-' if math.isnan(cost) else f'{cost:.1f}':>10}" for cost in (call, *alone))
         ratio = call / (alone[0] if math.isnan(alone[1]) else alone[1])
-        print(f"{name:18}{case[3]:3}{calls:12.0f}{simulated:12.0f}{times}{ratio:12.1f}", flush=True)
+        print(f"{name:18}{case[3]:3}{calls:10.0f}{simulated:10.0f}{times}{ratio:10.1f}", flush=True)
     common.write(report, args.json)
 
 
