@@ -139,7 +139,7 @@ class NetworkCritic(Critic):
             self._keep_within(torch.minimum(self._seen_3, seen_3))
 
     def _keep_within(self, seen_3: Float[Tensor, "3"]) -> None:
-        """Take these as seen, and the range of values that follows: `value_range`."""
+        """Take these as seen, and the range of values that follows: `models.rewards.value_range`, without a read."""
         self._seen_3.copy_(seen_3)
         size_2 = seen_3[:2].clamp(max=0)  # minus how far below and above 0 a reward can be
         reach_2 = torch.where(size_2 < 0, size_2 / (1 + seen_3[2]), 0.0)
@@ -251,6 +251,11 @@ class NetworkCritic(Critic):
         if not (isinstance(state["scale"], float) and state["scale"] >= 0):
             raise PgtsError(f"scale is {state['scale']!r}; it must be at least 0")
         check_count("num_fits", state["num_fits"], least=0)
+        seen = state.get("seen")
+        if seen is not None and not (
+            isinstance(seen, list) and len(seen) == 3 and all(isinstance(x, float) and x <= 0 for x in seen)
+        ):
+            raise PgtsError(f"seen is {seen!r}; it must be three numbers of at most 0")
         self.network.load_plain_state(state["network"])
         if self._lags:
             self._target_network.load_plain_state(state["target_network"])
@@ -259,8 +264,11 @@ class NetworkCritic(Critic):
         self._queried, self._num_fits = None, state["num_fits"]
         self._mean.fill_(state["mean"])
         self._scale.fill_(state["scale"])
-        if "seen" in state:
-            self._keep_within(torch.tensor(state["seen"], dtype=torch.float64))
+        if seen is None:
+            for each, unlimited in (self._seen_3, math.inf), (self._low, -math.inf), (self._high, math.inf):
+                each.fill_(unlimited)
+        else:
+            self._keep_within(torch.tensor(seen, dtype=torch.float64))
 
     def _values(self, network: Network, observation_N: Tensor) -> Float[Tensor, "N D"]:
         """The network's outputs in reward units."""

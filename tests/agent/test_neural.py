@@ -224,6 +224,18 @@ def test_the_range_of_values_is_that_of_all_rewards_and_discounts_so_far():
     assert sorted(critic.v(FAR_N1).tolist()) == pytest.approx([-10.0, 50.0])
 
 
+def test_a_state_saved_before_the_first_fit_has_no_range_and_a_wrong_range_is_refused():
+    critic, policy = NetworkCritic(LINE, 2, NetworkValues(network=MLP(hidden=()))), NetworkPolicy(LINE, 2)
+    unlearned, far_N = critic.state_dict(), critic.v(FAR_N1)
+    critic.fit(policy, w_to_2w(), generator=stream(0, "critic"))
+    learned = critic.state_dict()
+    for wrong in ("all", [-1.0], [-1.0, 2.0, -0.9]):
+        with pytest.raises(PgtsError, match="seen is"):
+            critic.load_state_dict(learned | {"seen": wrong})
+    critic.load_state_dict(unlearned)
+    assert torch.equal(critic.v(FAR_N1), far_N)
+
+
 @pytest.mark.parametrize(("polyak", "target_period"), [(0.25, 1), (1.0, 2), (0.25, 3)])
 def test_a_target_network_lags_behind(polyak, target_period):
     options = {"polyak": polyak, "target_period": target_period, "normalize_returns": False}
