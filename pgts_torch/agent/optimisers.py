@@ -20,8 +20,8 @@ BETAS = 0.9, 0.999
 _EPSILON = 1e-8
 
 _SHORT, _MANY = 2**15, 200
-"""Steps of up to so many numbers are compiled, because calls of torch take longer than these; and only from so many
-steps on, because a training that takes fewer is over before compiled loops are loaded."""
+"""Steps of dense networks with up to so many weights are compiled (`dense_steps`), because calls of torch take longer
+than the numbers; and only from so many steps on, because a shorter training is over before the loops are loaded."""
 
 
 @final
@@ -94,24 +94,17 @@ class Optimiser:
             norm = torch.linalg.vector_norm(gradient_D)
             if self._parameters is not parameters:
                 self._prepare(parameters)
-            is_short = self.method == "adam" and len(gradient_D) <= _SHORT
-            loops = is_short and self._compiles(gradient_D.device)
-            total = (self._compiled if loops else self._move)(gradient_D, norm)
+            total = self._move(gradient_D, norm)
             self._readings.check(loss, partial(refuse, "loss", f"the {name} loss"))
             self._readings.check(norm, partial(refuse, "gradient", f"the gradient of the {name} loss"))
             self._readings.check(total, partial(refuse, "gradient", f"the step down the {name} loss"))
             torch._foreach_add_(self._moved, self._pieces)
         return norm
 
-    def _compiles(self, device: torch.device) -> bool:
-        """Whether compiled loops are used where they save time. No bit of a step depends on it; those of the gradients
-        of dense layers do (`dense_steps`)."""
-        return self.num_steps >= _MANY and can_compile(device)
-
     def compiles_all_of(self, count: int, like: Tensor) -> bool:
-        """Whether steps of so many numbers like these are compiled as a whole, with their gradient."""
+        """Whether the next step of so many weights like these is a compiled loop, with its gradient."""
         is_short = count <= _SHORT and like.dtype == torch.float32
-        return is_short and self.method == "adam" and self._compiles(like.device)
+        return is_short and self.method == "adam" and self.num_steps >= _MANY and can_compile(like.device)
 
     def _prepare(self, parameters: Sequence[Tensor]) -> None:
         """Make room for steps of these parameters, which is kept."""
@@ -133,18 +126,6 @@ class Optimiser:
         second_D.mul_(BETAS[1]).addcmul_(gradient_D, gradient_D, value=1 - BETAS[1])
         epsilon, rate = self._corrected()
         return torch.div(first_D, second_D.sqrt().add_(epsilon), out=self._step_D).mul_(rate).sum()
-
-    def _compiled(self, gradient_D: Tensor, norm: Tensor) -> Tensor:
-        """As `_move` of Adam, by compiled loops."""
-        from pgts_torch.agent import step_kernels
-
-        first_D, second_D, longest, epsilon, rate = self.next_step(gradient_D)
-        first, second, total = first_D.numpy(), second_D.numpy(), torch.empty_like(norm)
-        rates = 1 - BETAS[0], BETAS[1], 1 - BETAS[1]
-        step_kernels.move_moments(gradient_D.numpy(), norm.numpy(), longest, first, second, *rates)
-        torch.sqrt(second_D, out=self._step_D)
-        step_kernels.steps(first, self._step_D.numpy(), epsilon, rate, total.numpy())
-        return total
 
     def next_step(self, like_D: Tensor) -> tuple[Tensor, Tensor, float, float, float]:
         """Count one more step of Adam, which the caller takes. Return the moments, which it changes in place, the

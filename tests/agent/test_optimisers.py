@@ -3,7 +3,6 @@
 import copy
 import math
 from collections.abc import Callable
-from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -11,7 +10,6 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from pgts_torch.agent import optimisers
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.neural import NetworkPolicy
@@ -49,41 +47,6 @@ def test_adam_is_that_of_torch_and_gradients_are_clipped_as_torch_does():
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
     assert (ours[0] - 1).abs().max() > 0.1
     assert clipped == {False, True}
-
-
-@pytest.mark.parametrize("max_grad_norm", [None, 0.5])
-def test_compiled_steps_have_the_bits_of_torch(monkeypatch, max_grad_norm):
-    step_kernels, found, compiled = pytest.importorskip("pgts_torch.agent.step_kernels"), [], []
-    plain = step_kernels.steps
-    monkeypatch.setattr(step_kernels, "steps", lambda *each: compiled.append(plain(*each)))
-    monkeypatch.setattr(optimisers, "_MANY", 10)
-    for form in (nullcontext, torch_only):
-        generator, parameter = stream(0, "compiled"), torch.nn.Parameter(torch.ones(1003))
-        optimiser, norms = Optimiser(learning_rate=1e-3, max_grad_norm=max_grad_norm), []
-        with form(), optimiser.attempt([parameter]):
-            for k in range(60):
-                gradient_D = torch.randn(1003, generator=generator) * 10.0 ** (k % 12 - 6)
-                norms.append(optimiser.step([parameter], [gradient_D], torch.zeros(()), "test"))
-        found.append((parameter.detach(), *optimiser.moments, torch.stack(norms)))
-        with pytest.raises(NotFinite, match="the gradient"), form(), optimiser.attempt([parameter]):
-            optimiser.step([parameter], [torch.full_like(gradient_D, math.nan)], torch.zeros(()), "test")
-        assert torch.equal(parameter, found[-1][0])
-    for one, other in zip(*found, strict=True):
-        assert torch.equal(one, other)
-    assert len(compiled) == 50 + 1
-    assert (found[0][0] - 1).abs().min() > 0
-
-
-def test_few_steps_and_long_gradients_are_left_to_torch(monkeypatch):
-    step_kernels = pytest.importorskip("pgts_torch.agent.step_kernels")
-    calls: list[int] = []
-    monkeypatch.setattr(step_kernels, "steps", lambda first, *_: calls.append(len(first)))
-    for size in (2**15, 2**15 + 1):
-        parameters, optimiser = [torch.nn.Parameter(torch.zeros(size))], Optimiser(learning_rate=0.1, max_grad_norm=1.0)
-        with optimiser.attempt(parameters):
-            for _ in range(202):
-                optimiser.step(parameters, [torch.ones(size)], torch.zeros(()), "test")
-    assert calls == [2**15] * 2
 
 
 @pytest.mark.parametrize("size", [0.0, 0.3, 0.7, 1e15])
