@@ -23,12 +23,12 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from linear import LinearQuadratic
 
 from pgts_torch import PGTS
 from pgts_torch.agent.evaluate import Evaluator
 from pgts_torch.agent.gaussian import GaussianPolicy, MixtureProposal
 from pgts_torch.models.drawn_actions import DrawnActions
-from pgts_torch.models.linear import LinearQuadratic
 from pgts_torch.search import expectimax, mcts
 
 GAMMA, STATES, _ACTIONS = 0.9, 500, 16

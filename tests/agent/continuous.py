@@ -6,9 +6,9 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from benchmarks.linear import LinearQuadratic
 from pgts_torch.agent.gaussian import GaussianPolicy, MixtureProposal
 from pgts_torch.models.drawn_actions import DrawnActions
-from pgts_torch.models.linear import LinearQuadratic
 from pgts_torch.options import MLP, Gaussian
 
 GAMMA = 0.9

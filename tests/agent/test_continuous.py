@@ -7,12 +7,12 @@ import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from benchmarks.linear import LinearQuadratic
 from pgts_torch import PGTS
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.model_check import ModelCheck
 from pgts_torch.errors import ModelMismatch, PgtsError, RandomOutcomes
 from pgts_torch.models import classic
-from pgts_torch.models.linear import LinearQuadratic
 from pgts_torch.models.squash import Squash, Squashed
 from pgts_torch.models.vector_simulator import VectorSimulator
 from pgts_torch.seeding import stream

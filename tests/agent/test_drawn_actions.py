@@ -4,8 +4,8 @@ import pytest
 import torch
 from scipy import stats
 
+from benchmarks.linear import LinearQuadratic
 from pgts_torch.agent.gaussian import Normals
-from pgts_torch.models.linear import LinearQuadratic
 from pgts_torch.search import expectimax
 from pgts_torch.search.mcts import mcts
 from tests.agent.continuous import GAMMA, drawing, gaussian, some_states

@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 
+from benchmarks.linear import LinearQuadratic
 from pgts_torch.agent.gaussian import Normals
 from pgts_torch.agent.gaussian_updates import GaussianGradientUpdate, GaussianPPOUpdate, MPOUpdate
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.drawn_actions import Drawn
-from pgts_torch.models.linear import LinearQuadratic
 from pgts_torch.options import MPO, PPO, Gradient
 from pgts_torch.seeding import stream
 from tests.agent.continuous import GAMMA, drawing, gaussian, some_states

@@ -5,9 +5,9 @@ import itertools
 import pytest
 import torch
 
+from benchmarks.linear import LinearQuadratic
 from pgts_torch.errors import NodeBudgetExceeded, PgtsError
 from pgts_torch.models.base import FollowingModel
-from pgts_torch.models.linear import LinearQuadratic
 from pgts_torch.options import MCTS
 from pgts_torch.search import expectimax, mcts
 from pgts_torch.search.lookahead import Leaves
