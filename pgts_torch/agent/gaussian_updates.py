@@ -18,7 +18,7 @@ from torch import Tensor
 from pgts_torch.agent.gaussian import GaussianPolicy, Normals
 from pgts_torch.agent.gradients import Forward
 from pgts_torch.agent.iteration import Batch
-from pgts_torch.agent.objectives import check_numbers, mean
+from pgts_torch.agent.objectives import check_numbers, in_own_units, mean
 from pgts_torch.agent.optimisers import minibatches
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.stepped import SteppedUpdate
@@ -238,10 +238,8 @@ class GaussianPPOUpdate(GaussianUpdate):
         drawn, advantage_NK = batch.drawn, batch.advantage_NA.float()
         assert drawn is not None
         if self.options.normalize_advantage:
-            size_N = (drawn.prob_NK * advantage_NK.abs()).sum(-1)
             share = batch.ranks.share("rows", len(weight_N))
-            square = batch.ranks.sum("advantages", mean(weight_N, size_N.square(), share.total))
-            advantage_NK = advantage_NK / (square.sqrt() + 1e-8)
+            advantage_NK = in_own_units(advantage_NK, drawn.prob_NK, weight_N, share)
         return drawn.action_NKX, drawn.prob_NK, advantage_NK, old.log_density(drawn.action_NKX)
 
     def loss(

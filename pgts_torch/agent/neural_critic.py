@@ -41,9 +41,8 @@ class NetworkCritic(Critic):
 
     y_t are lambda-returns or Monte-Carlo returns, bootstrapped with the target network where an episode was cut off and
     not where it terminated. mean and scale are running statistics of the targets, with the rate 1/k in fit k, at least
-    1/10; when they change, the head is rescaled so that v stays the same (PopArt; van Hasselt et al. 2016). In the
-    first fit targets are bootstrapped with 0, unless v was queried before. So rewards times 2^k give values times 2^k,
-    bit for bit.
+    1/10; when they change, the head is rescaled so that v stays the same (PopArt; van Hasselt et al. 2016). Before
+    the first fit scale is 0, and so are all values. So rewards times 2^k give values times 2^k, bit for bit.
 
     Values are in the range that all rewards and discounts of the fits so far allow,
 
@@ -88,7 +87,7 @@ class NetworkCritic(Critic):
             compile_as_steps(each, self._optimiser)
         self._policy: Policy | None = None
         self._queried: tuple[Rollout, tuple[Tensor, Tensor]] | None = None
-        self._mean, self._scale = (torch.tensor(x, dtype=torch.float64, device=device) for x in (0.0, 1.0))
+        self._mean, self._scale = (torch.tensor(0.0, dtype=torch.float64, device=device) for _ in range(2))
         self._num_fits = 0
         # The least reward, minus the greatest one and minus the largest discount; infinite before any was seen.
         self._seen_3 = torch.full((3,), math.inf, dtype=torch.float64, device=device)
@@ -292,8 +291,6 @@ class NetworkCritic(Critic):
         queried, self._queried = self._queried, None
         if queried is not None and queried[0] is rollout and not self._lags:
             v_TB, next_v_TB = queried[1]
-        elif queried is None and not self._num_fits and self.options.normalize_returns:
-            v_TB = next_v_TB = torch.zeros_like(rollout.reward_TB)
         else:
             v_TB, next_v_TB = rollout.values(lambda observation_N: self._v(self._target_network, observation_N))
         return v_TB, critic_targets(rollout, next_v_TB, self.options.method, readings)

@@ -28,12 +28,12 @@ from pgts_torch.agent.objectives import (
     check_numbers,
     divergence,
     entropy,
+    in_own_units,
     log_probs,
     log_probs_before,
     log_softmax,
     mean,
     passes,
-    size_of,
     with_legal,
 )
 from pgts_torch.agent.policies import Policy
@@ -226,7 +226,7 @@ class PPOUpdate(NetworkUpdate):
         share = batch.ranks.share("rows", len(input_N))
         weight_N = batch.weight_N / share.mean("weights", batch.weight_N)
         if self.options.normalize_advantage:
-            advantage_NA = advantage_NA / size_of(old_NA, advantage_NA, weight_N, share)
+            advantage_NA = in_own_units(advantage_NA, old_NA.exp(), weight_N, share)
         columns, num_steps, clip = [input_N, old_NA, advantage_NA, weight_N], 0, self.now.clip_range
         parts = passes(with_legal(columns, batch.legal_NA), share, self.options, generator)
         clips = 1 - clip, 1 + clip, self.now.entropy_coef

@@ -71,12 +71,13 @@ def mean(weight_N: Float[Tensor, "N"], value_N: Float[Tensor, "N"], count: int) 
     return weight_N @ value_N / count
 
 
-def size_of(
-    old_NA: Float[Tensor, "N A"], advantage_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"], share: Share
-) -> Float[Tensor, ""]:
-    """sqrt( mean_s w(s) (sum_a pi_old(a|s) |adv(s, a)|)^2 ), never 0."""
-    size_N = (old_NA.exp() * advantage_NA.abs()).sum(-1)
-    return share.ranks.sum("advantages", mean(weight_N, size_N.square(), share.total)).sqrt() + 1e-8
+def in_own_units(
+    advantage_NA: Float[Tensor, "N A"], pi_NA: Float[Tensor, "N A"], weight_N: Float[Tensor, "N"], share: Share
+) -> Float[Tensor, "N A"]:
+    """adv(s, a) / sqrt( mean_s w(s) (sum_a pi(a|s) |adv(s, a)|)^2 ): advantages of mean size 1, or 0 where all are."""
+    size_N = (pi_NA * advantage_NA.abs()).sum(-1)
+    size = share.ranks.sum("advantages", mean(weight_N, size_N.square(), share.total)).sqrt()
+    return torch.where(size == 0, 0.0, advantage_NA / size)
 
 
 def check_numbers(batch: Batch, readings: Readings) -> None:

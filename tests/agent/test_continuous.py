@@ -187,7 +187,10 @@ def test_a_lookahead_trains_the_double_integrator_to_nearly_its_best_return():
 REPLAYED = {"policy": "gaussian", "actions": 4, "depth": 0, "replay": {"type": "uniform", "starts": 4, "length": 10}}
 
 
-@pytest.mark.parametrize("options", [SMALL, REPLAYED], ids=["rollouts", "replay"])
+SAMPLED = {"policy": "gaussian", "depth": 0, "estimator": "sampled", "num_envs": 4, "horizon": SMALL["horizon"]}
+
+
+@pytest.mark.parametrize("options", [SMALL, REPLAYED, SAMPLED], ids=["rollouts", "replay", "sampled"])
 def test_rewards_of_any_size_train_the_same_policy(options):
     horizon = {"type": "steps", "length": 20, "first": 60} if options is REPLAYED else options["horizon"]
     given = options | {"gamma": GAMMA, "horizon": horizon}

@@ -79,6 +79,16 @@ def test_rewards_times_a_power_of_two_leave_every_bit_of_the_policy(depth: int, 
     assert not same(trained(lambda: Cart(-1.0), depth=depth, critic=critic), plain)
 
 
+@pytest.mark.fault("rewards in another unit, networks")
+@pytest.mark.parametrize("normalize", [True, False])
+def test_the_same_holds_of_sampled_advantages_where_values_are_normalised(normalize: bool):
+    options: dict[str, Any] = {"depth": 0, "estimator": "sampled"}
+    options["critic"] = {"type": "network", "normalize_returns": normalize}
+    plain = trained(Cart, **options)
+    for power in (-40, 40):
+        assert same(trained(lambda: Cart(2.0**power), **options), plain) == normalize  # noqa: B023
+
+
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "FrozenLake-v1"])
 def test_dynamics_and_tables_behind_a_wrapper_of_rewards_do_not_depend_on_their_unit(env_id: str):
     def scaled(unit: float) -> PGTS:

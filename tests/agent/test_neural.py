@@ -42,7 +42,7 @@ def tabular_critic(value_S: list[float] | Tensor, **options) -> NetworkCritic:
 
 def fitted(critic: NetworkCritic) -> NetworkCritic:
     """The critic as one that has been fitted before: its values count."""
-    critic.load_state_dict(critic.state_dict() | {"num_fits": 1})
+    critic.load_state_dict(critic.state_dict() | {"num_fits": 1, "scale": 1.0})
     return critic
 
 
@@ -53,18 +53,17 @@ def lagging(critic: NetworkCritic) -> NetworkCritic:
     return other
 
 
-def test_before_the_first_fit_values_are_0_unless_they_were_queried():
-    def loss(critic: NetworkCritic, *, queried: bool = False) -> float:
-        """The mean squared difference of the values of `by_hand` and their targets."""
-        made = by_hand()
-        if queried:
-            critic.values(made)
-        return critic.fit(following(torch.ones(4, 2) / 2), made, generator=stream(0, "critic"))["value"]
-
-    tens, zeros = [10.0] * 4, [0.0] * 4
-    assert loss(tabular_critic(tens)) == loss(fitted(tabular_critic(zeros)))
-    assert loss(tabular_critic(tens), queried=True) == loss(fitted(tabular_critic(tens)))
-    assert loss(fitted(tabular_critic(tens))) != loss(fitted(tabular_critic(zeros)))
+@pytest.mark.parametrize("target", ["v", "q"])
+def test_before_the_first_fit_all_values_are_0_and_then_those_that_were_fitted(target):
+    critic = NetworkCritic(VECTORS, 2, NetworkValues(target=target))
+    made, policy = by_hand(shows=POINTS_SD), NetworkPolicy(VECTORS, 2)
+    ask = critic.v if target == "v" else critic.q
+    assert not ask(POINTS_SD).any()
+    assert critic.network.outputs(POINTS_SD).all()
+    if target == "v":
+        assert not any(value_TB.any() for value_TB in critic.values(made))
+    critic.fit(policy, made, generator=stream(0, "critic"))
+    assert ask(POINTS_SD).all()
 
 
 def test_a_policy_is_the_softmax_of_its_network_and_nearly_uniform_at_first():
@@ -217,7 +216,6 @@ def test_values_in_states_without_visits_do_not_feed_on_themselves(target, rewar
 
 def test_the_range_of_values_is_that_of_all_rewards_and_discounts_so_far():
     critic, policy = NetworkCritic(LINE, 2, NetworkValues(network=MLP(hidden=()))), NetworkPolicy(LINE, 2)
-    assert critic.v(FAR_N1).abs().min() > 1e6  # before the first fit nothing is known
     critic.fit(policy, w_to_2w(5.0, ends=True), generator=stream(0, "critic"))
     assert sorted(critic.v(FAR_N1).tolist()) == pytest.approx([0.0, 5.0])
     critic.fit(policy, w_to_2w(-1.0), generator=stream(0, "critic"))
@@ -225,7 +223,8 @@ def test_the_range_of_values_is_that_of_all_rewards_and_discounts_so_far():
 
 
 def test_a_state_saved_before_the_first_fit_has_no_range_and_a_wrong_range_is_refused():
-    critic, policy = NetworkCritic(LINE, 2, NetworkValues(network=MLP(hidden=()))), NetworkPolicy(LINE, 2)
+    options = NetworkValues(network=MLP(hidden=()), normalize_returns=False)
+    critic, policy = NetworkCritic(LINE, 2, options), NetworkPolicy(LINE, 2)
     unlearned, far_N = critic.state_dict(), critic.v(FAR_N1)
     critic.fit(policy, w_to_2w(), generator=stream(0, "critic"))
     learned = critic.state_dict()
