@@ -33,7 +33,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
 }
 SEARCHES: dict[str, dict[str, Any]] = {
     "lookahead": SHORT | {"depth": 1},
-    "no lookahead": SHORT | {"depth": 0, "estimator": "sampled"},
+    "no lookahead": {"num_envs": 2, "horizon": {"type": "fixed", "length": 40}, "depth": 0, "estimator": "sampled"},
 }
 ONGOING: dict[str, Any] = {
     "depth": 1,
