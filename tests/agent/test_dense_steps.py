@@ -129,7 +129,9 @@ def test_values_of_a_critic_are_those_of_torch_up_to_rounding_and_compiled_as_it
         plain(*given)
 
     monkeypatch.setattr(dense_kernels, "outputs", counted)
-    critic = NetworkCritic(VECTORS, 4, NetworkValues(target=target, network=NETWORKS[network]), seed=1)
+    critic = NetworkCritic(
+        VECTORS, 4, NetworkValues(target=target, network=NETWORKS[network], normalize_returns=False), seed=1
+    )
     values = getattr(critic, target)
     observation_N = torch.randn(70, 3, generator=stream(0, "rows"))
     expected = values(observation_N)
@@ -187,7 +189,8 @@ def test_weights_have_gradients_also_where_a_policy_was_first_asked_in_inference
 
 def test_a_trunk_that_two_networks_share_and_copies_of_them_have_the_weights_that_were_last_learned(calls):
     policy = NetworkPolicy(VECTORS, 4, MLP(hidden=[8]), seed=1)
-    critic = NetworkCritic(VECTORS, 4, NetworkValues(network="shared"), trunk=policy.network.trunk, seed=1)
+    options = NetworkValues(network="shared", normalize_returns=False)
+    critic = NetworkCritic(VECTORS, 4, options, trunk=policy.network.trunk, seed=1)
     update, observation_N = UPDATES["gradient"](), batch().observation_N
     update.check(policy)
     with torch_only():
