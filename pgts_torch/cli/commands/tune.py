@@ -20,72 +20,8 @@ tune.json, tune.png and best.yaml are written; pgts train takes the last one."""
 
 def tune(arguments: Arguments) -> None:
     """Look for good values of options, over several seeds."""
-    parser = Parser(tune, usage="%(prog)s --out DIR --option KEY=VALUES ... [--KEY VALUE ...]")
-    parser.add_argument("--out", metavar="DIR", type=output_folder, help="for DIR/trial-N/seed-S and the results")
-    parser.add_argument(
-        "--option",
-        metavar="KEY=VALUES",
-        action="append",
-        default=[],
-        help="which values a key may have: uniform(LOW,HIGH), log(LOW,HIGH), int(LOW,HIGH), logint(LOW,HIGH), or "
-        "several as in 1,2,4; once for each key",
-    )
-    parser.add_argument("--config", metavar="FILE", help="as for pgts train; none: the defaults")
-    parser.add_argument("--trials", metavar="N", type=whole(1), default=50, help="in all (default: %(default)s)")
-    parser.add_argument(
-        "--seeds", metavar="N", type=whole(1), default=3, help="of each trial, 0 to N - 1 (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--batch",
-        metavar="N",
-        type=whole(1),
-        default=1,
-        help="trials that are proposed at once, without knowing of each other, and trained side by side (default: "
-        "%(default)s)",
-    )
-    parser.add_argument(
-        "--jobs",
-        metavar="N",
-        type=whole(1),
-        default=1,
-        help="runs at once: no more than seeds times --batch are of use (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--metric",
-        choices=TUNED_METRICS,
-        default=TUNED_METRICS[0],
-        help="of the trained policy, higher is better (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--sampler", choices=("tpe", "random"), default="tpe", help="what proposes values (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--prune",
-        metavar="SHARE",
-        type=unit_interval,
-        default=0.5,
-        help="end trials whose best evaluation is among this share of the worst; 0: none (default: 0.5, the median)",
-    )
-    parser.add_argument(
-        "--prune-trials",
-        metavar="N",
-        type=whole(0),
-        default=5,
-        help="complete trials before any is pruned (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--prune-steps",
-        metavar="N",
-        type=whole(0),
-        default=0,
-        help="environment steps, of all seeds together, before a trial is pruned (default: %(default)s)",
-    )
-    parser.add_argument("--storage", metavar="FILE", type=Path, help="Optuna's, of SQLite (default: DIR/tune.db)")
-    parser.add_argument(
-        "--confirm", metavar="N", type=whole(0), default=0, help="train the best one with N other seeds (default: 0)"
-    )
-    parser.add_argument("--json", action="store_true", help="print the results as one JSON object")
-    parser.epilog = HELP
+    parser = Parser(tune, usage="%(prog)s --out DIR --option KEY=VALUES ... [--KEY VALUE ...]", epilog=HELP)
+    _add_arguments(parser)
     given, overrides = parser.parse_known_args(arguments)
     if given.out is None:
         parser.error("the following arguments are required: --out")
@@ -104,3 +40,45 @@ def tune(arguments: Arguments) -> None:
     print_kept(json.dumps(asdict(answer)) if given.json else result.describe(answer), kept=f"{given.out}/tune.json")
     if answer.best is None:
         raise SystemExit(FAILED)
+
+
+def _add_arguments(parser: Parser) -> None:
+    parser.add_argument("--out", metavar="DIR", type=output_folder, help="for DIR/trial-N/seed-S and the results")
+    parser.add_argument(
+        "--option",
+        metavar="KEY=VALUES",
+        action="append",
+        default=[],
+        help="which values a key may have: uniform(LOW,HIGH), log(LOW,HIGH), int(LOW,HIGH), logint(LOW,HIGH), or "
+        "several as in 1,2,4; once for each key",
+    )
+    parser.add_argument("--config", metavar="FILE", help="as for pgts train; none: the defaults")
+    for name, least, default, meaning in [
+        ("trials", 1, 50, "in all"),
+        ("seeds", 1, 3, "of each trial, 0 to N - 1"),
+        ("batch", 1, 1, "trials that are proposed at once, without knowing of each other, and trained side by side"),
+        ("jobs", 1, 1, "runs at once: no more than seeds times --batch are of use"),
+        ("confirm", 0, 0, "train the best one with N other seeds"),
+        ("prune-trials", 0, 5, "complete trials before any is pruned"),
+        ("prune-steps", 0, 0, "environment steps, of all seeds together, before a trial is pruned"),
+    ]:
+        meaning += " (default: %(default)s)"
+        parser.add_argument(f"--{name}", metavar="N", type=whole(least), default=default, help=meaning)
+    parser.add_argument(
+        "--prune",
+        metavar="SHARE",
+        type=unit_interval,
+        default=0.5,
+        help="end trials whose best evaluation is among this share of the worst; 0: none (default: 0.5, the median)",
+    )
+    parser.add_argument(
+        "--metric",
+        choices=TUNED_METRICS,
+        default=TUNED_METRICS[0],
+        help="of the trained policy, higher is better (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--sampler", choices=("tpe", "random"), default="tpe", help="what proposes values (default: %(default)s)"
+    )
+    parser.add_argument("--storage", metavar="FILE", type=Path, help="Optuna's, of SQLite (default: DIR/tune.db)")
+    parser.add_argument("--json", action="store_true", help="print the results as one JSON object")
