@@ -59,6 +59,19 @@ def _count_children(child, node, edge, rules, valued_L, node_at, n):  # type: ig
 
 
 @inlined
+def _add_roots(  # type: ignore[no-untyped-def]
+    reward, prob, discount, child, table_row, state, prior, node, arm, edge, slot, lane, rules, root_B, valued_L,
+    node_at,
+):  # fmt: skip
+    for b in range(len(root_B)):
+        node[b].v, _ = expand(
+            reward, prob, discount, child, table_row, state, prior, node, arm, edge, rules, b, root_B[b], np.int64(0),
+        )  # fmt: skip
+        begin(arm, slot, lane, rules, b, b, b)
+        _count_children(child, node, edge, rules, valued_L, node_at, b)
+
+
+@inlined
 def _descend(child, node, arm, edge, path, node_at, rules, n, a, score_A):  # type: ignore[no-untyped-def]
     """Send a simulation down by an action of root n. Return the level of the node where it ends, whose edge in `path`
     leads to a child that is no node yet; or, as the second number, where nothing is left to expand: the child."""
@@ -74,6 +87,27 @@ def _descend(child, node, arm, edge, path, node_at, rules, n, a, score_A):  # ty
             return level, below
         n, level = below, level + 1
         a = select(arm, rules, n, score_A)
+
+
+@inlined
+def _backward(child, node, arm, edge, path, node_at, rules, level, is_used):  # type: ignore[no-untyped-def]
+    """Back up the nodes of a path from this level up, and count the simulation where it could be used."""
+    for j in range(level, -1, -1):
+        y = path[j]
+        edge[y.node, y.action, y.k].visits += is_used
+        arm[y.node, y.action].visits += is_used
+        _refresh(child, node, arm, edge, node_at, rules, y.node)
+
+
+@inlined
+def _begin_round(child, node, arm, edge, slot, lane, rules, preference, score_A, class_A, node_at):  # type: ignore[no-untyped-def]
+    """Back up the roots. Return how many simulations all of them are to send in the next round."""
+    under_way = 0
+    for b in range(len(slot)):
+        _refresh(child, node, arm, edge, node_at, rules, b)
+        slot[b].waiting = due(node, arm, slot, lane, rules, preference, b, b, score_A, class_A, True)
+        under_way += slot[b].waiting
+    return under_way
 
 
 @inlined
@@ -95,10 +129,9 @@ def search(  # type: ignore[no-untyped-def]
     reward, prob, discount, child, table_row, state, prior, node, arm, edge, slot, lane, rules, root_B, preference,
     q_BA, mass_BA, wanted, turn, valued_L, mass_N, score_A, class_A, child_C, v_C, learned, row, step, node_at, path,
 ):  # fmt: skip
-    """Go on with all searches. Return 0 where they are over, or why not.
-
-    Where a state is unknown it is then to run ahead, and returns how many states are wanted, which are listed in
-    `wanted`; what it has changed in `node`, `arm`, `edge`, `slot` and `path` is to be taken back.
+    """Go on with all searches. Return 0 where they are over, or why not. After UNKNOWN it is called once more, to run
+    ahead: then it returns how many states are wanted, which are listed in `wanted`, and what it has changed in `node`,
+    `arm`, `edge`, `slot` and `path` is to be taken back.
 
     Args:
         turn: how many nodes there are, whether a round is under way, the root and its action that are next in it,
@@ -108,31 +141,22 @@ def search(  # type: ignore[no-untyped-def]
     """
     if not learn(state, child_C, v_C, learned, row, step):
         return NOT_FINITE
-    B = len(root_B)
     if turn[0] == 0:
-        turn[0] = B
-        for b in range(B):
-            node[b].v, _ = expand(
-                reward, prob, discount, child, table_row, state, prior, node, arm, edge, rules, b, root_B[b],
-                np.int64(0),
-            )  # fmt: skip
-            begin(arm, slot, lane, rules, b, b, b)
-            _count_children(child, node, edge, rules, valued_L, node_at, b)
+        turn[0] = len(root_B)
+        _add_roots(
+            reward, prob, discount, child, table_row, state, prior, node, arm, edge, slot, lane, rules, root_B,
+            valued_L, node_at,
+        )  # fmt: skip
     while valued_L[-1] <= rules.max_nodes:
         if turn[1] == 0:
-            under_way = 0
-            for b in range(B):
-                _refresh(child, node, arm, edge, node_at, rules, b)
-                slot[b].waiting = due(node, arm, slot, lane, rules, preference, b, b, score_A, class_A, True)
-                under_way += slot[b].waiting
-            if under_way == 0:
+            if _begin_round(child, node, arm, edge, slot, lane, rules, preference, score_A, class_A, node_at) == 0:
                 _finish(child, node, arm, edge, node_at, rules, turn[0], q_BA, mass_BA, mass_N)
                 return 0
             turn[1], turn[2], turn[3] = 1, 0, 0
         num_wanted, nodes, i, runs_ahead, level_after = 0, turn[0], turn[3], turn[4] == 1, turn[5]
         if not runs_ahead:
             turn[5] = 0
-        for b in range(turn[2], B):
+        for b in range(turn[2], len(root_B)):
             while i < slot[b].waiting:
                 root_arm = arm[b, lane[b, i].first]
                 if root_arm.open == 0:  # other roots have expanded all below it
@@ -143,7 +167,7 @@ def search(  # type: ignore[no-untyped-def]
                 level, below = level_after - 1, 0
                 if level_after == 0:
                     level, below = _descend(child, node, arm, edge, path, node_at, rules, b, lane[b, i].first, score_A)
-                level_after = 0
+                level_after, is_used = 0, below == 0 or node[below].row < 0
                 if below == 0:
                     below, y = nodes, path[level]
                     s = child[node[y.node].row, y.action, y.k]
@@ -169,14 +193,7 @@ def search(  # type: ignore[no-untyped-def]
                             state[s].row = WANTED
                             wanted[num_wanted] = s
                             num_wanted += 1
-                    is_used = True
-                else:
-                    is_used = node[below].row < 0
-                for j in range(level, -1, -1):
-                    y = path[j]
-                    edge[y.node, y.action, y.k].visits += is_used
-                    arm[y.node, y.action].visits += is_used
-                    _refresh(child, node, arm, edge, node_at, rules, y.node)
+                _backward(child, node, arm, edge, path, node_at, rules, level, is_used)
                 slot[b].used -= not is_used  # it can be sent again
                 if valued_L[-1] > rules.max_nodes:
                     return TOO_MANY

@@ -80,6 +80,20 @@ def _average(discount, node, arm, edge, root, n, a, k, value):  # type: ignore[n
         n, a, k = root + node[n].parent, node[n].action, node[n].k
 
 
+@inlined
+def _finish(node, arm, edge, slot, rules, w, q_BA, mass_BA, mass_N):  # type: ignore[no-untyped-def]
+    """Write what a search has found, and leave its slot."""
+    x, root = slot[w], w * rules.room
+    for a in range(arm.shape[1]):
+        q_BA[x.root, a] = arm[root, a].q
+    if rules.mean:
+        mass_BA[x.root] = np.inf
+    else:
+        for i in range(x.nodes - 1, -1, -1):  # children come after their parents
+            mass_N[i] = open_mass(node, edge, rules, root + i, mass_N, mass_BA[x.root])
+    x.root = -1
+
+
 @jit
 def search(  # type: ignore[no-untyped-def]
     reward, prob, discount, child, table_row, state, prior, node, arm, edge, slot, lane, rules, root_B, preference,
@@ -158,12 +172,5 @@ def search(  # type: ignore[no-untyped-def]
             for i in range(count):
                 _descend(node, arm, edge, lane, rules, w, i, lane[w, i].first, score_A)
             if count == 0:
-                for a in range(arm.shape[1]):
-                    q_BA[x.root, a] = arm[root, a].q
-                if rules.mean:
-                    mass_BA[x.root] = np.inf
-                else:
-                    for i in range(x.nodes - 1, -1, -1):  # children come after their parents
-                        mass_N[i] = open_mass(node, edge, rules, root + i, mass_N, mass_BA[x.root])
-                x.root = -1
+                _finish(node, arm, edge, slot, rules, w, q_BA, mass_BA, mass_N)
     return num_wanted
