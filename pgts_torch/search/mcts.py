@@ -49,24 +49,20 @@ def mcts(
 ) -> Lookahead:
     """(T^m Q)(s, .) at the roots for m = depth, approached by so many simulations.
 
-    A simulation descends from a root by the tree rule, expands one node and backs up its value. An expanded node has
-    all its actions evaluated at once, with the critic at all their outcomes, so a maximum is never one over visited
-    actions alone:
+    A simulation descends from a root by the tree rule, expands one node and backs up its value. All actions of an
+    expanded node are evaluated at once, with the critic at all their outcomes:
 
         q(n, a) = r + sum_k p_k gamma_k v(n_k),   v(n) = max_a q(n, a) where n is expanded, else the critic's
 
-    An action with the reward -inf is not allowed: its q is -inf, nothing below it is queried, and it gets neither prior
-    nor simulations. Of the outcomes of an action the one that most lacks simulations is taken,
-    argmax_k p_k (N_a + 1) - N_k: outcomes are visited in proportion to their probabilities, not sampled. A node below
-    which everything is expanded is exhausted and never selected again, so after finitely many simulations the answer is
-    T^m Q.
+    An action with the reward -inf is not allowed: its q is -inf, and it gets neither prior nor simulations. Outcomes
+    are not sampled but visited in proportion to their probabilities: a simulation takes argmax_k p_k (N_a + 1) - N_k. A
+    node below which everything is expanded is exhausted and never selected again, so after finitely many simulations
+    the answer is T^m Q.
 
-    On the CPU simulations come one after another, in compiled loops (`pgts_torch.search.forest`), which stop at unknown
-    states until the model and the critic have been called for those of all roots together. On other devices, or where
-    numba is missing, they go down in waves (`pgts_torch.search.tree`): those of one wave are split among actions and
-    outcomes as if they came one by one, but do not know each other's values. What a wave could not use is sent again.
-    With waves of 1 both are the same search; without merging, where the model keeps a table of all states, it then is
-    one of fixed shape (`pgts_torch.search.fixed_trees`), for which the critic values all states.
+    On the CPU simulations come one after another, in compiled loops (`search.forest`). On other devices, or without
+    numba, they come in waves (`search.tree`): the simulations of a wave are split among actions and outcomes as if they
+    came one by one, but do not know each other's values. Waves of 1 are the search of the CPU; where the model keeps a
+    table of all states, in arrays of fixed shape (`search.fixed_trees`).
 
     With root="gumbel" the root's actions get simulations by sequential halving of g(a) + log prior(a) + sigma(q(a))
     (Danihelka et al. 2022). With merge=False the answer is the same bit for bit however the roots are split into
@@ -76,23 +72,19 @@ def mcts(
     Args:
         model, root_B, depth, q_leaf, v_leaf: as in `expectimax`.
         simulations, root, rule, exploration, wave, backup, widening, widening_power, max_nodes: see `options.MCTS`. The
-            first simulation expands the root. Larger waves are several times faster where nothing is compiled, and less
-            right with as many simulations.
+            first simulation expands the root.
         prior: the policy, states [N] to probabilities [N, A]; what it gives to actions that are not allowed is shared
             out among the others. Default: uniform.
         backup: with "mean" q(n, a) = (q_0 + sum_i G_i) / (1 + N_a) over the critic's first estimate q_0 and the returns
             G_i of simulations, which does not converge to T^m Q; `pruned_BA` is inf.
-        merge: a node is a (level, state), shared by all paths and roots. What a simulation could not update is
-            backed up at the end.
+        merge: a node is a (level, state), shared by all paths and roots.
         topology: as in `expectimax`. Its `max_bytes` is the most memory that the search may take.
         generator: of the Gumbel noise, one number a search. Default: no noise.
 
     Raises:
         PgtsError: an option that makes no sense or is ignored by the others, roots that are no states, leaf values of a
-            wrong shape or not finite (naming the state), a prior that is no distribution, or gives all to actions that
-            are not allowed; no action of a state is allowed.
-        NodeBudgetExceeded: more than `max_nodes` would be needed; or what is to be expanded next would not fit into
-            `max_bytes`, and the model has not been queried for it.
+            wrong shape or not finite (naming the state), a prior that is no distribution over the allowed actions.
+        NodeBudgetExceeded: more than `max_nodes`, or more memory than `max_bytes`, would be needed.
     """
     options = _options(
         simulations=simulations,
