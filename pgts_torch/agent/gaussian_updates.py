@@ -138,10 +138,7 @@ class MPOUpdate(GaussianUpdate):
     The step does not depend on the scale of rewards. Where all advantages are 0 there is none.
     """
 
-    options: MPO
-
-    def __init__(self, options: MPO = MPO()) -> None:  # noqa: B008 - frozen
-        super().__init__(options)
+    options: MPO = MPO()
 
     def aims(self, old: Normals, batch: Batch, weight_N: Float[Tensor, "N"]) -> tuple[Tensor, ...]:
         assert batch.drawn is not None
@@ -193,10 +190,7 @@ class GaussianGradientUpdate(GaussianUpdate):
     At the policy that drew them its gradient is an estimate of that of E_pi adv.
     """
 
-    options: Gradient
-
-    def __init__(self, options: Gradient = Gradient()) -> None:  # noqa: B008 - frozen
-        super().__init__(options)
+    options: Gradient = Gradient()
 
     def _passes(self, rows: int) -> tuple[int, int]:
         return 1, rows
@@ -229,10 +223,7 @@ class GaussianPPOUpdate(GaussianUpdate):
     `normalize_advantage` and `target_kl` are those of `PPOUpdate`.
     """
 
-    options: PPO
-
-    def __init__(self, options: PPO = PPO()) -> None:  # noqa: B008 - frozen
-        super().__init__(options)
+    options: PPO = PPO()
 
     def aims(self, old: Normals, batch: Batch, weight_N: Float[Tensor, "N"]) -> tuple[Tensor, ...]:
         drawn, advantage_NK = batch.drawn, batch.advantage_NA.float()

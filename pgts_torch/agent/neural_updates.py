@@ -170,11 +170,8 @@ class GradientUpdate(NetworkUpdate):
     With one-hot states, no hidden layer and plain gradient descent it is `SoftmaxUpdate`.
     """
 
-    options: Gradient
+    options: Gradient = Gradient()
     form = "free"
-
-    def __init__(self, options: Gradient = Gradient()) -> None:  # noqa: B008 - frozen
-        super().__init__(options)
 
     def move(
         self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator, readings: Readings
@@ -211,11 +208,8 @@ class PPOUpdate(NetworkUpdate):
     `target_kl`.
     """
 
-    options: PPO
+    options: PPO = PPO()
     form = "clipped"
-
-    def __init__(self, options: PPO = PPO()) -> None:  # noqa: B008 - frozen
-        super().__init__(options)
 
     def move(
         self, network: Network, input_N: Tensor, batch: Batch, generator: torch.Generator, readings: Readings

@@ -95,9 +95,30 @@ def drawn(pi_NA: Float[Tensor, "N A"], *, generator: torch.Generator) -> Int[Ten
 
 
 class TabularPolicy(Policy):
-    """pi(a|s) over numbered states, in float64."""
+    """pi(a|s) over numbered states, in float64.
 
-    num_states: int
+    Args:
+        legal_SA: the actions that are allowed; None: all are. The others have probability 0.
+    """
+
+    def __init__(
+        self,
+        num_states: int,
+        num_actions: int,
+        options: Any = None,
+        *,
+        legal_SA: Bool[Tensor, "S A"] | None = None,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.options = options = self.options if options is None else options
+        self.num_states, self.num_actions = num_states, num_actions
+        self._legal_SA = None if legal_SA is None else legal_SA.to(device)
+        self._begin(initial(options.init, num_states, num_actions, stream(seed, "policy"), legal_SA), device)
+
+    @abstractmethod
+    def _begin(self, probs_SA: Float[Tensor, "S A"], device: torch.device | str) -> None:
+        """Take over the initial probabilities, which are on the CPU."""
 
     def table(self) -> Float[Tensor, "S A"]:
         """pi(.|s) for all states, on the CPU."""
@@ -106,27 +127,12 @@ class TabularPolicy(Policy):
 
 @final
 class SoftmaxPolicy(TabularPolicy):
-    """pi(a|s) ~ exp(logits[s, a]): every action that is allowed keeps a positive probability.
+    """pi(a|s) ~ exp(logits[s, a]): every action that is allowed keeps a positive probability."""
 
-    Args:
-        legal_SA: the actions that are allowed; None: all are. The logits of the others are -inf.
-    """
+    options: Softmax = Softmax()
 
-    def __init__(
-        self,
-        num_states: int,
-        num_actions: int,
-        options: Softmax = Softmax(),  # noqa: B008 - frozen
-        *,
-        legal_SA: Bool[Tensor, "S A"] | None = None,
-        seed: int = 0,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.options = options
-        probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy"), legal_SA)
-        self.num_states, self.num_actions = num_states, num_actions
+    def _begin(self, probs_SA: Float[Tensor, "S A"], device: torch.device | str) -> None:
         self.logits_SA = probs_SA.log().to(device)
-        self._legal_SA = None if legal_SA is None else legal_SA.to(device)
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         return self.logits_SA[observation_N].softmax(-1)
@@ -141,25 +147,12 @@ class SoftmaxPolicy(TabularPolicy):
 
 @final
 class SimplexPolicy(TabularPolicy):
-    """The paper's direct parametrisation: pi(a|s) is the parameter itself, and may be 0 or 1.        [PGTS Sec. 2]
+    """The paper's direct parametrisation: pi(a|s) is the parameter itself, and may be 0 or 1.        [PGTS Sec. 2]"""
 
-    Args:
-        legal_SA: as in `SoftmaxPolicy`.
-    """
+    options: Simplex = Simplex()
 
-    def __init__(
-        self,
-        num_states: int,
-        num_actions: int,
-        options: Simplex = Simplex(),  # noqa: B008 - frozen
-        *,
-        legal_SA: Bool[Tensor, "S A"] | None = None,
-        seed: int = 0,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.options = options
-        self.num_states, self.num_actions = num_states, num_actions
-        self.probs_SA = initial(options.init, num_states, num_actions, stream(seed, "policy"), legal_SA).to(device)
+    def _begin(self, probs_SA: Float[Tensor, "S A"], device: torch.device | str) -> None:
+        self.probs_SA = probs_SA.to(device)
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         return self.probs_SA[observation_N]

@@ -16,11 +16,13 @@ from pgts_torch.options.schedules import at
 class SteppedUpdate(Update, ABC):
     """An update by the steps of one optimiser, which is its state.
 
+    options: of the class, by default.
     now: the options, with the present values of those that are schedules.
     """
 
-    def __init__(self, options: Any) -> None:
-        self.options, self.state_weight = options, options.state_weight
+    def __init__(self, options: Any = None) -> None:
+        self.options = options = self.options if options is None else options
+        self.state_weight = options.state_weight
         self.now = at(options, 0)
         self._optimiser = Optimiser(
             learning_rate=self.now.learning_rate,

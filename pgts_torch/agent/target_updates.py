@@ -94,8 +94,7 @@ class CMPOUpdate(TargetUpdate):
     advantages do not make the steps of all others negligible.
     """
 
-    def __init__(self, options: CMPO = CMPO()) -> None:  # noqa: B008 - frozen
-        super().__init__(options)
+    options: CMPO = CMPO()
 
     def exponent(self, batch: Batch) -> Float[Tensor, "N A"]:
         scale = advantage_scale(batch.advantage_NA, batch.weight_N, batch.ranks, batch.legal_NA).clamp(min=batch.noise)

@@ -58,15 +58,17 @@ class Update(ABC):
 class TabularUpdate(Update):
     """One step in the rows of visited states; all other rows stay as they are.
 
-    eta: its options' step size, a number or a schedule.
+    options: of the class, by default.
     """
 
-    eta: float | str
+    def __init__(self, options: Any = None) -> None:
+        self.options = self.options if options is None else options
+        self.state_weight = self.options.state_weight
 
     @property
     def step_size(self) -> float:
-        """Its present value."""
-        return value_at(self.eta, self.num_env_steps)
+        """eta, the present value where it is a schedule."""
+        return value_at(self.options.step_size, self.num_env_steps)
 
     def __call__(self, policy: Policy, batch: Batch, *, generator: torch.Generator) -> dict[str, float]:
         """Take the step. It uses no random numbers and has no losses.
@@ -94,9 +96,7 @@ class ProjectedUpdate(TabularUpdate):
     """The paper's update, pi(.|s) <- proj[pi(.|s) + eta w(s) q(s, .)].        [PGTS Eq. (3)]"""
 
     policies = (SimplexPolicy,)
-
-    def __init__(self, options: Projected = Projected()) -> None:  # noqa: B008 - frozen
-        self.options, self.eta, self.state_weight = options, options.step_size, options.state_weight
+    options: Projected = Projected()
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         assert isinstance(policy, SimplexPolicy)
@@ -108,9 +108,7 @@ class SoftmaxUpdate(TabularUpdate):
     """All-action policy gradient on the logits: theta(s, .) <- theta(s, .) + eta w(s) pi (q - <pi, q>)."""
 
     policies = (SoftmaxPolicy,)
-
-    def __init__(self, options: SoftmaxGradient = SoftmaxGradient()) -> None:  # noqa: B008 - frozen
-        self.options, self.eta, self.state_weight = options, options.step_size, options.state_weight
+    options: SoftmaxGradient = SoftmaxGradient()
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         assert isinstance(policy, SoftmaxPolicy)
@@ -137,8 +135,8 @@ class MirrorUpdate(TabularUpdate):
     options: Any
 
     def __init__(self, options: Mirror = Mirror()) -> None:  # noqa: B008 - frozen
-        self.options = filled = options.filled("tables")
-        self.eta, self.state_weight, self._floor = filled.step_size, filled.state_weight, limit(filled.floor)
+        super().__init__(options.filled("tables"))
+        self._floor = limit(self.options.floor)
 
     def step(self, policy: Policy, state_N: Tensor, q_NA: Tensor, weight_N: Tensor, noise: float = 0.0) -> None:
         pi_NA = policy.probs(state_N)
