@@ -6,6 +6,7 @@ go down side by side; a "lane" is an action of a root with a simulation under wa
 less than others, works on one more node, which is nobody's.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import final
 
@@ -15,8 +16,9 @@ from torch import Tensor
 
 from pgts_torch.bellman import Outcomes
 from pgts_torch.options.search import MCTS
+from pgts_torch.search.halving import ranked, rounds
 from pgts_torch.search.outcome_table import has_weight
-from pgts_torch.search.split import Selection, most_lacking, sigma
+from pgts_torch.search.split import Selection, most_lacking
 
 _Q, _VISITS, _OPEN, _PRIOR, _REWARD, _EDGES = range(6)
 """The columns of an arm, a (node, action): numbers of its own, and K each of its edges: values of children, weights
@@ -95,17 +97,19 @@ class FixedTrees:
         width_TB = self._width_TA.index_select(1, allowed_B - 1)
         for number, widths in enumerate(self._widths_T):
             arm_BAC, width_B = self.arm_NAC.index_select(0, self.root_B), width_TB[number]
+            open_BA = arm_BAC[..., _OPEN] > 0
+            known = arm_BAC[..., _Q], arm_BAC[..., _VISITS], open_BA
             if self._options.root == "rule":
                 action_BW = self._select(arm_BAC).unsqueeze(1)
             else:
                 if not number or widths != self._widths_T[number - 1]:
                     # A new round of some roots: the best actions of those that are left go on.
-                    order_BA = _order(arm_BAC, preference_BA, survives_BA)
+                    order_BA = ranked(preference_BA, *known, survives_BA)
                     best_BA = torch.zeros_like(survives_BA).scatter_(1, order_BA, place_A < width_B.unsqueeze(1))
                     is_new_B = width_B != (width_TB[number - 1] if number else 0)
                     survives_BA = torch.where(is_new_B.unsqueeze(1), best_BA, survives_BA)
-                action_BW = _order(arm_BAC, preference_BA, survives_BA)[:, : max(widths)]
-            count_B = (arm_BAC[..., _OPEN] > 0).sum(1).minimum(width_B).minimum(left_B)
+                action_BW = ranked(preference_BA, *known, survives_BA)[:, : max(widths)]
+            count_B = open_BA.sum(1).minimum(width_B).minimum(left_B)
             left_B -= count_B
             # A wave goes at most a level deeper than the one before it.
             self._wave(action_BW, count_B, min(self._bottom - 1, number + 1))
@@ -116,13 +120,10 @@ class FixedTrees:
 
         Each wave uses at least one simulation, so there are as many waves; those at the end may have nothing to do.
         """
-        simulations, widths = self._options.simulations - 1 if self._bottom > 1 else 0, list[int]()
+        simulations = self._options.simulations - 1 if self._bottom > 1 else 0
         by_rule = self._options.root == "rule"
-        width, phases = (1, 1) if by_rule else (count, max(1, (count - 1).bit_length()))
-        for _ in range(phases - 1):
-            widths += [width] * max(1, simulations // (phases * width))
-            width = max(2, width // 2)
-        return [*widths, *([width] * simulations)][:simulations]
+        waves = rounds(1 if by_rule else count, simulations, 1)
+        return [width for width, _ in itertools.islice(waves, simulations)]
 
     def _wave(self, action_BW: Int[Tensor, "B W"], count_B: Int[Tensor, "B"], levels: int) -> None:
         """A simulation by each of the first actions of each root, through at most so many levels."""
@@ -239,13 +240,3 @@ class FixedTrees:
 def _summed_up(arm_LAC: Float[Tensor, "L A C"]) -> tuple[Float[Tensor, "L"], Bool[Tensor, "L"]]:
     """v of nodes, and whether all their actions are exhausted."""
     return arm_LAC[..., _Q].amax(1), arm_LAC[..., _OPEN].amax(1) <= 0
-
-
-def _order(
-    arm_BAC: Float[Tensor, "B A C"], preference_BA: Float[Tensor, "B A"], survives_BA: Bool[Tensor, "B A"]
-) -> Int[Tensor, "B A"]:
-    """The actions of each root, best first: survivors before the others, exhausted ones last."""
-    score_BA = preference_BA + sigma(arm_BAC[..., _Q], arm_BAC[..., _VISITS])
-    by_score_BA = score_BA.argsort(dim=1, descending=True, stable=True)
-    rank_BA = torch.where(arm_BAC[..., _OPEN] > 0, (~survives_BA).long(), 2).gather(1, by_score_BA)
-    return by_score_BA.gather(1, rank_BA.argsort(dim=1, stable=True))

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pgts_torch.options.search import MCTS
@@ -63,12 +63,12 @@ def _halve(tree: Tree | WideningTrees, node_B: Tensor, options: MCTS, preference
     place_A = torch.arange(tree.A, device=node_B.device)
     allowed_B = (tree.nodes.q_NA[node_B] > -torch.inf).sum(1)
     widths, width_B1 = list[int](), torch.zeros_like(allowed_B).unsqueeze(1)
-    rounds = [_rounds(allowed, simulations, options.wave) for allowed in range(1, tree.A + 1)]
+    of_allowed = [rounds(allowed, simulations, options.wave) for allowed in range(1, tree.A + 1)]
     while True:
         if isinstance(tree, Tree):
             tree.back_up_shared(node_B)
         # Each root has the rounds of as many actions as are allowed there.
-        of_count = [next(each) for each in rounds]
+        of_count = [next(each) for each in of_allowed]
         before_B1, (width_B1, most_B1) = (
             width_B1,
             torch.tensor(of_count, device=node_B.device)[allowed_B - 1].split(1, 1),
@@ -112,7 +112,7 @@ def _send(
     return used_B
 
 
-def _rounds(actions: int, simulations: int, wave: int | None) -> Iterator[tuple[int, int]]:
+def rounds(actions: int, simulations: int, wave: int | None) -> Iterator[tuple[int, int]]:
     """How many of the allowed actions of a root a wave considers, and the most simulations each of them gets.
 
     The last round takes what is left.
@@ -129,10 +129,20 @@ def _rounds(actions: int, simulations: int, wave: int | None) -> Iterator[tuple[
 
 
 def _order(tree: Tree | WideningTrees, node_B: Tensor, preference_BA: Tensor, alive_BA: Tensor) -> Int[Tensor, "B A"]:
+    nodes = tree.nodes
+    return ranked(preference_BA, nodes.q_NA[node_B], nodes.visits_NA[node_B], nodes.open(node_B), alive_BA)
+
+
+def ranked(
+    preference_BA: Float[Tensor, "B A"],
+    q_BA: Float[Tensor, "B A"],
+    visits_BA: Float[Tensor, "B A"],
+    open_BA: Bool[Tensor, "B A"],
+    alive_BA: Bool[Tensor, "B A"],
+) -> Int[Tensor, "B A"]:
     """The actions of each root, best first: survivors before the others, exhausted ones last."""
-    score_BA = preference_BA + sigma(tree.nodes.q_NA[node_B], tree.nodes.visits_NA[node_B])
-    by_score_BA = score_BA.argsort(dim=1, descending=True, stable=True)
-    rank_BA = torch.where(tree.nodes.open(node_B), torch.where(alive_BA, 0, 1), 2).gather(1, by_score_BA)
+    by_score_BA = (preference_BA + sigma(q_BA, visits_BA)).argsort(dim=1, descending=True, stable=True)
+    rank_BA = torch.where(open_BA, (~alive_BA).long(), 2).gather(1, by_score_BA)
     return by_score_BA.gather(1, rank_BA.argsort(dim=1, stable=True))
 
 
