@@ -60,24 +60,23 @@ class Certificates:
 
         J* - J^pi <= sum_s mu(s) [ v_hat(s) - v(s) ]        [docs/theory.md, Prop. 6]
 
-    over all start states, whether an episode has begun there or not. The bound is right up to the error of v against
-    v^pi at these states, and a proof if the critic is exact and the model is the environment. Rounding is added: the
-    critic's own `error`, and (N + 2) eps sum_s mu(s) (|v_hat(s)| + |v(s)|) for the sum over N start states. A critic
-    whose v exceeds v_hat is wrong by at least the difference, so the absolute difference is used.
+    over all start states. The bound is right up to the error of v against v^pi there, and a proof if the critic is
+    exact and the model is the environment. Rounding is added: the critic's own `error`, and (N + 2) eps sum_s mu(s)
+    (|v_hat(s)| + |v(s)|) for the sum over N start states. The absolute differences are summed, because a critic whose v
+    exceeds v_hat is wrong by at least the difference.
 
-    Where mu is not known, the starts of the n episodes are independent samples from it, made after pi was fixed. f =
-    T^n w - v^pi is a function of the start state that does not depend on these samples, with values in [0, w - l],
-    where l is the model's `lowest_value`. So with a probability of 95 % for all iterations k = 1, 2, ... and all D
-    depths that each may try (Hoeffding 1963)
+    Where mu is not known, the starts of the n episodes are independent samples from it, made after pi was fixed, and f
+    = T^n w - v^pi has values in [0, w - l], with l the model's `lowest_value`. So with a probability of 95 % for all
+    iterations k = 1, 2, ... and all D depths that each may try (Hoeffding 1963)
 
         J* - J^pi <= mean f + (w - l) sqrt( ln(1 / alpha_k) / 2n ),        alpha_k = 0.05 (6 / pi^2 k^2) / D
 
-    The certificate uses v in place of v^pi. The critic was fitted to the same episodes, so the certificate is off by
-    the mean of v - v^pi over the sampled starts. It is infinite where the bound is no smaller than the trivial one, w -
-    l, and where the lookahead has pruned nodes, because T^n w would then depend on the other start states.
+    with v in place of v^pi: the error of the critic at the sampled starts comes on top. The certificate is infinite
+    where the bound is no smaller than the trivial one, w - l, and where the lookahead has pruned nodes, because T^n w
+    would then depend on the other start states.
 
-    Processes that train together have queried different states, and each computes v_hat from its own. Where they number
-    states alike the smallest is used; else each has it at the states that it has visited, and sums are over all.
+    Each of several processes computes v_hat from what it has queried itself. Where they number states alike the
+    smallest is used; else each has it at the states that it has visited, and sums are over all.
 
     Args:
         world: gives the start distribution.

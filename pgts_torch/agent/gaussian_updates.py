@@ -121,17 +121,16 @@ class MPOUpdate(GaussianUpdate):
 
         q_k ~ pi_hat_k exp(adv_k / eta),        mean_s w(s) KL(q || pi_hat) = kl
 
-    Its moments, by differences to those of pi_hat, so that what is due to the draw alone cancels, are
+    Its moments, as differences to those of pi_hat, so that what is due to the draw alone cancels, are
 
         mean' = mean + std x,    x = sum_k (q_k - pi_hat_k) z_k,    z_k = (a_k - mean) / std
         std'^2 = std^2 V(q) / V(pi_hat),    V(w) = [sum_k w_k z_k^2 - (sum_k w_k z_k)^2] / (1 - sum_k w_k^2)
 
-    They are those of q as K grows. V is a variance with Bessel's correction for weights, without which advantages that
-    have nothing to do with actions would narrow the policy in each iteration. Around the old mean, as if mean and
-    deviation were optimised apart, a mean that keeps moving would be taken for spread and widen it without end, under
-    tanh until it is a coin that is tossed between the bounds, whose mean says nothing. Each moves no farther than a
-    divergence allows: x is shortened to x^2 / 2 <= kl_mean, and |log std' - log std| of each entry is at most
-    sqrt(kl_std). The network is fitted to both:
+    V is a variance with Bessel's correction for weights, without which advantages that have nothing to do with actions
+    would narrow the policy in each iteration. It is taken around the new mean: around the old one a mean that keeps
+    moving would be taken for spread and widen the policy without end. Each moves no farther than a divergence allows: x
+    is shortened to x^2 / 2 <= kl_mean, and |log std' - log std| of each entry is at most sqrt(kl_std). The network is
+    fitted to both:
 
         minimise  mean_s w(s) sum_x [ (mean' - mean_theta)^2 / (2 std^2) + log std_theta + std'^2 / (2 std_theta^2) ]
 

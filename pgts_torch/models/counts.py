@@ -60,8 +60,8 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
 
     for each of the k outcomes (next state s', discount d) that the pair has had: the mean of the posterior, if all
     their probabilities are equally likely at first (Laplace). With probability u (`Counts.optimism`) there is an
-    unknown outcome, which has discount 0: it pays what it is worth, and nothing follows. So optimism (Brafman and
-    Tennenholtz 2002; Strehl and Littman 2008; Osband, Russo and Van Roy 2013) is in the outcomes alone.
+    unknown outcome of discount 0, which pays what it is worth. So optimism (Brafman and Tennenholtz 2002; Strehl and
+    Littman 2008; Osband, Russo and Van Roy 2013) is in the outcomes alone.
 
     Without `value_range` values are at most what the rewards seen so far allow,
 
@@ -72,8 +72,8 @@ class CountsModel(EnumeratingModel, SamplingModel, LearningModel, FallibleModel)
     unknown is worth the upper end, and at least twice what the largest reward that ends nothing is worth for ever: else
     it would never be worth leaving the place that pays it.
 
-    A learned table proves nothing: it is not exact, has no highest value, and is never certain. Memory grows with the
-    distinct outcomes seen.
+    A learned table is not exact, has no highest value, and is never certain. Memory grows with the distinct outcomes
+    seen.
 
     Args:
         num_states, num_actions: S and A.

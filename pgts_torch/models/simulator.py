@@ -33,18 +33,16 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel):
 
     The instance is used by the model alone, so queries never touch the environment that an agent acts in. What its
     wrappers make of actions, rewards and observations is part of the outcomes (`transforms_of`); a `TimeLimit` is left
-    out and ends no episode here. Where the environment itself truncates an episode the model never steps on: such a
-    state leads to itself with reward 0 and discount 1, under its first action alone, so that at any depth T leaves it
-    the value that the critic gives it at the leaves.
+    out. Where the environment itself truncates an episode the model never steps on: such a state leads to itself with
+    reward 0 and discount 1, under its first action alone, so that T leaves it the critic's value at any depth.
 
     Chance comes from the keys of the search, so a search cannot foresee what the environment of the agent will do. What
     uses no chance is simulated once: such answers outlive `clear`, unless they take much memory.
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
-        gamma: discount in [0, 1] of an outcome that ends no episode; truncation does not end it, what follows is worth
-            what the critic says. An environment with `metadata["discounts"] = True` may name another one in
-            `info["discount"]`.
+        gamma: discount in [0, 1] of an outcome that does not terminate. An environment with `metadata["discounts"] =
+            True` may name another one in `info["discount"]`.
         actions: the actions, as the outermost wrapper takes them, in the order of their numbers. Default: all of a
             discrete space; for a continuous one see `grid_actions` and `sampled_actions`.
         action_repeat: how often an action is taken in one outcome, as in `TensorModel`.
@@ -57,8 +55,8 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel):
 
     Raises:
         MissingModel: no adapter knows the environment, or a wrapper may change more than single answers.
-        PgtsError: it cannot be made, gamma is no discount, its actions cannot be enumerated, or action_repeat is below
-            1, or above 1 beside a highest value or action masks.
+        PgtsError: it cannot be made, an argument is out of range, its actions cannot be enumerated, or action_repeat is
+            above 1 beside a highest value or action masks.
     """
 
     num_outcomes, answers_singly = 1, True

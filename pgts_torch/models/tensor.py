@@ -22,10 +22,8 @@ _ROUNDING = 1e-12
 
 
 class TensorModel(EnumeratingModel, FollowingModel):
-    """Deterministic dynamics over vectors of D numbers. A subclass defines `step`; this class gives states a number as
-    it meets them, equal ones the same, so that a search merges them.
-
-    Memory grows with every new state until `clear`.
+    """Deterministic dynamics over vectors of D numbers. A subclass defines `step`; this class numbers states as it
+    meets them, equal ones alike, so that a search merges them. Memory grows with every new state until `clear`.
 
     With `action_repeat` k > 1 an outcome is that of taking the same action k times, so that a search of little depth
     sees rewards that are far ahead:
@@ -35,11 +33,11 @@ class TensorModel(EnumeratingModel, FollowingModel):
     It ends early where an episode terminates (discount 0) and before a step in which the action is not allowed. T is
     then the optimality operator T_k of the semi-MDP of these options (Sutton, Precup and Singh 1999):
 
-    - with `q_leaf` a search gives T_k^m Q^pi; with `v_leaf` it gives T_k^m Q_k, where Q_k(s, a), the value of a taken k
-      times and pi from there on, is not Q^pi;
-    - every value is that of a plan which can be followed, so with an exact critic none is above q*. But pi itself may
-      be better than each repeated action: max_a need not reach v^pi, and a gap of 0 does not put pi into Pi^m;
-    - upper bounds of v* do not stay such under T_k, so there is no certificate: `highest_value` is to be infinite.
+    - with `q_leaf` a search gives T_k^m Q^pi; with `v_leaf` T_k^m Q_k, where Q_k(s, a), the value of a taken k times
+    and pi from there on, is not Q^pi;
+    - every value is that of a plan which can be followed, so with an exact critic none is above q*. But pi may be
+    better than each repeated action: max_a need not reach v^pi, and a gap of 0 does not put pi into Pi^m;
+    - upper bounds of v* do not stay such under T_k, so there is no certificate, and `highest_value` must be infinite.
 
     A model call is one (state, action) however often it is repeated; `simulator_steps` counts the steps.
 
@@ -52,7 +50,7 @@ class TensorModel(EnumeratingModel, FollowingModel):
         state_dtype: of the vectors: floating, or int64.
         dtype: of rewards, discounts and values.
         merge: whether equal states get one number (`StateIndex`).
-        action_repeat: k, how often an action is taken in one outcome, at least 1.
+        action_repeat: k, at least 1.
     """
 
     num_outcomes = 1

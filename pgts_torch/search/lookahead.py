@@ -28,23 +28,22 @@ _FAIR = 1e-3
 class Lookahead:
     """Estimates of (T^m Q)(s, .) at the roots, how far they can be trusted, and what they cost.
 
-    q_BA: lookahead values of all actions, in reward units and in the dtype of the model; they carry no gradient.
-        -inf where the action is not allowed.
+    q_BA: lookahead values of all actions, in reward units and in the dtype of the model; they carry no gradient. -inf
+        where the action is not allowed.
     stderr_BA: standard error of q that comes from sampled outcomes, in reward units: 0 where all outcomes were
         enumerated, NaN where it was not estimated.
     pruned_BA: in [0, 1]: the most discounted probability that any plan after (s, a) puts on nodes above the last level
-        that the critic values in place of a deeper search. If the critic is off by at most e there,
-        |q - T^m Q| <= pruned * e beside the sampling error; 0 for a search of full width.
+        that the critic values in place of a deeper search. If the critic is off by at most e there, |q - T^m Q| <=
+        pruned * e beside the sampling error; 0 for a search of full width.
     model_calls: for how many (state, action) the model was queried in this search.
     critic_calls: how often the critic was called, each time for many states together.
     nodes_per_level: how many nodes are backed up at each level, from the roots to the leaves.
-    bias_BA: how much q is too high because maxima were taken over sampled values, in reward units, as far as the sample
-        itself can tell; None where nothing was sampled.
+    bias_BA: an estimate of how much q is too high because maxima were taken over sampled values, in reward units; None
+        where nothing was sampled.
     samples: the fewest outcomes that were sampled of a (state, action); None where none were.
     doubt_BA: at least |q - T^m Q|, with T and Q of the environment, in reward units. None: not asked for, or the model
         does not say.
-    value_range: between which numbers the model's values lie; both the same (0) where its actions have one outcome
-        each, so that equal samples leave no doubt.
+    value_range: between which numbers the model's values lie; both 0 where its actions have one outcome each.
 
     The doubt is what the model and the critic may be wrong by, added up along the best plan for errors,
 
@@ -83,22 +82,20 @@ class Lookahead:
         return cls(q_BA, zero_BA, pruned_BA, model_calls, critic_calls, nodes_per_level, doubt_BA=doubt_BA)
 
     def interval(self, confidence: float = 0.95) -> tuple[Float[Tensor, "B A"], Float[Tensor, "B A"]]:
-        """Lower and upper bounds of T^m Q, as far as sampled outcomes put it in doubt: q - bias -+ t stderr;
-        and the doubt on both sides, where there is one: then they are bounds of T^m Q in the environment.
+        """Lower and upper bounds of T^m Q, as far as sampled outcomes put it in doubt: q - bias -+ t stderr; and the
+        doubt on both sides, where there is one: then they are bounds of T^m Q in the environment.
 
         t is the quantile of Student's distribution with C - 1 degrees of freedom, C = `samples`. Where samples agree so
-        far that stderr is 0 the interval comes from the range of the values instead: with values in [l, u]
+        far that stderr is 0 the interval comes from the range [l, u] of the values instead (infinite without a range):
 
             q - f (q - l)  to  q + f (u - q),        f = 1 - (1 - confidence)^{1 / (C - 1)}
 
-        C samples that agree on a value of probability p < 1 - f do so with a probability of sum p^C <= (1 - f)^{C-1} =
-        1 - confidence; of a larger p the rest, at most f, lies between l and u. So this part is exact with one level.
-        Without a range these bounds are infinite.
+        C samples agree on a value of probability p < 1 - f with a probability of sum p^C <= (1 - f)^{C-1} = 1 -
+        confidence; of a larger p the rest, at most f, lies between l and u. So this part is exact with one level.
 
-        Measured on random MDPs with two outcomes of each action (`benchmarks/intervals.py`, docs/benchmarks.md), 95 %:
-        with one level they hold the truth at least so often for C = 2, 4, 8 and 16. They hold it less often over more
-        levels, where maxima over samples make q too high and `bias_BA` is a part of that, most among tied actions;
-        and where few of many outcomes carry most of a value and none of these was sampled while others differ. What was
+        On random MDPs (`benchmarks/intervals.py`, docs/benchmarks.md) intervals of one level hold the truth at least as
+        often as they say. Those of more levels hold it less often, where maxima over samples make q too high, most
+        among tied actions, and where few of many outcomes carry most of a value and none of these was sampled. What was
         pruned is not in them, nor, without a doubt, what the critic gets wrong.
 
         Raises:

@@ -19,28 +19,25 @@ def pruned(
 ) -> Lookahead:
     """(T^m Q)(s, .) at the roots, where at most W states of each level below the roots are expanded.
 
-    A level with more states keeps those of the highest priority; the critic's v stands for what follows the others:
+    Of a level with more states those of the highest priority are expanded; the others have the critic's value v:
 
-        priority(n) = reach(n) (v(n) - min v),     the minimum taken over the states of the level,
+        priority(n) = reach(n) (v(n) - min v),     the minimum taken over the states of the level
 
-    how much of the value of a plan depends on n. reach(n) is the discounted probability with which the plan meets n:
-    1 at every root, and the sum of reach(s) pi(a|s) p gamma over all (s, a) of the level above that lead to n, where
+    reach(n) is the discounted probability with which a plan that prefers better actions meets n: 1 at every root, and
+    the sum of reach(s) pi(a|s) p gamma over all (s, a) of the level above that lead to n, where
 
         pi(a|s) ~ exp(-(max_b q1(s, b) - q1(s, a)) / t),     q1 = r + sum p gamma v,     t = mean of max_b q1 - q1
 
-    over all pairs so far. So a state that several paths or roots share counts for each of them, one behind a bad action
-    counts little, and neither the zero nor the unit of rewards matters. Equal priorities: the higher reach first, then
-    the lower state number.
+    over all pairs so far. So a state that several paths or roots share counts for each of them, and neither the zero
+    nor the unit of rewards matters. Of equal priorities the higher reach comes first, then the lower state number.
 
-    Optimistic planning (Hren and Munos 2008; Busoniu and Munos 2012) orders by reach(n) (U - v(n)), U an upper bound of
-    values. It may return to what it left; here what is kept for what might be there prunes what is there, and that
-    order is no better than an arbitrary one. Beam search orders by v(n): as good where outcomes are nearly certain,
-    worse for the best value where they spread, and for a batch, of which it serves the roots near high values.
+    (Optimistic planning, Hren and Munos 2008, orders by reach(n) (U - v(n)) with an upper bound U of values: it may
+    return to what it left, and this search does not. Beam search orders by v(n) alone, which ignores how likely n is.)
 
-    The batch shares the width: W bounds a level of all roots together, and the roots are all expanded. With W at least
-    as large as the largest level the result is that of the full lookahead. pruned is 1 at a pruned state, 0 at the
-    last level and max_a sum p gamma pruned(child) at one that is expanded. The critic is called once for each level
-    below the roots; the model is queried for at most (roots + W (levels - 1)) A pairs. Pruned nodes count as nodes.
+    W bounds a level of all roots together, and the roots are all expanded. With W at least as large as the largest
+    level the result is that of the full lookahead. `pruned_BA` backs up 1 from a pruned state and 0 from the last
+    level. The critic is called once for each level below the roots; the model is queried for at most (roots + W (levels
+    - 1)) A pairs. Pruned nodes count as nodes.
 
     Args:
         max_width: W, at least 1.

@@ -37,27 +37,26 @@ def sampled(
 
         q(s, a) = 1/C sum_c [ r_c + gamma_c max_b q(s'_c, b) ]        (Kearns, Mansour and Ng 2002)
 
-    All actions of all nodes are expanded. Leaves are those of `expectimax`, each state once. A sample is named by
-    (search, level, state, action, c), so q is the same bit for bit however the roots are split into batches or ordered,
-    as long as the generator is in the same state and the model numbers its states alike.
+    All actions of all nodes are expanded. A sample is named by (search, level, state, action, c), so q is the same bit
+    for bit however the roots are split into batches or ordered, if the generator is in the same state and the model
+    numbers its states alike.
 
-    The error falls as 1 / sqrt(C). The maxima over noisy values make the estimate too high wherever actions are nearly
-    tied: E q >= T^m Q, with equality where there is one action and where no maximum is over sampled values. `bias_BA`
-    estimates by how much, `stderr_BA` the standard deviation, both by a bootstrap: of the C samples of each (s, a)
-    C - 1 are drawn with replacement, which makes the variance of a mean unbiased (Rao and Wu 1988), and all backups are
-    done again, `replicates` times. With few samples stderr is rather too large, since what a level inherits from the
-    one below varies with both. Both are NaN (not estimated) without replicates and with C = 1 at any level.
+    The error falls as 1 / sqrt(C). Maxima over noisy values make the estimate too high wherever actions are nearly
+    tied: E q >= T^m Q. `bias_BA` estimates by how much, `stderr_BA` the standard deviation, both by a bootstrap: of the
+    C samples of each (s, a) C - 1 are drawn with replacement, which makes the variance of a mean unbiased (Rao and Wu
+    1988), and all backups are done again, `replicates` times. With few samples stderr is rather too large. Both are NaN
+    (not estimated) without replicates and with C = 1 at any level.
 
     Args:
         model: samples an outcome of a state and an action.
         root_B: as in `expectimax`; repeated states share their samples, whatever `share` says.
         depth, q_leaf, v_leaf: as in `expectimax`.
-        samples: C, or one C for each level from the roots down; the last one serves all deeper levels, and those below
-            the leaves are not used. None enumerates all outcomes of a level, which the model must be able to do;
-            where all levels are enumerated the search is `expectimax`.
+        samples: C, or one C for each level from the roots down, of which the last serves all deeper levels. None
+            enumerates all outcomes of a level, which the model must be able to do; with None alone the search is
+            `expectimax`.
         share: "none": every path has its own samples, and the nodes are a tree. "level": paths that meet in a state at
-            one level are one node, with one set of samples. "search": a state has one set of samples at all levels:
-            fewest calls, one C, and a closed set as in `expectimax`. All three have the same rate.
+            one level share a node and its samples. "search": a state has one set of samples at all levels, which needs
+            one C: fewest calls, and a closed set as in `expectimax`. The error has the same rate with each.
         generator: of one key, which decides all samples of this search.
         replicates: R of the bootstrap: 0, or at least 2.
         max_nodes: the most nodes, summed over levels; a level is sampled before its children are counted.

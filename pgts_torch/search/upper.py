@@ -33,19 +33,17 @@ class UpperBound:
 
     - one from above, from w: every sweep of an upper bound of v* is one;
     - one from below, which comes to v_hat in about as many sweeps as the best plan has steps, however close the
-      discount is to 1. As it is swept it proves v_hat <= T u + beta delta / (1 - beta), with delta = max over X of
-      T u - u, not below 0, and beta the largest sum_k p_k gamma_k in X (MacQueen 1966; Prop. 5).
+    discount is to 1. It proves v_hat <= T u + beta delta / (1 - beta), with delta = max over X of T u - u, not below 0,
+    and beta the largest sum_k p_k gamma_k in X (MacQueen 1966; Prop. 5).
 
-    A state that may stay where it is for ever, undiscounted and with reward 0, counts as one outside X: T does not
-    bound its value. Such is a state in which an episode was truncated.
-
-    The bound is the smaller of the two and never rises. A call has a budget of sweeps, so it may take several calls
-    to come down to v_hat; at any time it is an upper bound.
+    The bound is the smaller of the two and never rises. A call has a budget of sweeps, so it may take several calls to
+    come down to v_hat; at any time it is an upper bound. A state that may stay where it is for ever, undiscounted and
+    with reward 0, as one in which an episode was truncated, counts as outside X: T does not bound its value.
 
     Rounding is outward. A computed backup of u misses the exact one by at most (K + 4) eps (max |r| + max |u|): K
-    products p gamma u with p gamma rounded, their sum and the reward, eps that of float64. This is added to every sweep
-    from above, and twice to delta. w is enlarged by the share 1,024 eps / (1 - gamma), for the sums of probabilities
-    and the division that it came from.
+    products p gamma u with p gamma rounded, their sum and the reward. This is added to every sweep from above, and
+    twice to delta. w is enlarged by the share 1,024 eps / (1 - gamma), for the sums of probabilities and the division
+    that it came from.
 
     Args:
         highest: w, the model's `highest_value`.
