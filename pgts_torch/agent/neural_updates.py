@@ -18,24 +18,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pgts_torch.agent import objectives
 from pgts_torch.agent.components import legal_only
 from pgts_torch.agent.dense_steps import dense_steps
 from pgts_torch.agent.gradients import Forward, through_log_softmax
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural import NetworkPolicy
-from pgts_torch.agent.objectives import (
-    check_numbers,
-    divergence,
-    entropy,
-    in_own_units,
-    log_probs,
-    log_probs_before,
-    log_softmax,
-    mean,
-    passes,
-    with_legal,
-)
 from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.stepped import SteppedUpdate
 from pgts_torch.options.updates import PPO, Gradient
@@ -75,7 +64,7 @@ class NetworkUpdate(SteppedUpdate):
         with self._optimiser.attempt(network.tensors) as readings:
             if (legal_NA := encoder.legal(batch.observation_N)) is not None:
                 batch = replace(batch, advantage_NA=legal_only(batch.advantage_NA, legal_NA, 0.0), legal_NA=legal_NA)
-            check_numbers(batch, readings)
+            objectives.check_numbers(batch, readings)
             if fresh := encoder.fresh:
                 encoder.absorb(batch.observation_N, ranks)
             weight_N = batch.weight_N.float()
@@ -83,7 +72,8 @@ class NetworkUpdate(SteppedUpdate):
             old_NA, new_NA = self.move(network, input_N, replace(batch, weight_N=weight_N), generator, readings)
             readings.check(new_NA.sum(), lambda _: check_finite("probability", "the next policy", new_NA, None))
             weight_N = weight_N / ranks.sum("weights", weight_N.sum())
-            found = torch.stack([weight_N @ entropy(new_NA), weight_N @ divergence(old_NA, new_NA)])
+            entropy_N, kl_N = objectives.entropy(new_NA), objectives.divergence(old_NA, new_NA)
+            found = torch.stack([weight_N @ entropy_N, weight_N @ kl_N])
             readings.add(**dict(zip(("entropy", "kl"), ranks.sum("the next policy", found), strict=True)))
             if not fresh:
                 encoder.absorb(batch.observation_N, ranks)
@@ -152,7 +142,7 @@ class NetworkUpdate(SteppedUpdate):
         most: float | None,
     ) -> tuple[Tensor, Tensor] | None:
         made = Forward(network, part[0])
-        log_NA = log_softmax(made.output_ND, legal_NA)
+        log_NA = objectives.log_softmax(made.output_ND, legal_NA)
         down_NA, losses = self.objective(log_NA, part[1:], count)
         own = made.gradients(through_log_softmax(log_NA, down_NA))
         gradients, sums = ranks.summed("the gradient of the policy", own, *losses)
@@ -178,10 +168,10 @@ class GradientUpdate(NetworkUpdate):
     ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
         """Losses: policy, minus the objective without entropy, before the step; grad_norm, before clipping."""
         old_NA = torch.empty(batch.advantage_NA.shape, dtype=input_N.dtype, device=input_N.device)
-        rows = with_legal([input_N, old_NA, batch.advantage_NA.float(), batch.weight_N], batch.legal_NA)
+        rows = objectives.with_legal([input_N, old_NA, batch.advantage_NA.float(), batch.weight_N], batch.legal_NA)
         for norm, loss in self.descend(network, [(1, rows)], batch, clip=(0.0, math.inf, self.now.entropy_coef)):
             readings.add(policy=loss, grad_norm=norm)
-        return old_NA, log_probs(network, input_N, batch.legal_NA)
+        return old_NA, objectives.log_probs(network, input_N, batch.legal_NA)
 
     def objective(
         self, log_NA: Float[Tensor, "N A"], part: Sequence[Tensor], count: int
@@ -216,23 +206,21 @@ class PPOUpdate(NetworkUpdate):
     ) -> tuple[Float[Tensor, "N A"], Float[Tensor, "N A"]]:
         """Losses: policy, minus the objective without entropy, mean over the steps; grad_norm, mean, before clipping;
         clip_fraction, the probability of actions whose rho is out of range after the steps; num_steps."""
-        old_NA, advantage_NA = log_probs_before(network, input_N, batch), batch.advantage_NA.float()
+        old_NA, advantage_NA = objectives.log_probs_before(network, input_N, batch), batch.advantage_NA.float()
         share = batch.ranks.share("rows", len(input_N))
         weight_N = batch.weight_N / share.mean("weights", batch.weight_N)
         if self.options.normalize_advantage:
-            advantage_NA = in_own_units(advantage_NA, old_NA.exp(), weight_N, share)
+            advantage_NA = objectives.in_own_units(advantage_NA, old_NA.exp(), weight_N, share)
         columns, num_steps, clip = [input_N, old_NA, advantage_NA, weight_N], 0, self.now.clip_range
-        parts = passes(with_legal(columns, batch.legal_NA), share, self.options, generator)
+        parts = objectives.passes(objectives.with_legal(columns, batch.legal_NA), share, self.options, generator)
         clips = 1 - clip, 1 + clip, self.now.entropy_coef
         for norm, loss in self.descend(network, parts, batch, clip=clips, most=self.options.target_kl):
             readings.add(policy=loss, grad_norm=norm)
             num_steps += 1
-        new_NA = log_probs(network, input_N, batch.legal_NA)
+        new_NA = objectives.log_probs(network, input_N, batch.legal_NA)
         outside_NA = ((new_NA - old_NA).exp() - 1).abs() > self.now.clip_range
-        readings.add(
-            clip_fraction=batch.ranks.sum("clipped", mean(weight_N, (old_NA.exp() * outside_NA).sum(-1), share.total)),
-            num_steps=num_steps,
-        )
+        clipped = objectives.mean(weight_N, (old_NA.exp() * outside_NA).sum(-1), share.total)
+        readings.add(clip_fraction=batch.ranks.sum("clipped", clipped), num_steps=num_steps)
         return old_NA, new_NA
 
     def objective(
@@ -252,7 +240,7 @@ class PPOUpdate(NetworkUpdate):
         slope_NA = torch.where(least_NA == free_NA, advantage_NA, 0.0)
         if coef:
             slope_NA = slope_NA - coef * (log_NA + 1)
-        losses = [-mean(weight_N, (old_NA.exp() * least_NA).sum(-1), count)]
+        losses = [-objectives.mean(weight_N, (old_NA.exp() * least_NA).sum(-1), count)]
         if self.options.target_kl is not None:
-            losses.append(mean(weight_N, divergence(old_NA, log_NA), count))
+            losses.append(objectives.mean(weight_N, objectives.divergence(old_NA, log_NA), count))
         return -(pi_NA * slope_NA) * (weight_N / count)[:, None], losses

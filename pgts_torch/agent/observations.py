@@ -13,19 +13,8 @@ from gymnasium.vector import VectorEnv
 from jaxtyping import Bool
 from torch import Tensor
 
-from pgts_torch.agent.components import (
-    Component,
-    Path,
-    counts,
-    found_in,
-    has_channels_first,
-    num_combinations,
-    plainly,
-    row_dtype,
-    row_shape,
-    with_legal,
-    with_mask,
-)
+from pgts_torch.agent import components
+from pgts_torch.agent.components import Component, Path
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.masks import Masked
 from pgts_torch.models.snapshots import env_name
@@ -85,7 +74,9 @@ class _Part:
 
 def fit_keys(space: spaces.Dict) -> list[str]:
     """The entries of dictionary observations that can be learned from."""
-    return [key for key, one in space.items() if all(isinstance(leaf, Component) for _, leaf in found_in(one))]
+    return [
+        key for key, one in space.items() if all(isinstance(leaf, Component) for _, leaf in components.found_in(one))
+    ]
 
 
 @final
@@ -118,18 +109,18 @@ class Observations:
         self._what = f"the observations of {env_name(env)}"
         space, channels = env.single_observation_space, options.image_channels
         self._parts = [
-            _Part(path, part, plainly(part, channels), has_channels_first(part, channels))
+            _Part(path, part, components.plainly(part, channels), components.has_channels_first(part, channels))
             for path, part in self._known(self._selected(space))
         ]
         seen: list[Component] = [part.seen for part in self._parts]
         self._row: Space[Any] = seen[0] if len(seen) == 1 else spaces.Tuple(seen)
-        self._dtype = row_dtype(self._row)
-        self.space: Space[Any] = spaces.Discrete(num_combinations(self._row) or 0) if numbered else self._row
+        self._dtype = components.row_dtype(self._row)
+        self.space: Space[Any] = spaces.Discrete(components.num_combinations(self._row) or 0) if numbered else self._row
         self.as_given = isinstance(space, spaces.Box | spaces.Discrete) and self.space == space
-        self._inner_axes = len(row_shape(self.space))
+        self._inner_axes = len(components.row_shape(self.space))
         if masked is not None:
-            self.space = with_mask(self.space, masked)
-            self._masked_dtype = row_dtype(self.space)
+            self.space = components.with_mask(self.space, masked)
+            self._masked_dtype = components.row_dtype(self.space)
         if channels is not None and not any(len(part.shape or ()) == 3 for part in seen):
             raise PgtsError(f"image_channels is {channels!r}; {self._what} are {space}, without an image of three axes")
 
@@ -150,7 +141,7 @@ class Observations:
     def _known(self, space: Space[Any]) -> list[tuple[Path, Component]]:
         """The components of a space; PgtsError where a part of it is none."""
         known: list[tuple[Path, Component]] = []
-        for path, part in found_in(space):
+        for path, part in components.found_in(space):
             if isinstance(part, Component):
                 known.append((path, part))
                 continue
@@ -224,7 +215,7 @@ class Observations:
             return row_N
         legal_NA = legal_NA | ~legal_NA.any(-1, keepdim=True)
         row_ND = row_N.reshape(row_N.shape[0], -1).to(_torch_dtype(self._masked_dtype))
-        return with_legal(row_ND, legal_NA)
+        return components.with_legal(row_ND, legal_NA)
 
     @staticmethod
     def _before(array: np.ndarray, part: _Part) -> tuple[int, ...]:
@@ -234,7 +225,7 @@ class Observations:
         """The numbers of combinations, in mixed radix; the last entry counts fastest. Arrays or tensors."""
         number = 0 * flat[0][..., 0]
         for part, array in zip(self._parts, flat, strict=True):
-            for k, count in enumerate(counts(part.seen).tolist()):
+            for k, count in enumerate(components.counts(part.seen).tolist()):
                 number = number * count + array[..., k]
         return number
 
@@ -248,7 +239,7 @@ def _from_zero(array: np.ndarray, space: spaces.Discrete | spaces.MultiDiscrete 
     if array.dtype.kind not in ("biu" if isinstance(space, spaces.MultiBinary) else "iu"):
         raise PgtsError(f"observation is of {array.dtype}; states are integers")
     first = np.asarray(0 if isinstance(space, spaces.MultiBinary) else space.start)
-    number, count = array.astype(np.int64) - first, counts(space).reshape(space.shape or ())
+    number, count = array.astype(np.int64) - first, components.counts(space).reshape(space.shape or ())
     off = (number < 0) | (number >= count)
     if not off.any():
         return number

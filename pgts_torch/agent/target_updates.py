@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pgts_torch.agent import objectives
 from pgts_torch.agent.iteration import Batch
 from pgts_torch.agent.networks import Network
 from pgts_torch.agent.neural_updates import NetworkUpdate
-from pgts_torch.agent.objectives import divergence, log_probs, log_probs_before, log_softmax, mean, passes, with_legal
 from pgts_torch.options.updates import CMPO, Mirror
 from pgts_torch.ranks import ALONE, Ranks
 from pgts_torch.readings import Readings
@@ -40,19 +40,19 @@ class TargetUpdate(NetworkUpdate):
 
         Where step(s, a) is 0 everywhere no gradient step is taken, because Adam would turn rounding errors into one.
         """
-        old_NA, exponent_NA = log_probs_before(network, input_N, batch), self.exponent(batch)
+        old_NA, exponent_NA = objectives.log_probs_before(network, input_N, batch), self.exponent(batch)
         if batch.ranks.totals("rows that move", exponent_NA.any()) == [0]:
             readings.add(policy=0.0, grad_norm=0.0)
             return old_NA, old_NA
-        target_NA = log_softmax(old_NA + exponent_NA, batch.legal_NA)
+        target_NA = objectives.log_softmax(old_NA + exponent_NA, batch.legal_NA)
         share = batch.ranks.share("rows", len(input_N))
         weight_N = batch.weight_N / share.mean("weights", batch.weight_N)
         columns = input_N, target_NA, weight_N
-        parts = passes(with_legal(columns, batch.legal_NA), share, self.options, generator)
+        parts = objectives.passes(objectives.with_legal(columns, batch.legal_NA), share, self.options, generator)
         for norm, _ in self.descend(network, parts, batch):
             readings.add(grad_norm=norm)
-        new_NA = log_probs(network, input_N, batch.legal_NA)
-        after = mean(weight_N, divergence(target_NA, new_NA), share.total)
+        new_NA = objectives.log_probs(network, input_N, batch.legal_NA)
+        after = objectives.mean(weight_N, objectives.divergence(target_NA, new_NA), share.total)
         readings.add(policy=batch.ranks.sum("the loss of the policy", after))
         return old_NA, new_NA
 
@@ -62,7 +62,7 @@ class TargetUpdate(NetworkUpdate):
         target_NA, weight_N = part
         # Of KL(target || pi) in log pi it is -target, and so in the logits pi - target.
         down_NA = -(weight_N * (1 / count))[:, None] * target_NA.exp()
-        return down_NA, [mean(weight_N, divergence(target_NA, log_NA), count)]
+        return down_NA, [objectives.mean(weight_N, objectives.divergence(target_NA, log_NA), count)]
 
 
 @final

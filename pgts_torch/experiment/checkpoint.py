@@ -13,14 +13,7 @@ from pgts_torch.agent import saving
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.saving import Damaged
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment.ownership import (
-    CHECKPOINTS,
-    checkpoint_name,
-    checkpoints,
-    read_mark,
-    remove_partial,
-    write_mark,
-)
+from pgts_torch.experiment import ownership
 from pgts_torch.experiment.summary import EndedBy, first_mistake
 
 
@@ -65,7 +58,7 @@ def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
     Raises:
         PgtsError: it cannot be written; then the others are as they were.
     """
-    path = run / CHECKPOINTS / checkpoint_name(notes.env_steps)
+    path = run / ownership.CHECKPOINTS / ownership.checkpoint_name(notes.env_steps)
     content = algorithm.content() | {"notes": notes.model_dump()}
 
     def put() -> None:
@@ -73,8 +66,8 @@ def write(run: Path, algorithm: PGTS, notes: Notes, *, keep: int) -> Path:
             path.parent.mkdir(exist_ok=True)
         saving.write(path, content)
         tidy(run, path, keep=keep)
-        if (mark := read_mark(run)) is not None and not mark.has_checkpoints:
-            write_mark(run, replace(mark, has_checkpoints=True))
+        if (mark := ownership.read_mark(run)) is not None and not mark.has_checkpoints:
+            ownership.write_mark(run, replace(mark, has_checkpoints=True))
 
     algorithm.ranks.first("a checkpoint", put)
     return path
@@ -93,7 +86,7 @@ def read(path: Path) -> tuple[Notes, dict[str, Any]]:
     except ValidationError as error:
         reason = first_mistake(error, "notes")
         raise PgtsError(f"the checkpoint {path} is not of the form that this version writes: {reason}") from error
-    if path.name != checkpoint_name(notes.env_steps):
+    if path.name != ownership.checkpoint_name(notes.env_steps):
         raise Damaged(f"{path} is damaged: it is the checkpoint of step {notes.env_steps}")
     return notes, content
 
@@ -107,7 +100,7 @@ def newest(run: Path, *, strict: bool = False) -> tuple[Path, Notes, dict[str, A
     Raises:
         PgtsError: none is intact, or `strict` and the newest is not.
     """
-    paths = checkpoints(run)
+    paths = ownership.checkpoints(run)
     for path in reversed(paths):
         try:
             return path, *read(path)
@@ -123,8 +116,8 @@ def newest(run: Path, *, strict: bool = False) -> tuple[Path, Notes, dict[str, A
 def tidy(run: Path, last: Path, *, keep: int) -> None:
     """Remove all checkpoints but `last` and the newest before it, `keep` in all; those ahead of it are damaged. And
     what a process that was killed has left half written: nobody else may be writing."""
-    kept = [path for path in checkpoints(run) if path.name <= last.name][-keep:]
-    for path in checkpoints(run):
+    kept = [path for path in ownership.checkpoints(run) if path.name <= last.name][-keep:]
+    for path in ownership.checkpoints(run):
         if path not in kept:
             path.unlink(missing_ok=True)
-    remove_partial(run)
+    ownership.remove_partial(run)

@@ -14,21 +14,9 @@ from pgts_torch.agent.board import hyperparameters
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.config import Config, dump, load
 from pgts_torch.errors import PgtsError
-from pgts_torch.experiment import checkpoint
+from pgts_torch.experiment import checkpoint, ownership
 from pgts_torch.experiment.launch import check_restarts
 from pgts_torch.experiment.locking import RunLock
-from pgts_torch.experiment.ownership import (
-    BEST_FILE,
-    CONFIG_FILE,
-    METRICS_FILE,
-    VERSIONS_FILE,
-    Mark,
-    check_folder,
-    clear,
-    cut_events,
-    digest,
-    write_mark,
-)
 from pgts_torch.experiment.resume import Start
 from pgts_torch.experiment.tracking import RunFolder, versions
 from pgts_torch.seeding import drawn_seed
@@ -47,8 +35,8 @@ def seeded(config: Config) -> Config:
     if config.seed is not None:
         return config
     run = None if config.run.dir is None or config.run.overwrite else Path(config.run.dir)
-    goes_on = run is not None and files.kind(run / CONFIG_FILE) is not None
-    seed = load(run / CONFIG_FILE).seed if run is not None and goes_on else drawn_seed()
+    goes_on = run is not None and files.kind(run / ownership.CONFIG_FILE) is not None
+    seed = load(run / ownership.CONFIG_FILE).seed if run is not None and goes_on else drawn_seed()
     print(
         f"note: seed is null; {'the run in the folder' if goes_on else 'this run'} has the seed {seed}", file=sys.stderr
     )
@@ -60,7 +48,7 @@ def _check_dir(config: Config) -> None:
     if config.run.dir:
         with files.named(f"run.dir {config.run.dir!a}"):
             config.run.dir.encode()  # it is written down in config.yaml
-        check_folder(Path(config.run.dir))
+        ownership.check_folder(Path(config.run.dir))
     check_restarts(config, int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")))
 
 
@@ -68,7 +56,7 @@ def _check_dir(config: Config) -> None:
 def claimed(config: Config) -> Iterator[RunLock]:
     """Lock the configured folder, or a new one; PgtsError as from `check_folder`, or for an edited configuration."""
     with RunLock(Path(config.run.dir) if config.run.dir else new_folder(config)) as lock:
-        _is_edited(config, lock.path, check_folder(lock.path))
+        _is_edited(config, lock.path, ownership.check_folder(lock.path))
         yield lock
 
 
@@ -87,14 +75,14 @@ def new_folder(config: Config) -> Path:
     raise AssertionError
 
 
-def _is_edited(config: Config, run: Path, mark: Mark) -> bool:
+def _is_edited(config: Config, run: Path, mark: ownership.Mark) -> bool:
     """Whether a user has edited config.yaml in a run folder without changing its meaning, so that it is kept.
 
     Raises:
         PgtsError: it was edited and has another meaning, so that this run would overwrite the user's changes.
     """
-    path = run / CONFIG_FILE
-    if files.kind(path) is None or digest(files.read(path)) in mark.configs:
+    path = run / ownership.CONFIG_FILE
+    if files.kind(path) is None or ownership.digest(files.read(path)) in mark.configs:
         return False
     try:
         is_same = load(path).model_copy(update={"run": config.run}) == config
@@ -110,13 +98,13 @@ def opened(config: Config, lock: RunLock, start: Start | None, algorithm: PGTS) 
     TensorBoard events up to the checkpoint."""
     path = lock.path
     lock.check()
-    mark = check_folder(path)
+    mark = ownership.check_folder(path)
     text = dump(config).encode()
     is_edited = _is_edited(config, path, mark)
     new_mark = mark.of(text) if start is not None else replace(mark.of(text), has_checkpoints=False)
-    write_mark(path, new_mark)  # first of all: the mark makes this a run folder
+    ownership.write_mark(path, new_mark)  # first of all: the mark makes this a run folder
     if start is None:
-        if left := [name for name in clear(path, mark) if not (is_edited and name == CONFIG_FILE)]:
+        if left := [name for name in ownership.clear(path, mark) if not (is_edited and name == ownership.CONFIG_FILE)]:
             print(
                 f"note: run.dir {path} also holds {files.listing(left)}, which no run has left; it stays",
                 file=sys.stderr,
@@ -125,21 +113,21 @@ def opened(config: Config, lock: RunLock, start: Start | None, algorithm: PGTS) 
         checkpoint.tidy(path, start.path, keep=config.log.keep)
         print(f"going on from {start.path}", file=sys.stderr)
         if start.lost_best:
-            (path / BEST_FILE).unlink(missing_ok=True)
+            (path / ownership.BEST_FILE).unlink(missing_ok=True)
         if config.run.tensorboard:
-            cut_events(path, start.notes.files if start.has_events else {})
+            ownership.cut_events(path, start.notes.files if start.has_events else {})
     if config.critic.type == "exact":
         print("note: critic exact learns from the true values; it is for validation", file=sys.stderr)
     if not is_edited:
-        files.replace(path / CONFIG_FILE, text)
+        files.replace(path / ownership.CONFIG_FILE, text)
     position: dict[str, int] = {}
     if start is not None:
-        position = {"metrics_bytes": start.notes.files[METRICS_FILE][0], "after_step": start.notes.env_steps}
+        position = {"metrics_bytes": start.notes.files[ownership.METRICS_FILE][0], "after_step": start.notes.env_steps}
     folder = RunFolder(lock, tensorboard=config.run.tensorboard, **position)
     if folder.events is not None and folder.events.is_new:
         folder.events.begin(
             hyperparameters(algorithm.parts, env_kwargs=config.env.kwargs, seed=algorithm.seed),
             text.decode(),
         )
-    folder.json(VERSIONS_FILE, versions() | {"threads": config.threads})
+    folder.json(ownership.VERSIONS_FILE, versions() | {"threads": config.threads})
     return folder

@@ -12,6 +12,7 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch.errors import MissingModel, PgtsError, failure
+from pgts_torch.models import restoring
 from pgts_torch.models.actions import all_actions, sampled_actions
 from pgts_torch.models.adapters import known_adapter, not_restored
 from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside
@@ -21,18 +22,7 @@ from pgts_torch.models.clocks import check_clock
 from pgts_torch.models.environments import EnvSource, Given
 from pgts_torch.models.masks import masks_in
 from pgts_torch.models.published import compare_table, published_table
-from pgts_torch.models.restoring import (
-    ACTIONS_TRIED,
-    Setup,
-    Walk,
-    beside_snapshots,
-    chance,
-    check_resets,
-    repeated,
-    restored,
-    untouched,
-    walks_of,
-)
+from pgts_torch.models.restoring import Setup, Walk
 from pgts_torch.models.snapshots import SnapshotAdapter, env_name
 from pgts_torch.models.stepper import Stepper
 from pgts_torch.models.tabular import TabularModel
@@ -163,7 +153,7 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
     try:
         seen = setup.reset(new := setup.make(), seed=seed)
         setup = replace(setup, masks=masks_in(new, setup.actions, seen.info))
-        walks = walks_of(setup, continuations, length)
+        walks = restoring.walks_of(setup, continuations, length)
     except PgtsError as error:
         raise failure(f"{name} fails in random walks with seed {seed}", error) from error
     checks = (*_simulator_checks(setup, walks, length, shares), *claims)
@@ -193,19 +183,19 @@ def _setup(make: Callable[[], gymnasium.Env], env: gymnasium.Env, adapter: Snaps
 
 def _simulator_checks(setup: Setup, walks: Sequence[Walk], length: int, shares: list[float]) -> Iterator[Check]:
     """The checks of what is restored, in the order of `check_model`; `shares` gets that of random outcomes."""
-    others = functools.cache(lambda: repeated(setup, walks))
+    others = functools.cache(lambda: restoring.repeated(setup, walks))
 
     def restore() -> str:
-        beside_snapshots(setup)
+        restoring.beside_snapshots(setup)
         if isinstance(setup.adapter, Layered):
-            check_resets(setup)
-        return restored(walks, others())
+            restoring.check_resets(setup)
+        return restoring.restored(walks, others())
 
     yield _check("answers", lambda: _answers(setup, walks, shares))
     yield _check("restore", restore)
     yield _check("merge", lambda: _merged(walks, others()), needed=False)
-    yield _check("chance", lambda: chance(setup, walks))
-    yield _check("untouched", lambda: untouched(setup, length))
+    yield _check("chance", lambda: restoring.chance(setup, walks))
+    yield _check("untouched", lambda: restoring.untouched(setup, length))
     yield from _clock(setup)
 
 
@@ -243,7 +233,7 @@ def _answers(setup: Setup, walks: Sequence[Walk], shares: list[float]) -> str:
     """Query a model for some actions in each state; the share of those that chance decides is added to `shares`."""
     model = setup.model()
     numbers = [model.number(walk.start, legal_A=walk.legal_A) for walk in walks]
-    state_N = torch.tensor(numbers).repeat_interleave(ACTIONS_TRIED)
+    state_N = torch.tensor(numbers).repeat_interleave(restoring.ACTIONS_TRIED)
     action_N = torch.from_numpy(setup.random.integers(len(setup.actions), size=len(state_N)))
     legal_NA = torch.tensor(model.legal(state_N))
     action_N = torch.where(legal_NA.gather(1, action_N[:, None]).squeeze(1), action_N, legal_NA.int().argmax(1))
