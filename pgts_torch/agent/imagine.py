@@ -29,8 +29,9 @@ def imagine(
 ) -> Rollout:
     """Run one episode of at most `length` steps in the model from each state; the environment is not stepped.
 
-    Outcomes are sampled from the model, so visits are an unbiased sample of what pi does in it. An episode is cut off
-    before a step that the model does not trust, unless it is the first one.
+    Outcomes are sampled from the model, so visits are an unbiased sample of what pi does in it where it trusts all
+    steps. An episode is cut off before a step that it does not trust, unless it is the first one: later visits are
+    then those of trusted actions.
 
     Args:
         world: its model is stepped, and gives the observations of its states.
