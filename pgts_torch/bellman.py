@@ -1,8 +1,7 @@
 """The outcomes of states and actions, and the one Bellman backup that exact solvers and searches share.
 
-A tabular MDP is a table of outcomes for all its states. A level of a lookahead is a table of outcomes for its frontier.
-Both are `Outcomes` and both are backed up by `backup`, so exact values and searches cannot differ in what they compute.
-On the CPU the loops of `bellman_kernels` do what the torch code says.
+A tabular MDP is a table of outcomes for all its states, a level of a lookahead one for its frontier. Both are backed up
+by `backup`, so exact values and searches cannot differ in what they compute. On the CPU `bellman_kernels` does it.
 """
 
 import functools
@@ -26,11 +25,9 @@ _LARGE = 2**20
 """From so many outcomes on torch divides a product among its threads; compiled loops take one."""
 
 COMPILED_FROM = 256
-"""From so many outcomes on, backups are compiled where they can be. For fewer, loading what is compiled takes longer
-than it saves, unless it is loaded."""
+"""From so many outcomes on, backups are compiled where they can be; for fewer if the loops are loaded already."""
 
 _KERNELS = "pgts_torch.bellman_kernels"
-
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, int, int]
 """Rewards, weights and children, flat; numbers of actions and of outcomes."""
@@ -64,10 +61,8 @@ class Outcomes:
         Args:
             weight, child: N A K numbers, flat.
         """
-        shape = (*reward_NA.shape, K)
-        outcomes = cls(
-            reward_NA, weight.view(shape), weight.new_ones(()).expand(shape), child.view(shape), num_children
-        )
+        shape, one = (*reward_NA.shape, K), weight.new_ones(())
+        outcomes = cls(reward_NA, weight.view(shape), one.expand(shape), child.view(shape), num_children)
         vars(outcomes)["weight"] = _rows(weight, child, K, num_children)
         return outcomes
 
@@ -145,13 +140,8 @@ class Outcomes:
 
     def rows(self, row_N: Int[Tensor, "N"]) -> Self:
         """The outcomes of some of the states, in the given order."""
-        return type(self)(
-            self.reward_NA[row_N],
-            self.prob_NAK[row_N],
-            self.discount_NAK[row_N],
-            self.child_NAK[row_N],
-            self.num_children,
-        )
+        prob_NAK, discount_NAK = self.prob_NAK[row_N], self.discount_NAK[row_N]
+        return type(self)(self.reward_NA[row_N], prob_NAK, discount_NAK, self.child_NAK[row_N], self.num_children)
 
     def paying(self, reward_NA: Float[Tensor, "N A"]) -> Self:
         """The same outcomes with other rewards, and with the same `weight` in memory; an action that is not allowed
@@ -162,13 +152,9 @@ class Outcomes:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
         """The same outcomes on another device or in another floating dtype."""
-        return type(self)(
-            self.reward_NA.to(device, dtype),
-            self.prob_NAK.to(device, dtype),
-            self.discount_NAK.to(device, dtype),
-            self.child_NAK.to(device),
-            self.num_children,
-        )
+        prob_NAK, discount_NAK = self.prob_NAK.to(device, dtype), self.discount_NAK.to(device, dtype)
+        reward_NA, child_NAK = self.reward_NA.to(device, dtype), self.child_NAK.to(device)
+        return type(self)(reward_NA, prob_NAK, discount_NAK, child_NAK, self.num_children)
 
 
 def policy_mean(pi_NA: Float[Tensor, "N A"], q_NA: Float[Tensor, "N A"]) -> Float[Tensor, "N"]:
@@ -250,9 +236,7 @@ def sweep(
             arrays = outcomes.arrays if action_S is None else _arrays(reward_NA, weight, outcomes.num_outcomes)
             v = _array(v_S)
             return torch.from_numpy(_kernels().back_up(*arrays, v, times, v[:0]))
-        if times == 0:
-            return v_S.clone()
-        reward = reward_NA.reshape(-1)
+        v_S, reward = v_S if times else v_S.clone(), reward_NA.reshape(-1)
         for _ in range(times):
             v_S = _product(weight, outcomes.num_outcomes, v_S, reward).view(reward_NA.shape).amax(-1)
         return v_S
@@ -276,27 +260,19 @@ def _product(weight: Tensor, K: int, v_C: Float[Tensor, "C"], reward: Float[Tens
 def sums_in_order(device: torch.device, size: int) -> bool:
     """Whether a product adds in the order of compiled loops where nothing is compiled: on the CPU, unless it is large.
 
-    The order in which torch's sparse product adds, and whether it rounds in between, is that of the processor's maker.
-    It depends on the number of rows too, so that a search split into batches would be another one.
+    The order in which torch's sparse product adds depends on the processor, and on the number of rows, so that a search
+    split into batches would be another one.
     """
     return device.type == "cpu" and size < _LARGE
 
 
 def _rows(values: Tensor, child: Tensor, K: int, num_children: int) -> Tensor:
     """The sparse matrix whose rows have K entries each."""
-    index = child.dtype
+    size = len(child) // K, num_children
+    first = torch.arange(size[0] + 1, dtype=child.dtype, device=child.device) * K
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
-        warnings.filterwarnings(
-            "ignore", message="Sparse invariant checks are implicitly disabled"
-        )  # before torch 2.12
-        return torch.sparse_csr_tensor(
-            torch.arange(len(child) // K + 1, dtype=index, device=child.device) * K,
-            child,
-            values,
-            size=(len(child) // K, num_children),
-            check_invariants=False,
-        )
+        warnings.filterwarnings("ignore", message="Sparse (CSR tensor support|invariant checks)")
+        return torch.sparse_csr_tensor(first, child, values, size=size, check_invariants=False)
 
 
 def _check_values(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> None:
@@ -310,13 +286,8 @@ def _check_values(outcomes: Outcomes, v_C: Float[Tensor, "C"]) -> None:
 
 def _arrays(reward_NA: Float[Tensor, "N A"], weight: Tensor, K: int) -> Arrays:
     child = weight.col_indices().numpy()
-    return (
-        reward_NA.detach().reshape(-1).numpy(),
-        weight.values().numpy(),
-        child.view(np.uint32 if child.dtype == np.int32 else np.uint64),
-        reward_NA.shape[1],
-        K,
-    )
+    child = child.view(np.uint32 if child.dtype == np.int32 else np.uint64)
+    return reward_NA.detach().reshape(-1).numpy(), weight.values().numpy(), child, reward_NA.shape[1], K
 
 
 @functools.cache
