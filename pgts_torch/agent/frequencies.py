@@ -41,8 +41,8 @@ class Frequencies:
 
     Row r has outcomes k with claimed probabilities p_rk. The hypothesis, for a margin e: in every row the claim about
     each event is within e of its true probability. Each batch of steps is bet on using earlier steps only: in row r on
-    the event A_r of the outcomes that were more frequent than claimed, and only if their frequency was above
-    m = p_r(A_r) + e. At odds that are fair for the probability m, staking a fraction g of the wealth W_rg changes it to
+    the event A_r of the outcomes that were more frequent than claimed, and only if their frequency was above m =
+    p_r(A_r) + e. At odds that are fair for the probability m, staking a fraction g of the wealth W_rg changes it to
 
         W_rg <- W_rg * (1 + g (1 - m) / m)    where A_r happens,        W_rg * (1 - g)    elsewhere,
 
@@ -51,11 +51,10 @@ class Frequencies:
         E = 1/2 mean_g prod_r W_rg  +  1/2 mean_r mean_g W_rg
 
     is a nonnegative supermartingale that begins at 1: P(E ever reaches 1/a) <= a, however often it is looked at (Ville
-    1939; Waudby-Smith and Ramdas 2024). The product detects a small error common to many rows, the mean over rows a
-    large one in a single row. docs/theory.md, Sec. 7.
+    1939; Waudby-Smith and Ramdas 2024; docs/theory.md, Sec. 7). The product detects a small error common to many rows,
+    the mean over rows a large one in a single row.
 
-    log_evidence: log E, for each margin.
-    has_chance: whether there is a row with several possible outcomes.
+    log_evidence: log E, for each margin.   has_chance: whether there is a row with several possible outcomes.
 
     Args:
         prob_RK: the claimed probabilities. Rows with a single possible outcome are not tested.

@@ -49,9 +49,8 @@ class LatentModel(FittedModel):
 
         reward = (1 - p) r_0 + p r_1,    discount = gamma (1 - p),    p = the probability of an end
 
-    so r_0 is the reward of a step after which the episode goes on, r_1 that of a step that ends it. Nothing is decoded:
-    a vector has to tell only what follows (MuZero, Schrittwieser et al. 2020). Over K steps from an image, with the
-    actions that were taken, these are added:
+    so r_0 is the reward of a step after which the episode goes on, r_1 that of a step that ends it. Nothing is decoded
+    (MuZero, Schrittwieser et al. 2020). Over K steps from an image, with the actions that were taken, these are added:
 
         reward          squared error, in standard deviations of rewards
         end             cross-entropy; ends are oversampled, and the predicted odds corrected for that
@@ -63,8 +62,7 @@ class LatentModel(FittedModel):
 
     `step` is deterministic, `sample` samples the end. A tenth of the steps is held out to measure errors.
 
-    space: of the vectors.
-    representation: the network h.
+    space: of the vectors.   representation: the network h.
     replay: its columns "state" and "next_state" have the images, as they came.
 
     Args (others as of `FittedModel`):

@@ -54,8 +54,8 @@ class Trunk(nn.Module):
 
 def default_network(space: Space[Any], *, normalize: bool = False) -> MLP | CNN:
     """Return the network for such observations where none is given: a CNN where there are images that its convolutions
-    fit in, with strides where they are large, or else the dense layer of Atari's (210, 160, 3) would have 266 million
-    weights; an MLP for all others.
+    fit in, an MLP for all others. On large images the CNN has strides: without them the dense layer behind Atari's
+    frames, (210, 160, 3), would have 266 million weights.
 
     Args:
         normalize: whether an MLP normalises what has a scale.
@@ -74,17 +74,16 @@ def make_trunk(
 ) -> Trunk:
     """Make a trunk on the CPU, with orthogonal weights of gain sqrt(2) (Saxe et al. 2014) and biases 0.
 
-    MLP: without hidden layers, and with one-hot states, the network is a table. CNN: convolutions without padding over
-    channels-last images, each image with its own, beside what is no image; `CNN()` is the usual one for the 7x7x3 views
-    of MiniGrid (Chevalier-Boisvert et al. 2023).
+    Convolutions are over channels-last images without padding, each image with its own, beside what is no image; those
+    of `CNN()` are the usual ones for the 7x7x3 views of MiniGrid (Chevalier-Boisvert et al. 2023).
 
     Args:
         observation_space: of the rows: a `Component`, or a Tuple of some.
         num_outputs: of a module of the caller's own that returns outputs.
 
     Raises:
-        PgtsError: the network does not take such observations, a layer would have more than 20 million weights, or
-            a module of the caller's own cannot be used.
+        PgtsError: the network does not take such observations, a layer would have more than 20 million weights, or a
+            module of the caller's own cannot be used.
     """
     encoder = Encoder(observation_space, network)
     if isinstance(network, OwnModule):
@@ -185,9 +184,10 @@ class Network(nn.Module):
 
     @property
     def theta_D(self) -> Float[np.ndarray, "P"]:
-        """All weights as one vector, on the CPU. They lie in it, so each changes with the other; where they lie
-        elsewhere, because another network has the same trunk or because this one is a copy, they are moved into a new
-        one."""
+        """All weights as one vector, on the CPU, in which they lie, so that each changes with the other. Weights that
+        lie elsewhere, because another network has the same trunk or because this one is a copy, are moved into a new
+        one.
+        """
         place, theta_D = self._packed
         if self.weights[0].data_ptr() != place:
             with torch.inference_mode(False):  # or it could not be changed outside of that mode

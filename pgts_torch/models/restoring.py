@@ -100,8 +100,10 @@ class Setup:
 
 @dataclass(frozen=True)
 class Walk:
-    """A recorded walk: its start, the key of its chance, its actions, what was seen and the names of its states; and
-    the legal actions at its start, None where these are not known."""
+    """A recorded walk: its start, the key of its chance, its actions, what was seen, and the names of its states.
+
+    legal_A: the legal actions at its start; None where these are not known.
+    """
 
     start: Snapshot
     key: int
@@ -112,8 +114,8 @@ class Walk:
 
 
 def check_snapshots(setup: Setup, *, seconds: float = 0.4) -> float:
-    """The checks `chance`, `restore` and `untouched` with a few short walks and a long one; their length is such that
-    all takes about these seconds, and at least two steps. Return the seconds that a step takes with its snapshot.
+    """Check a few short walks and a long one (`chance`, `restored`, `untouched`), whose length is such that all takes
+    about these seconds, and at least two steps. Return the seconds that a step takes with its snapshot.
 
     Raises:
         MissingModel: snapshots of the environment cannot be trusted; the message says why.

@@ -61,14 +61,13 @@ class StateIndex:
 
     An open-addressing hash table with linear probing (Knuth, TAOCP 6.4), at most half full, that takes a whole tensor
     at once: in each round every row that is still looking visits one slot, and of those that find it empty the first
-    one takes it. Rows are compared in full, so a collision of hashes costs a round and never an error. A call costs
-    O(N) for N rows however many are known; the cost of growth is spread over the calls that cause it. On the CPU a
+    one takes it. Rows are compared in full, so a collision of hashes costs a round and never an error. On the CPU a
     compiled loop (`index_kernels`) takes one row after another and gives the same numbers.
 
-    Where rows do not recur, lookups are a waste. With `merge` "auto" each row gets a number of its own, without a
-    lookup, once a few thousand of them have recurred less than 1.01 times on average. One row in 16 is still looked up,
-    chosen by its hash, so that rows equal to it are chosen too: when these recur, lookups are resumed, after one call
-    that enters the rows that were skipped. A row that got several numbers is then known by the first one.
+    Where rows do not recur lookups are a waste. With `merge` "auto" each row gets a number of its own, without a
+    lookup, once a few thousand of them have recurred less than 1.01 times on average. One row in 16, chosen by its
+    hash, is still looked up: when these recur, lookups are resumed, after one call that enters the rows that were
+    skipped. A row that got several numbers is then known by the first one.
 
     count: how many rows there are.
 

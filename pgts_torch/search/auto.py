@@ -26,16 +26,14 @@ class AutoSearch(Search):
     """Picks the search by what the model can do, by how often paths meet, and by the budget; `str` says what it picked.
 
     - The model enumerates outcomes and the nodes that hold all paths fit into the budget: expectimax of full width,
-      exact.
-    - It enumerates them and they do not fit: expectimax that expands as many states of each level as fit. The width is
-      halved until they do; where they left room, the next search is twice as wide. Full width is not tried again for
-      as many roots and levels as were too many the last time.
-    - There is a largest number of model calls, and the model may have more states: expectimax of the width W with which
-      (roots + W (levels - 1)) A calls are not more.
+    exact.
+    - It enumerates them and they do not fit: expectimax of bounded width. The width is halved until a search fits;
+    where it left room, the next one is twice as wide. Full width is not tried again for as many roots and levels.
+    - `max_calls` is given, and the model may have more states: expectimax of the width W with which (roots + W (levels
+    - 1)) A calls are not more.
     - It only samples outcomes, or turns out to be random where it should enumerate them: sampled, with as many samples
-      of each action as fit if no two paths meet. Where paths met and left room, the next search takes twice as many, up
-      to 32; for more roots or levels the number is chosen again, and a search that turns out too large is done again
-      with half.
+    of each action as fit if no two paths meet. Where paths met and left room, the next search takes twice as many, up
+    to 32; for more roots or levels the number is chosen again, and is halved where a search turns out too large.
 
     Raises:
         NodeBudgetExceeded: from a search, where even one state a level, or one sample of each action, is too much.

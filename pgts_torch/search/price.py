@@ -29,8 +29,7 @@ class Meter:
             number of states that the model will have been queried for in this update, and the seconds of queries from
             now on.
         planned: how many levels the deepest search of an update expands; None: those of the one under way.
-        patience: in seconds.
-        clock: returns seconds.
+        patience: in seconds.   clock: returns seconds.
     """
 
     def __init__(

@@ -20,15 +20,14 @@ _SLACK = 1e-9
 
 @final
 class WideningTrees:
-    """One simulation after another, below all roots at once, over K drawn actions of which a node that was visited N
+    """One simulation after another, below all roots at once, over K drawn actions, of which a node that was visited N
     times has (Couetoux et al. 2011)
 
         k(N) = min(K, ceil(C N^alpha)),    alpha in [0, 1]
 
-    and one more where nothing is left to expand below those that it has. The model is queried for an action when a node
-    gets it; the values of its nodes are maxima over the actions that they have. A root has all K. So with C >= K these
-    are the trees of a search that expands nodes with all their actions, and after finitely many simulations all of them
-    are there, whatever C and alpha are.
+    and one more where nothing is left to expand below those that it has. A root has all K. The model is queried for an
+    action when a node gets it; the values of nodes are maxima over the actions that they have. So with C >= K, and
+    after finitely many simulations whatever C and alpha are, these are the trees of a search that expands all actions.
 
     A: K.
     nodes: itself. As of `Tree`, `q_NA` and `visits_NA` are values and simulations; q is -inf of actions that a node

@@ -138,16 +138,16 @@ def grid(
 
 
 def mirage(width: int = 10, *, delta: float = 0.05, gamma: float = 0.9, start: Start = 0) -> TabularMDP:
-    """A choice that a deep lookahead belittles: in state 0, 'right' leads to state 1, where every step earns 1, and
-    'left' to one of `width` states at random, where a step earns 1 - delta by 'right' and nothing by 'left'.
+    """A choice that a deep lookahead hides: in state 0, 'right' leads to state 1, where every step earns 1, and 'left'
+    to one of `width` states at random, where a step earns 1 - delta by 'right' and nothing by 'left'.
 
     J* = gamma / (1 - gamma) from state 0, by 'right' in every state. To the policy that always goes left the advantage
     of 'right' in state 0 is
 
         (T^m Q)(0, right) - (T^m Q)(0, left) = gamma / (1 - gamma) (1 - (1 - delta) (1 - gamma^m))
 
-    which falls from gamma / (1 - gamma) to delta gamma / (1 - gamma): what 'left' could still be made of counts more
-    and more with depth (docs/theory.md, Sec. 5). The wider, the slower it is made of it.
+    which falls from gamma / (1 - gamma) to delta gamma / (1 - gamma), because a deeper lookahead sees how good the
+    states behind 'left' could be made (docs/theory.md, Sec. 5). The more of them there are, the longer that takes.
     """
     check_count("width", width)
     if not 0 < delta < 1:
@@ -162,15 +162,16 @@ def roundabout(depth: int = 1, *, cost: float | None = None, gamma: float = 0.9,
     """m + 2 states on which a lookahead of m = depth goes round for ever, though a policy in sight earns 1 a step.
 
     In state 0 both actions cost `cost`: 'left' leads to state 1, where nothing is earned any more, 'right' to state 2.
-    There 'right' stays and earns 1, and 'left' leads back to state 0, which takes m steps.
+    There 'right' stays and earns 1, and 'left' leads back to state 0 in m steps. J* = gamma / (1 - gamma) - cost from
+    state 0.
 
-    J* = gamma / (1 - gamma) - cost from state 0, by 'right' in every state. To the policy that always goes left state 2
-    looks good; to the one that goes right in state 0 only, and so visits state 2, it looks best there to go back and
-    then left. Each prefers the other in state 0, and neither changes state 2 (docs/theory.md, Prop. 16).
+    To the policy that always goes left state 2 looks good; to the one that goes right in state 0 only it looks best
+    there to go back and then left. Each prefers the other in state 0, and neither changes state 2 (docs/theory.md,
+    Prop. 16).
 
     Args:
-        cost: between (1 - gamma^{m+1})^2 / ((1 - gamma) gamma^m (2 gamma^{m+1} - 1)) and
-            (1 - gamma^m) / ((1 - gamma) gamma^{2m}). Default: the middle.
+        cost: between (1 - gamma^{m+1})^2 / ((1 - gamma) gamma^m (2 gamma^{m+1} - 1)) and (1 - gamma^m) / ((1 - gamma)
+            gamma^{2m}). Default: the middle.
 
     Raises:
         PgtsError: there is no such cost, because gamma is too small for the depth, or it is not between the two.
@@ -259,8 +260,7 @@ def river_swim(n: int = 12, *, gamma: float = 0.99, start: Start = 0) -> Tabular
     [transitions: Strehl and Littman 2008; rewards: Osband, Russo and Van Roy 2013]
 
     In the first state 'right' stays with 0.7; in the last it stays with 0.3 and drifts left with 0.7. Both papers have
-    6 states. Strehl and Littman start in the second or third and pay 5 and, where 'right' stays in the last state,
-    10,000; the current of Osband et al. is weaker (0.35, 0.6 and 0.05).
+    6 states; starts and rewards of the first, and the current of the second, are others.
     """
     check_count("n", n, least=2)
     P: list[list[list[Transition]]] = []
@@ -276,13 +276,12 @@ def river_swim(n: int = 12, *, gamma: float = 0.99, start: Start = 0) -> Tabular
 def corridor(
     width: int = 3, length: int = 25, *, slip: float = 0.2, gamma: float = 0.99, start: Start = None
 ) -> TabularMDP:
-    """A slippery corridor without walls: a step off its long sides leads back to the start. Reaching the last
-    column earns 1 and ends the episode. State `length * row + column`; actions left, right, up, down.
+    """A slippery corridor without walls: a step off its long sides leads back to the start. Reaching the last column
+    earns 1 and ends the episode. State `length * row + column`; actions left, right, up, down.
 
     An action moves one cell as intended with probability 1 - slip, and to either side at right angles with slip / 2
     each, as on the ice of Gymnasium's FrozenLake; the long sides are the cliff of its CliffWalking, without the cost. A
-    step against the end of the first column stays. The length is what a lookahead must see or what must be learned
-    column by column.
+    step against the end of the first column stays.
 
     Args:
         start: default the middle of the first column.
