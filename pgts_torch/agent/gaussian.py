@@ -202,12 +202,9 @@ class MixtureProposal:
         wider = Normals(normals.mean_NX, self._scale * normals.std_NX)
         # log pi - log beta is minus the log of  share + (1 - share) wide / pi.
         ratio_NK = wider.log_density(action_NKX) - log_NK
-        parts_2NK = torch.stack([torch.full_like(ratio_NK, math.log(self._share)), ratio_NK + self._log_rest])
+        log_rest = math.log1p(-self._share) if self._share < 1 else -math.inf
+        parts_2NK = torch.stack([torch.full_like(ratio_NK, math.log(self._share)), ratio_NK + log_rest])
         return Drawn(action_NKX, (-parts_2NK.logsumexp(0)).softmax(-1))
-
-    @property
-    def _log_rest(self) -> float:
-        return math.log1p(-self._share) if self._share < 1 else -math.inf
 
     def _draw(self, normals: Normals, state_N: Int[Tensor, "N"]) -> Float[Tensor, "N K X"]:
         size = normals.mean_NX.shape[1]

@@ -8,7 +8,6 @@ is PPO.
 import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import final
 
 import torch
@@ -24,7 +23,6 @@ from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.stepped import SteppedUpdate
 from pgts_torch.agent.target_updates import advantage_scale
 from pgts_torch.options.updates import MPO, PPO, Gradient
-from pgts_torch.ranks import Ranks
 from pgts_torch.search.lookahead import check_finite
 
 _LEAST = 1e-6
@@ -69,13 +67,16 @@ class GaussianUpdate(SteppedUpdate):
             weight_N = batch.weight_N.float()
             scaled_N = weight_N / share.mean("weights", weight_N)
             columns = input_N, *old, scaled_N, *self.aims(old, batch, scaled_N)
+            most = getattr(self.options, "target_kl", None)
             num_epochs, size = self._passes(share.total)
             passes = (minibatches(columns, size, share, generator=generator) for _ in range(num_epochs))
             for count, part in itertools.chain.from_iterable(passes):
                 made = Forward(network, part[0])
                 now, was = policy.read(made.output_ND), Normals(*part[1:3])
-                if self._is_far(ranks, lambda: mean(part[3], was.divergence(now), count)):  # noqa: B023
-                    break
+                if most is not None:
+                    own = mean(part[3], was.divergence(now), count)
+                    if float(ranks.sum("the divergence", own)) > most:
+                        break
                 loss_N, mean_NX, log_std_NX = self.loss(now, was, *part[4:])
                 down_N1 = (part[3] * (1 / count))[:, None]
                 down_ND = policy.through(made.output_ND, down_N1 * mean_NX, down_N1 * log_std_NX)
@@ -92,11 +93,6 @@ class GaussianUpdate(SteppedUpdate):
             if not fresh:
                 encoder.absorb(batch.observation_N, ranks)
         return readings.means
-
-    def _is_far(self, ranks: Ranks, kl: Callable[[], Tensor]) -> bool:
-        """Whether KL(pi_old || pi) of a minibatch, of which `kl` computes the part of this process, ends the steps."""
-        most = getattr(self.options, "target_kl", None)
-        return most is not None and float(ranks.sum("the divergence", kl())) > most
 
     def _passes(self, rows: int) -> tuple[int, int]:
         """How many passes over how large minibatches."""

@@ -170,7 +170,7 @@ class Network(nn.Module):
         else:
             self.head = _linear(trunk.num_features, num_outputs, gain, generator, trunk.encoder.space)
         self._most_rows = max(1, _MOST_INPUTS // max(trunk.encoder.num_inputs, trunk.num_features))
-        self.loops: Callable[[], bool] = _never
+        self.loops: Callable[[], bool] = lambda: False
         self._packed = 0, np.zeros(0, np.float32)
 
     @cached_property
@@ -289,10 +289,6 @@ class Network(nn.Module):
                 raise PgtsError(f"{name} is negative")
         for name, value in found.items():
             own[name].copy_(value)
-
-
-def _never() -> bool:
-    return False
 
 
 def _linear(inputs: int, outputs: int, gain: float, generator: torch.Generator, space: Space[Any]) -> nn.Linear:

@@ -30,10 +30,6 @@ from pgts_torch.options.environment import Observed
 from pgts_torch.tabular.mdp import TabularMDP
 
 
-def _as_it_is(encoded_N: Tensor) -> Tensor:
-    return encoded_N
-
-
 class World:
     """Environments and their observations as tensors: all that is needed for rollouts without a lookahead.
 
@@ -85,7 +81,7 @@ class World:
         masked = self.num_actions if isinstance(masks, ActionMasks) and self.shows_masks else None
         self.observations = Observations(env, observed, self.device, numbered=numbered, masked=masked)
         self.observation_space = self.perceived_space = self.observations.space
-        self.perceive = _as_it_is
+        self.perceive = lambda encoded_N: encoded_N
 
     def encode(self, observation: Any) -> Tensor:
         """Return one observation of an environment, or rows of them, as the tensor that a policy takes; PgtsError

@@ -1,6 +1,7 @@
 """The command line's parser, arguments that several commands have, help and output."""
 
 import argparse
+import functools
 import itertools
 import json
 import sys
@@ -24,7 +25,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, function: Callable[..., Any], **settings: Any) -> None:
         settings = {"prog": f"pgts {command_name(function)}", "description": summary(function)} | settings
-        super().__init__(allow_abbrev=False, formatter_class=_Formatter, **settings)
+        formatter: Any = functools.partial(argparse.RawDescriptionHelpFormatter, width=WIDTH)
+        super().__init__(allow_abbrev=False, formatter_class=formatter, **settings)
 
     def print_help(self, file: Any = None) -> None:
         """As argparse, but a broken pipe raises an error."""
@@ -41,11 +43,6 @@ def command_name(function: Callable[..., Any]) -> str:
 def summary(function: Callable[..., Any]) -> str:
     """Return the first line of its docstring."""
     return (function.__doc__ or "").partition("\n")[0]
-
-
-class _Formatter(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, width=WIDTH)
 
 
 def describe_options(options: Sequence[Option]) -> Iterator[str]:

@@ -143,31 +143,26 @@ Ascending = Annotated[
 ]
 
 
-def _check_samples(value: Any) -> Any:
-    levels = value if isinstance(value, list) and value else [value]
-    if not all((type(count) is int and 1 <= count <= INT64_MAX) or count is None for count in levels) or value is None:
-        raise ValueError
-    return value
-
-
-def _check_per_layer(value: Any) -> Any:
-    numbers = value if isinstance(value, list) and value else [value]
-    if not all(type(number) is int and 1 <= number <= 2**16 for number in numbers):
-        raise ValueError
+def _check_counts(value: Any, *, most: int, has_null: bool) -> Any:
+    """A whole number, or a list of such and, if `has_null`, None; else ValueError."""
+    is_list = isinstance(value, list) and len(value) > 0
+    for count in value if is_list else [value]:
+        if not ((type(count) is int and 1 <= count <= most) or (count is None and is_list and has_null)):
+            raise ValueError
     return value
 
 
 PerLayer = Annotated[
     Any,
     BeforeValidator(_as_list),
-    AfterValidator(_check_per_layer),
+    AfterValidator(partial(_check_counts, most=2**16, has_null=False)),
     Field(json_schema_extra={"requirement": "a whole number in [1, 65536], or a list of such, one for each layer"}),
 ]
 
 Samples = Annotated[
     Any,
     BeforeValidator(_as_list),
-    AfterValidator(_check_samples),
+    AfterValidator(partial(_check_counts, most=INT64_MAX, has_null=True)),
     Field(json_schema_extra={"requirement": "a whole number >= 1, or a list of such and null, one for each level"}),
 ]
 """None in a list: all outcomes are enumerated at that level."""

@@ -118,7 +118,7 @@ class Plan:
 
     def arguments(self, values: Values, own: Mapping[str, Any]) -> tuple[str, ...]:
         """The overrides of a run with these values, and keys of its own."""
-        chosen = (f"--{key}={_written(value)}" for key, value in values.items())
+        chosen = (f"--{key}={value if isinstance(value, str) else repr(value)}" for key, value in values.items())
         return (*self.overrides, *chosen, *(f"--{key}={value}" for key, value in own.items()))
 
     def config(self, values: Values, own: Mapping[str, Any] | None = None) -> Config:
@@ -175,7 +175,3 @@ def plan(
         every = max(1, base.total_steps // _EVALUATIONS)
         made = replace(made, overrides=(*overrides, f"--eval.every={every}"))
     return made
-
-
-def _written(value: Value) -> str:
-    return value if isinstance(value, str) else repr(value)
