@@ -19,7 +19,6 @@ from pgts_torch.agent.worlds import SimulatedWorld
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.base import LearningModel
 from pgts_torch.models.replay import ReplayBuffer
-from pgts_torch.models.snapshots import env_name
 from pgts_torch.options.replay import UniformReplay
 
 
@@ -145,17 +144,19 @@ class Dyna:
         """Return what was kept and learned, as tensors on the CPU and plain values.
 
         Raises:
-            PgtsError: the states that were kept are snapshots of a simulator.
+            PgtsError: the states that were kept are snapshots of a simulator, which are objects.
         """
-        model = self._model
-        if self._owns_replay and isinstance(self._world, SimulatedWorld):
-            raise PgtsError(
-                f"replay keeps snapshots of {env_name(self._world.env)}, which are objects of its simulator and cannot "
-                "be saved: train with it in Python without saving, or without replay (replay.type none)"
-            )
+        model, replay = self._model, self.replay.state_dict() if self._owns_replay else None
+        if replay is not None and isinstance(self._world, SimulatedWorld):
+            try:
+                replay["columns"] = self._world.model.packed(replay["columns"]["state"])
+            except PgtsError as error:
+                raise PgtsError(
+                    f"replay keeps {error}: train in Python without saving, or without replay (replay.type none)"
+                ) from error
         return {
             "num_updates": self.num_updates,
-            "replay": self.replay.state_dict() if self._owns_replay else None,
+            "replay": replay,
             "model": model.state_dict() if isinstance(model, LearningModel) else None,
             "explorer": None if self.explorer is None else self.explorer.state_dict(),
             "policy": self.policy.state_dict() if self.policy is not self._trained else None,
@@ -168,7 +169,10 @@ class Dyna:
         if self.explorer is not None:
             self.explorer.load_state_dict(state["explorer"])
         if self._owns_replay:
-            self.replay.load_state_dict(state["replay"])
+            replay = state["replay"]
+            if isinstance(self._world, SimulatedWorld):
+                replay = replay | {"columns": {"state": self._world.model.unpacked(replay["columns"])}}
+            self.replay.load_state_dict(replay)
         if isinstance(model, LearningModel):
             model.load_state_dict(state["model"])
         if self.policy is not self._trained:

@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pgts_torch.agent.collect import check_end, survival
@@ -12,7 +12,7 @@ from pgts_torch.agent.rollout import COLUMNS, Rollout
 from pgts_torch.agent.world import ModelWorld
 from pgts_torch.agent.worlds import SimulatedWorld
 from pgts_torch.errors import MissingModel, PgtsError
-from pgts_torch.models.base import SamplingModel
+from pgts_torch.models.base import SamplingModel, Transitions
 from pgts_torch.options.rollouts import Horizon
 from pgts_torch.seeding import sample_keys
 
@@ -53,7 +53,11 @@ def imagine(
     rows: list[tuple[Tensor, ...]] = []
     while len(rows) < length and bool(alive_B.any()):
         action_B = policy.sample(observations[-1], generator=generator)
-        sampled = model.sample(state_B, action_B, key_N=sample_keys(len(state_B), generator=generator))
+        key_B = sample_keys(len(state_B), generator=generator)
+        if isinstance(world, SimulatedWorld):
+            sampled = _sample_those_that_go_on(model, state_B, action_B, key_B, alive_B)
+        else:
+            sampled = model.sample(state_B, action_B, key_N=key_B)
         if rows and sampled.trusted_N is not None:
             alive_B = alive_B & sampled.trusted_N
         reward_B, discount_B = torch.where(alive_B, sampled.reward_N.double(), 0.0), sampled.discount_N.double()
@@ -76,6 +80,17 @@ def imagine(
     )
     searched_TB = None if search_every == 1 else step_TB % search_every == 0
     return Rollout(torch.stack(observations), **columns, state_UB=torch.stack(states), searched_TB=searched_TB)
+
+
+def _sample_those_that_go_on(
+    model: SamplingModel, state_B: Tensor, action_B: Tensor, key_B: Int[Tensor, "B"], alive_B: Bool[Tensor, "B"]
+) -> Transitions:
+    """Outcomes where an episode is not over, because each takes a step of a simulator; the others stay where they
+    are, with reward and discount 0."""
+    sampled = model.sample(state_B[alive_B], action_B[alive_B], key_N=key_B[alive_B])
+    reward_B, discount_B = (x_N.new_zeros(len(state_B)) for x_N in (sampled.reward_N, sampled.discount_N))
+    reward_B[alive_B], discount_B[alive_B] = sampled.reward_N, sampled.discount_N
+    return Transitions(reward_B, discount_B, state_B.masked_scatter(alive_B, sampled.next_state_N))
 
 
 def simulated_returns(

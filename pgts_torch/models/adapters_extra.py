@@ -55,7 +55,7 @@ class Mujoco(SnapshotAdapter):
 
     Reacher and Pusher keep beside it what their reset drew, which the positions hold too."""
 
-    name = "MuJoCo"
+    name, is_plain = "MuJoCo", True
     restored = frozenset({"data", "mujoco_renderer", "goal", "goal_pos", "cylinder_pos", "init_qpos"})
 
     def __init__(self) -> None:

@@ -93,7 +93,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel):
                 f"action_repeat is {action_repeat}, and {masks.what} may forbid the second of two equal actions: take "
                 "1, or set action_masks to 'off'"
             )
-        stepper, self._masks, self.highest_value = self._stepper, masks, highest_value
+        stepper, self.highest_value = self._stepper, highest_value
         self.actions, self.num_actions = stepper.actions, len(stepper.actions)
         stepper.clock = trusted_clock(stepper) if action_repeat == 1 else None
         self._answers = Answers(stepper.at_count if stepper.clock else None)

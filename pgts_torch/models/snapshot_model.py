@@ -1,7 +1,7 @@
 """Models whose states are snapshots, numbered as they are met, equal ones with the same number."""
 
 import itertools
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -20,7 +20,7 @@ from pgts_torch.models.environments import Given
 from pgts_torch.models.exact_model import ExactModel
 from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.provenance import draws_its_own
-from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name, of_key
 from pgts_torch.models.stepper import Stepper
 from pgts_torch.seeding import SharedGenerators
 from pgts_torch.tabular.mdp import check_gamma
@@ -59,6 +59,7 @@ class SnapshotModel(ExactModel):
         self.gamma, self.action_repeat, self.dtype = gamma, action_repeat, dtype
         self.name, self.env, self.adapter, self._observe = stepper.name, stepper.env, stepper.adapter, observe
         self.device = torch.empty(0, device=device).device
+        self._masks = masks
         self._draws_its_own = draws_its_own(stepper.made)
         self.num_states = 0
         # By number: the state. By the name of a snapshot: the number.
@@ -185,6 +186,30 @@ class SnapshotModel(ExactModel):
         """The numbers of states that another model of the same environment has exported."""
         numbers = [self._enter(Seen(one[0], one[1], legal=one[2] if len(one) > 2 else None)) for one in exported]
         return torch.tensor(numbers, dtype=torch.int64, device=self.device)
+
+    def packed(self, exported: Sequence[tuple[Any, ...]]) -> dict[str, Tensor]:
+        """What `export` has returned as tensors, for files.
+
+        Raises:
+            PgtsError: the snapshots are objects.
+        """
+        if not self.adapter.is_plain or self._masks is not None:
+            raise PgtsError(f"snapshots of {self.name} are objects of its simulator, which cannot be saved")
+        size = len(self.adapter.get_state(self.env).data)
+        data = bytearray().join(snapshot.data for snapshot, _ in exported)
+        return {
+            "data": torch.from_numpy(np.frombuffer(data, np.uint8).reshape(-1, size)),
+            "cut": torch.tensor([snapshot.cut for snapshot, _ in exported], dtype=torch.bool),
+            "observation": torch.from_numpy(np.array([seen for _, seen in exported])),
+        }
+
+    def unpacked(self, packed: Mapping[str, Tensor]) -> list[tuple[Any, ...]]:
+        """What was `packed`; PgtsError unless these can be states of this simulator."""
+        data_NL, size = packed["data"].numpy(), len(self.adapter.get_state(self.env).data)
+        if data_NL.dtype != np.uint8 or data_NL.shape[1:] != (size,):
+            raise PgtsError(f"snapshots are {data_NL.dtype} of shape {data_NL.shape[1:]}; they must be {size} bytes")
+        rows = zip(data_NL, packed["cut"].tolist(), packed["observation"].numpy(), strict=True)
+        return [(of_key(data.tobytes())._replace(cut=cut), seen) for data, cut, seen in rows]
 
     def legal(self, state_N: Int[Tensor, "N"]) -> Bool[np.ndarray, "N A"]:
         """The legal actions in each state; all where they are not known, as after an end."""

@@ -94,10 +94,13 @@ class SnapshotAdapter(ABC):
         name: of the family of environments.
         restored: the attributes of an environment that change in steps and resets and are in a snapshot, or are for
             rendering only; None: whatever there is.
+        is_plain: whether all snapshots are made by `of_key`, of bytes of the same length that `set_state` copies and
+            does not decode: then they can be saved, and loaded from files of others.
     """
 
     name: str
     restored: frozenset[str] | None = None
+    is_plain = False
 
     @abstractmethod
     def get_state(self, env: Any) -> Snapshot:

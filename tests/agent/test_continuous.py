@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from benchmarks.linear import LinearQuadratic
 from pgts_torch import PGTS
+from pgts_torch.agent.draws import Draws
 from pgts_torch.agent.evaluate import evaluate
 from pgts_torch.agent.model_check import ModelCheck
 from pgts_torch.errors import ModelMismatch, PgtsError, RandomOutcomes
@@ -126,11 +127,14 @@ CASES = {
         | {"replay": {"type": "uniform", "starts": 4, "length": 5, "updates_per_step": 0.1}},
     ),
 }
+CASES["replayed simulator"] = ("InvertedPendulum-v5", CASES["replay"][1])
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_loaded_training_goes_on_bit_for_bit(case, tmp_path):
     env, arguments = CASES[case]
+    if env == "InvertedPendulum-v5":
+        pytest.importorskip("mujoco", exc_type=ImportError)
     model = PGTS(env, **arguments)
     model.iterate()
     if case == "own model":
@@ -143,6 +147,35 @@ def test_a_loaded_training_goes_on_bit_for_bit(case, tmp_path):
     assert torch.equal(first.experience.action_TB, second.experience.action_TB)
     assert first.losses == second.losses
     assert all(map(torch.equal, model.policy.network.weights, other.policy.network.weights))
+
+
+def test_saved_snapshots_of_another_length_are_refused():
+    pytest.importorskip("mujoco", exc_type=ImportError)
+    model = PGTS("InvertedPendulum-v5", **CASES["replay"][1])
+    model.iterate()
+    state = model.state_dict()
+    kept = state["dyna"]["replay"]["columns"]
+    kept["data"] = kept["data"][:, 8:]
+    with pytest.raises(PgtsError, match=r"snapshots are uint8 of shape \(\d+,\); they must be \d+ bytes"):
+        PGTS("InvertedPendulum-v5", **CASES["replay"][1]).load_state_dict(state)
+
+
+class Leaving(Cart):
+    """A cart whose episode ends far from the middle."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, bool(abs(observation[0]) > 1), truncated, info
+
+
+def test_an_imagined_episode_that_is_over_takes_no_step_of_the_simulator():
+    model = PGTS(Leaving, **CASES["replay"][1])
+    model.iterate()
+    simulator = model.world.model
+    before = simulator.simulator_steps
+    imagined, _ = next(model.dyna.rollouts(Draws.of(model.ranks, 0, 1, model.device)))
+    assert not imagined.alive_TB.all()
+    assert simulator.simulator_steps - before == imagined.num_steps
 
 
 def test_actions_are_in_bounds_and_deterministic_ones_the_squashed_mean():
