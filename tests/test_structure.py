@@ -1,4 +1,4 @@
-"""The plan of the house: imports point one way, and the paper's equations are where the documentation says."""
+"""The order of the rooms: imports point one way, and the paper's equations are where the documentation says."""
 
 import ast
 import functools

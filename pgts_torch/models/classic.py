@@ -182,12 +182,12 @@ class Pendulum(DynamicsModel):
         return 3.0 / (c.m * c.l**2) * torque, 0.001 * square
 
     def _reward_range(self) -> tuple[float, float]:
-        dearest = (
+        highest = (
             float(self._effect(np.array([self._c.max_torque], np.float32))[1])
             if self._squash
             else float(self._effect_AE[:, 1].max())
         )
-        return -(math.pi**2 + 0.1 * self._c.max_speed**2 + dearest), 0.0
+        return -(math.pi**2 + 0.1 * self._c.max_speed**2 + highest), 0.0
 
     def _move(self, xp: Any, state: Arrays, effect: Arrays) -> tuple[Any, Any, Arrays]:
         (angle, speed), (push, price), c = state, effect, self._c

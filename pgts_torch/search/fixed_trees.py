@@ -3,7 +3,7 @@
 They are those of `tree_kernels`, one simulation after another below each root, in operations on tensors that are the
 same whatever the numbers are: nothing is read back while they grow, so a CUDA graph can hold a whole search. All roots
 go down side by side; a "lane" is an action of a root with a simulation under way. A lane that has nothing to do, or
-less than others, works on one more node, which is nobody's.
+less than others, works on a spare node, which belongs to no tree.
 """
 
 import itertools
@@ -72,7 +72,7 @@ class FixedTrees:
         self.arm_NAC = self._begun_SAC.new_zeros(num_roots * num_nodes + 1, *self._begun_SAC.shape[1:])
         self.place_N2 = torch.zeros(len(self.arm_NAC), 2, dtype=torch.int64, device=device)
         self.root_B = torch.arange(num_roots, device=device) * num_nodes
-        self.nodes_B, self._nobody = torch.ones_like(self.root_B), num_roots * num_nodes
+        self.nodes_B, self._spare = torch.ones_like(self.root_B), num_roots * num_nodes
         # How many actions have a simulation in each wave: by how many are allowed at the root, and all that occur.
         widths_A = [self._widths(count) for count in range(1, self.A + 1)]
         self._width_TA = torch.tensor(widths_A, dtype=torch.int64, device=device).t()
@@ -131,12 +131,12 @@ class FixedTrees:
         starts_BW = torch.arange(W, device=count_B.device) < count_B.unsqueeze(1)
         new_BW = (self.root_B + self.nodes_B).unsqueeze(1) + torch.arange(W, device=count_B.device)
         self.nodes_B += count_B
-        new_L = torch.where(starts_BW, new_BW, self._nobody).view(-1)
+        new_L = torch.where(starts_BW, new_BW, self._spare).view(-1)
         on_L, action_L = starts_BW.view(-1), torch.where(starts_BW, action_BW, 0).view(-1)
-        node_L = torch.where(starts_BW, self.root_B.unsqueeze(1), self._nobody).view(-1)
+        node_L = torch.where(starts_BW, self.root_B.unsqueeze(1), self._spare).view(-1)
         level_L = torch.zeros_like(node_L)
         # end_L: the edge, arm * K + k, where a lane ends because its child is no node yet
-        path, end_L = list[tuple[Tensor, Tensor, Tensor, Tensor]](), torch.full_like(node_L, self._nobody * self.A)
+        path, end_L = list[tuple[Tensor, Tensor, Tensor, Tensor]](), torch.full_like(node_L, self._spare * self.A)
         end_L *= self.K
         for depth in range(levels):
             arm_L = torch.add(action_L, node_L, alpha=self.A)
@@ -146,7 +146,7 @@ class FixedTrees:
             if depth < levels - 1:
                 on_L = on_L & (below_L > 0)
                 level_L = level_L + on_L
-                node_L = torch.where(on_L, below_L, self._nobody)
+                node_L = torch.where(on_L, below_L, self._spare)
                 action_L = self._select(self.arm_NAC.index_select(0, node_L))
         edge_L = end_L % (self.A * self.K)
         state_L = self.place_N2[:, 0].index_select(0, torch.div(end_L, self.A * self.K, rounding_mode="floor"))
@@ -205,7 +205,7 @@ class FixedTrees:
         """q of arms whose children k have these values; the same of their nodes. Lanes that have ended above keep what
         they bring."""
         arm_MC, k_L1, K = self.arm_NAC.view(-1, self._columns), k_L.unsqueeze(1), self.K
-        arm_L = torch.where(passes_L, arm_L, self._nobody * self.A)
+        arm_L = torch.where(passes_L, arm_L, self._spare * self.A)
         arm_LC = arm_MC.index_select(0, arm_L)
         arm_LC.scatter_(1, k_L1 + _EDGES, value_L.unsqueeze(1))
         arm_LC[:, _VISITS] += 1

@@ -21,7 +21,7 @@ _EPS = torch.finfo(torch.float64).eps
 class Improved:
     """action_S: the best actions for values v.   v_S: between bounds of v* that are at most 2 `error` apart.
 
-    Whoever takes these actions has values between the same bounds.
+    The policy that takes these actions has values between the same bounds.
     """
 
     action_S: Int[Tensor, "S"]
