@@ -17,12 +17,11 @@ and draws from self.np_random only."""
 
 def check_model(arguments: Arguments) -> None:
     """Try out whether an environment can serve as a model of itself."""
-    parser = Parser(check_model)
+    parser = Parser(check_model, epilog=HELP)
     parser.add_argument("env_id", metavar="ENV_ID", help="as in gymnasium.make; MODULE:ID imports MODULE first")
     add_kwargs(parser)
     parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the walks (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
-    parser.epilog = HELP
     given = parser.parse_args(arguments)
     from pgts_torch.experiment import check_model as fidelity
 

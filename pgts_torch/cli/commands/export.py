@@ -12,14 +12,13 @@ not pgts_torch. ONNX needs pip install 'pgts_torch[onnx]'."""
 
 def export(arguments: Arguments) -> None:
     """Write the policy of a run as a program of torch or ONNX."""
-    parser = Parser(export)
+    parser = Parser(export, epilog=HELP)
     add_run(parser)
     parser.add_argument("--format", choices=["torch", "onnx"], help="default: by the end of FILE, or torch")
     parser.add_argument(
         "--out", metavar="FILE", type=file_path, help="where to write (default: RUN_DIR/policy.pt2, or policy.onnx)"
     )
     parser.add_argument("--json", action="store_true", help="print what the file says of itself as one JSON object")
-    parser.epilog = HELP
     given = parser.parse_args(arguments)
     from pgts_torch.experiment.export import export_run
 

@@ -18,7 +18,7 @@ out."""
 
 def init(arguments: Arguments) -> None:
     """Write a configuration to begin with, for an environment."""
-    parser = Parser(init)
+    parser = Parser(init, epilog=HELP)
     parser.add_argument(
         "env_id", metavar="ENV", help="as in gymnasium.make; MODULE:ID imports MODULE first; or MODULE:CLASS"
     )
@@ -27,7 +27,6 @@ def init(arguments: Arguments) -> None:
     add_kwargs(parser)
     parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the training (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
-    parser.epilog = HELP
     given = parser.parse_args(arguments)
     from pgts_torch.experiment import initial
 

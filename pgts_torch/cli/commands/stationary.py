@@ -27,7 +27,7 @@ A terminal state is one that leads to itself and earns 0."""
 
 def stationary(arguments: Arguments) -> None:
     """Count the policies that tree search cannot improve, depth by depth."""
-    parser = Parser(stationary, usage="%(prog)s WHAT [--OPTION VALUE ...]")
+    parser = Parser(stationary, usage="%(prog)s WHAT [--OPTION VALUE ...]", epilog=HELP)
     parser.add_argument("what", metavar="WHAT", type=_mdp_name, help=", ".join(MDPS))
     for name, kind, meaning in [
         ("n", whole(1), "size: ladder (default 5), grid (3), deep_sea (3)"),
@@ -41,7 +41,6 @@ def stationary(arguments: Arguments) -> None:
     ]:
         parser.add_argument(f"--{name}", metavar="N", type=kind, help=meaning)
     parser.add_argument("--json", action="store_true", help="print the answer as one JSON object")
-    parser.epilog = HELP
     given = vars(parser.parse_args(arguments))
     what, as_json = given.pop("what"), given.pop("json")
     options = {name: value for name, value in given.items() if value is not None}

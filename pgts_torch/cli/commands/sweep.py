@@ -18,7 +18,7 @@ code is 1. SIGTERM or Ctrl-C lets the runs finish their iterations and save."""
 
 def sweep(arguments: Arguments) -> None:
     """Train with several seeds at several depths, and compare."""
-    parser = Parser(sweep, usage="%(prog)s --out DIR [--config FILE] [--KEY VALUE ...]")
+    parser = Parser(sweep, usage="%(prog)s --out DIR [--config FILE] [--KEY VALUE ...]", epilog=HELP)
     parser.add_argument("--out", metavar="DIR", type=output_folder, help="for DIR/depth-D/seed-S, a table, a picture")
     parser.add_argument("--config", metavar="FILE", help="as for pgts train; none: the defaults")
     parser.add_argument("--seeds", metavar="N", type=whole(1), default=5, help="0 to N - 1 (default: %(default)s)")
@@ -27,7 +27,6 @@ def sweep(arguments: Arguments) -> None:
     )
     parser.add_argument("--jobs", metavar="N", type=whole(1), default=1, help="runs at once (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the table as one JSON object")
-    parser.epilog = HELP
     fixed, overrides = parser.parse_known_args(arguments)
     if fixed.out is None:
         parser.error("the following arguments are required: --out")

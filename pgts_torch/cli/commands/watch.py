@@ -13,7 +13,7 @@ text, else the observation. .mp4 needs pip install 'pgts_torch[video]'."""
 
 def watch(arguments: Arguments) -> None:
     """Show episodes of a run, with what the lookahead says."""
-    parser = Parser(watch)
+    parser = Parser(watch, epilog=HELP)
     add_run(parser)
     parser.add_argument(
         "--out", metavar="FILE", type=film_path, help="a .gif, .mp4 or .txt (default: text, in the terminal)"
@@ -30,7 +30,6 @@ def watch(arguments: Arguments) -> None:
         "--sampled", action="store_true", help="sample actions from the policy (default: the most probable ones)"
     )
     parser.add_argument("--json", action="store_true", help="print length and return of each episode as JSON, no text")
-    parser.epilog = HELP
     given = parser.parse_args(arguments)
     from pgts_torch.experiment import watch as watching
 
