@@ -16,16 +16,17 @@ from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from pgts_torch.agent.observations import Observations
 from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
-from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError, warn
+from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError, failure, warn
 from pgts_torch.models.actions import all_actions
 from pgts_torch.models.adapters import known_adapter, not_restored
 from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside
 from pgts_torch.models.attributes import attributes, own_to_each
 from pgts_torch.models.classic import CLASSIC
 from pgts_torch.models.environments import EnvSource
+from pgts_torch.models.ids import Maker
 from pgts_torch.models.masks import ActionMasks, has_method, masks_of
 from pgts_torch.models.published import publishes_table, table_of
-from pgts_torch.models.restoring import Setup, check_resets, check_snapshots
+from pgts_torch.models.restoring import Setup, check_alone, check_resets, check_snapshots
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import SnapshotAdapter, each_of, env_name
 from pgts_torch.models.squash import squash_of
@@ -41,9 +42,14 @@ _TRIED_VECTORS = 64
 
 @dataclass(frozen=True)
 class Request:
-    """The environments that a model is looked for, and its options."""
+    """The environments that a model is looked for, and its options.
+
+    fresh: makes a new environment like number k (0). Trials use these, so that the training environments are not
+        changed; they do not outlive the search for a model.
+    """
 
     source: EnvSource
+    fresh: Maker
     env: VectorEnv
     gamma: float
     observed: Observed
@@ -64,10 +70,6 @@ class Request:
         """The environments, as a vector of single ones."""
         assert isinstance(self.env, SyncVectorEnv)
         return self.env
-
-    def fresh(self, k: int = 0) -> gymnasium.Env:
-        """A new environment like number k. Trials use these, so that the training environments are not changed."""
-        return self.source.like(k)
 
     @cached_property
     def new(self) -> gymnasium.Env:
@@ -190,6 +192,8 @@ def simulator_world(request: Request, *, reasons: Sequence[str], layered: bool) 
             )
     except PgtsError as error:
         if known is None:
+            if not isinstance(error, MissingModel):
+                _check_alone(request.name, setup)
             raise MissingModel(f"{not_restored(env)}; its attributes, pickled, are not enough: {error}") from error
         if isinstance(error, MissingModel):
             raise MissingModel(f"{request.name} cannot serve as a model: {error}") from error
@@ -204,10 +208,18 @@ def simulator_world(request: Request, *, reasons: Sequence[str], layered: bool) 
     }
     model: SimulatorModel | VectorSimulator
     if squash is None:
-        model = SimulatorModel(request.fresh, masks=masks, **options)
+        model = SimulatorModel(request.source.like, masks=masks, **options)
     else:
-        model = VectorSimulator(request.fresh, size=squash.size, **options)
+        model = VectorSimulator(request.source.like, size=squash.size, **options)
     return SimulatedWorld(request.envs, model, observed=request.observed, masks=request.masks, device=request.device)
+
+
+def _check_alone(name: str, setup: Setup) -> None:
+    """Failed if it is not restored states that fail, but the environment."""
+    try:
+        check_alone(setup)
+    except PgtsError as error:
+        raise failure(f"{name} fails in random walks", error) from error
 
 
 def tried_actions(request: Request) -> Sequence[Any]:

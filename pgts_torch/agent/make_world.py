@@ -31,7 +31,7 @@ from pgts_torch.agent.worlds import TabularWorld
 from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import Failed, MissingModel, PgtsError
 from pgts_torch.models.attributes import unlike
-from pgts_torch.models.environments import SLOW, EnvSource, kinds_of
+from pgts_torch.models.environments import SLOW, EnvSource, close_environments, closing_made, kinds_of
 from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.snapshots import each_of
 from pgts_torch.models.squash import squash_of
@@ -80,22 +80,35 @@ def make_world(
     env = source.make(num_envs, one_by_one=one_by_one) if source.given is None else source.given
     discount = DEFAULT_GAMMA if gamma is None else gamma
     check_gamma(discount)
-    request = Request(source, env, discount, observed, action_repeat, torch.device(device))
-    if other is not None:
-        check_memories(env)
-        own = getattr(each_of(env)[0].unwrapped, "mdp", None)
-        return other(
-            env, float(own.outcomes.discount_NAK.max()) if isinstance(own, TabularMDP) else discount, request.masks
-        )
+    try:
+        with closing_made(source.like) as fresh:
+            request = Request(source, fresh, env, discount, observed, action_repeat, torch.device(device))
+            if other is None:
+                return _chosen(request, plain=plain)
+            check_memories(env)
+            own = getattr(each_of(env)[0].unwrapped, "mdp", None)
+            return other(
+                env, float(own.outcomes.discount_NAK.max()) if isinstance(own, TabularMDP) else discount, request.masks
+            )
+    except BaseException:
+        if source.given is None:
+            close_environments(env)
+        raise
+
+
+def _chosen(request: Request, *, plain: bool) -> World:
+    """The world with the first model that applies, or without one where none is needed."""
     with SharedGenerators(0, "models"):
         world, reasons = _first_model(request, plain=plain)
     if world is not None:
         return world
     if not plain:
         raise MissingModel("; ".join(reversed(reasons)) + _WAYS_OUT)
-    check_memories(env)
-    check_single(action_repeat, "without a model")
-    return World(env, gamma=discount, observed=observed, masks=request.masks, device=device)
+    check_memories(request.env)
+    check_single(request.action_repeat, "without a model")
+    return World(
+        request.env, gamma=request.gamma, observed=request.observed, masks=request.masks, device=request.device
+    )
 
 
 def _first_model(request: Request, *, plain: bool) -> tuple[ModelWorld | None, list[str]]:

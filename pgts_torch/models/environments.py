@@ -2,7 +2,8 @@
 
 import copy
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, final
@@ -214,9 +215,10 @@ class EnvSource:
         """The most steps of an episode, as registered or by a TimeLimit around the environment; None: no limit."""
         spec, limits = self.spec, list[int]()
         if spec is None and self.makers:
-            env = self.make_one() if self.given is None else each_of(self.given)[0]
-            spec = env.spec
-            limits = [each._max_episode_steps for each in wrappers_of(env) if isinstance(each, TimeLimit)]
+            with closing_made(self.make_one) as make:
+                env = make() if self.given is None else each_of(self.given)[0]
+                spec = env.spec
+                limits = [each._max_episode_steps for each in wrappers_of(env) if isinstance(each, TimeLimit)]
         limit = min(limits, default=None) if spec is None else spec.max_episode_steps
         return limit if limit is not None and limit > 0 else None
 
@@ -256,12 +258,31 @@ def check_vector_env(env: VectorEnv, *, vectors: bool = False) -> None:
 
 def close_environments(env: VectorEnv) -> None:
     """Close them all; what one of them raises is a warning, for all that was wanted of it is done."""
-    for one in each_of(env):
+    _close(each_of(env))
+    env.closed = True
+
+
+@contextmanager
+def closing_made(make: Maker) -> Iterator[Maker]:
+    """The same function; the environments that it has made in this context are closed at its end."""
+    made = list[gymnasium.Env]()
+
+    def kept(*args: Any, **options: Any) -> gymnasium.Env:
+        made.append(make(*args, **options))
+        return made[-1]
+
+    try:
+        yield kept
+    finally:
+        _close(made)
+
+
+def _close(envs: Sequence[Any]) -> None:
+    for env in envs:
         try:
-            one.close()
+            env.close()
         except BaseException as error:
             warn(str(failure(f"{env_name(env)} failed in close", error)))
-    env.closed = True
 
 
 def kinds_of(env: gymnasium.Env) -> list[type]:
@@ -290,11 +311,12 @@ def _spec_like(env: gymnasium.Env) -> EnvSpec:
             made = gymnasium.make(env.spec)
     except PgtsError as error:
         raise PgtsError(f"{given} that its spec cannot make again ({error}): {way_out}") from error
-    if kinds_of(env) != kinds_of(made):
-        own, other = (" in ".join(kind.__name__ for kind in reversed(kinds_of(each))) for each in (env, made))
-        raise PgtsError(f"{given}, {own}, of whose spec comes {other}: {way_out}")
-    if found := _unlike([env], [made], lambda: made, name):
-        raise PgtsError(f"{given} with {found.what} of its spec: {way_out}")
+    with closing(made):
+        if kinds_of(env) != kinds_of(made):
+            own, other = (" in ".join(kind.__name__ for kind in reversed(kinds_of(each))) for each in (env, made))
+            raise PgtsError(f"{given}, {own}, of whose spec comes {other}: {way_out}")
+        if found := _unlike([env], [made], lambda: made, name):
+            raise PgtsError(f"{given} with {found.what} of its spec: {way_out}")
     return env.spec
 
 

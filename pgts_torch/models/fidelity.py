@@ -19,7 +19,7 @@ from pgts_torch.models.adapters_generic import Layered, PickledAttributes, insid
 from pgts_torch.models.attributes import own_to_each
 from pgts_torch.models.classic import dynamics_of
 from pgts_torch.models.clocks import check_clock
-from pgts_torch.models.environments import EnvSource, Given
+from pgts_torch.models.environments import EnvSource, Given, closing_made
 from pgts_torch.models.masks import masks_in
 from pgts_torch.models.published import compare_table, published_table
 from pgts_torch.models.restoring import Setup, Walk
@@ -138,7 +138,11 @@ def check_model(env: Given, *, seed: int = 0, continuations: int = 20, length: i
     """
     if min(continuations, length) < 1:
         raise PgtsError(f"continuations is {continuations} and length is {length}; both must be at least 1")
-    make = EnvSource.of(env).make_one
+    with closing_made(EnvSource.of(env).make_one) as make:
+        return _report(make, seed=seed, continuations=continuations, length=length)
+
+
+def _report(make: Callable[[], gymnasium.Env], *, seed: int, continuations: int, length: int) -> Report:
     first, claims = make(), tuple(_claims(make(), seed=seed))
     name, known, mdp = env_name(first), None, published_table(first, gamma=_GAMMA)
     try:

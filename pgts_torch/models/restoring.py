@@ -18,8 +18,8 @@ from pgts_torch.models.attributes import changing, own_generator
 from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, generator_state
-from pgts_torch.models.steps import as_declared, bits, number_of
-from pgts_torch.models.trial import Taken, Trial, environment_code
+from pgts_torch.models.steps import as_declared, bits, check_observation, check_rewards, number_of
+from pgts_torch.models.trial import Taken, Trial, environment_code, random_walk
 from pgts_torch.seeding import SharedGenerators, sample_keys, stream
 
 ACTIONS_TRIED = 8
@@ -145,10 +145,11 @@ def _seconds_of_a_step(setup: Setup) -> float:
     env, times = setup.fresh(), []
     for _ in range(_TIMED_STEPS):
         begin = time.perf_counter()
-        state = setup.snapshot(env)
-        setup.step(env, setup.action())
+        setup.snapshot(env)
+        taken = setup.step(env, setup.action())
         times.append(time.perf_counter() - begin)
-        setup.restore(env, state)
+        if taken.ends:
+            setup.reset(env)
     return min(times)
 
 
@@ -208,6 +209,17 @@ def _bits_of(env: gymnasium.Env, taken: Taken) -> bytes:
     declared = as_declared(env.observation_space, taken.observation)
     reward = None if taken.action is None else number_of("reward", taken.reward)
     return bits((declared, reward, taken.terminated, taken.truncated))
+
+
+def check_alone(setup: Setup) -> None:
+    """PgtsError if the environment fails in random episodes without any snapshot."""
+    env = setup.make()
+    for taken in random_walk(env, setup.actions, setup.random, steps=_LONG_LENGTH, longest=_LONG_LENGTH):
+        check_observation(env.observation_space, taken.observation)
+        if taken.action is not None:
+            check_rewards(number_of("reward", taken.reward))
+        if setup.masks is not None and not taken.ends:
+            setup.masks.of(env, taken.info)
 
 
 def beside_snapshots(setup: Setup) -> None:

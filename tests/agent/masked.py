@@ -23,13 +23,16 @@ class Strict(gymnasium.Env):
 
     Args:
         says: how it says which actions are legal, "method", "info" or not at all.
+        bare: whether it is restored from its attributes, for it has no `get_state`.
     """
 
     action_space = spaces.Discrete(3)
     taken = 0
 
-    def __init__(self, says: str = "method", *, vector: bool = False) -> None:
+    def __init__(self, says: str = "method", *, vector: bool = False, bare: bool = False) -> None:
         self.says, self.vector = says, vector
+        if bare:
+            self.get_state = None
         self.observation_space = spaces.Box(0, 1, (6,), np.float32) if vector else spaces.Discrete(6)
 
     def _mask(self) -> np.ndarray:
@@ -105,6 +108,7 @@ ENVIRONMENTS: dict[str, Any] = {
     "action_masks(), observed as vectors": lambda: ByMethod(vector=True),
     "info": lambda: Strict("info"),
     "info, observed as vectors": lambda: Strict("info", vector=True),
+    "info, without get_state": lambda: Strict("info", bare=True),
     "action_masks(), of a wrapper": lambda: Masker(Strict("nothing")),
     "action_masks(), of a wrapper within an action wrapper": lambda: Turned(Masker(Strict("nothing"))),
     "info, within an action wrapper": lambda: Turned(Strict("info")),

@@ -62,6 +62,7 @@ def probs_by_state(model: PGTS) -> np.ndarray:
 # No illegal step
 
 
+@pytest.mark.filterwarnings("ignore:.*attributes are pickled")
 @pytest.mark.parametrize(
     ("env", "search"),
     [*itertools.product(ENVIRONMENTS, ["expectimax", "none"]), *[("info", search) for search in SEARCHES]],

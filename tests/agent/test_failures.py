@@ -127,6 +127,17 @@ def test_what_fails_in_a_rollout_is_named_with_its_step_and_seeds(env, options):
     assert make(Clock, **options).iterate().experience.num_steps == 12
 
 
+@pytest.mark.filterwarnings("ignore:.*attributes are pickled")
+@pytest.mark.parametrize("env", FAILURES)
+def test_what_fails_in_the_trial_of_a_simulator_is_no_missing_model(env):
+    bare = type(env.__name__, (env,), {"get_state": None})
+    message = FAILURES[env].partition(".* ")[2]
+    with pytest.raises(PgtsError, match=f"^{env.__name__} (fails in random walks|failed .*): .*{message}") as caught:
+        make(bare, depth=1, estimator="lookahead").iterate()
+    assert not isinstance(caught.value, MissingModel)
+    assert getattr(caught.value, "what", None) == NOT_FINITE.get(env)
+
+
 @pytest.mark.parametrize("env", [Raises, Unseen, Longer, Worthless])
 def test_of_many_copies_the_one_that_failed_is_named(env):
     class Sometimes(env):
