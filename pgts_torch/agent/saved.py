@@ -93,11 +93,15 @@ def _learned(parts: Parts) -> dict[str, Policy | Critic | Update | Dyna | Poster
 def _kept(ranks: Ranks, state: Any) -> tuple[Any, str | None]:
     """The replay of this rank, with the learned model, which is that of all; and what is missing."""
     saved = state.get("ranks", {0: state}) if isinstance(state, Mapping) else {0: state}
+    _check_ranks(saved, "the saved replay is not one of each rank")
+    missing = _missing(ranks, len(saved), "the replay", "each of which has kept its own steps")
+    return saved[ranks.rank % len(saved)], missing
+
+
+def _check_ranks(saved: Any, message: str) -> None:
+    """PgtsError unless something is saved for each of the ranks 0, 1, ..."""
     if not isinstance(saved, Mapping) or set(saved) != set(range(len(saved))) or not saved:
-        raise PgtsError("the saved replay is not one of each rank")
-    return saved[ranks.rank % len(saved)], _missing(
-        ranks, len(saved), "the replay", "each of which has kept its own steps"
-    )
+        raise PgtsError(message)
 
 
 def _missing(ranks: Ranks, count: int, what: str, why: str) -> str | None:
@@ -118,8 +122,7 @@ def _search_state(parts: Parts) -> dict[str, Any]:
 
 def _restore_search(parts: Parts, ranks: Ranks, searches: Any) -> None:
     """Load the state of this rank's search."""
-    if not isinstance(searches, Mapping) or set(searches) != set(range(len(searches))) or not searches:
-        raise PgtsError("the saved state of searches is not one of each rank")
+    _check_ranks(searches, "the saved state of searches is not one of each rank")
     rank, search, certificates = ranks.rank % len(searches), parts.search, parts.certificates
     if search is None or certificates is None:
         return
@@ -135,8 +138,7 @@ def _restore_episodes(parts: Parts, ranks: Ranks, states: Any) -> str | None:
     """Restore the episodes of this rank that go on. Return what is missing."""
     if parts.episodes is None:
         return None
-    if not isinstance(states, Mapping) or set(states) != set(range(len(states))) or not states:
-        raise PgtsError("the saved episodes are not those of each rank")
+    _check_ranks(states, "the saved episodes are not those of each rank")
     missing = _missing(ranks, len(states), "the episodes", "which go on in the environments of each")
     if missing is None:
         load_checked(
