@@ -23,6 +23,7 @@ from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.stepped import SteppedUpdate
 from pgts_torch.agent.target_updates import advantage_scale
 from pgts_torch.options.updates import MPO, PPO, Gradient
+from pgts_torch.readings import Readings
 from pgts_torch.search.lookahead import check_finite
 
 _LEAST = 1e-6
@@ -63,29 +64,11 @@ class GaussianUpdate(SteppedUpdate):
             before = batch.policy if isinstance(batch.policy, GaussianPolicy) else policy
             with torch.no_grad():
                 old = before.read(before.network(input_N))
-            share = ranks.share("rows", len(input_N))
-            weight_N = batch.weight_N.float()
-            scaled_N = weight_N / share.mean("weights", weight_N)
-            columns = input_N, *old, scaled_N, *self.aims(old, batch, scaled_N)
-            most = getattr(self.options, "target_kl", None)
-            num_epochs, size = self._passes(share.total)
-            passes = (minibatches(columns, size, share, generator=generator) for _ in range(num_epochs))
-            for count, part in itertools.chain.from_iterable(passes):
-                made = Forward(network, part[0])
-                now, was = policy.read(made.output_ND), Normals(*part[1:3])
-                if most is not None:
-                    own = mean(part[3], was.divergence(now), count)
-                    if float(ranks.sum("the divergence", own)) > most:
-                        break
-                loss_N, mean_NX, log_std_NX = self.loss(now, was, *part[4:])
-                down_N1 = (part[3] * (1 / count))[:, None]
-                down_ND = policy.through(made.output_ND, down_N1 * mean_NX, down_N1 * log_std_NX)
-                found = made.gradients(down_ND), mean(part[3], loss_N, count)
-                gradients, (loss,) = ranks.summed("the gradient of the policy", *found)
-                readings.add(policy=loss, grad_norm=self._optimiser.step(network.weights, gradients, loss, "policy"))
+            self._descend(policy, input_N, old, batch, generator, readings)
             with torch.no_grad():
                 new = policy.read(network(input_N))
             readings.check(new.entropy().sum(), lambda _: check_finite("probability", "the next policy", new[1], None))
+            weight_N = batch.weight_N.float()
             share_N = weight_N / ranks.sum("weights", weight_N.sum())
             numbers = [new.entropy(), old.divergence(new), new.std_NX.mean(-1)]
             found_3 = ranks.sum("the next policy", torch.stack([share_N @ number_N for number_N in numbers]))
@@ -93,6 +76,38 @@ class GaussianUpdate(SteppedUpdate):
             if not fresh:
                 encoder.absorb(batch.observation_N, ranks)
         return readings.means
+
+    def _descend(
+        self,
+        policy: GaussianPolicy,
+        input_N: Tensor,
+        old: Normals,
+        batch: Batch,
+        generator: torch.Generator,
+        readings: Readings,
+    ) -> None:
+        """Take a step for each minibatch, until the policy has moved as far from the old one as the options allow."""
+        network, ranks = policy.network, batch.ranks
+        share = ranks.share("rows", len(input_N))
+        weight_N = batch.weight_N.float()
+        weight_N = weight_N / share.mean("weights", weight_N)
+        columns = input_N, *old, weight_N, *self.aims(old, batch, weight_N)
+        most = getattr(self.options, "target_kl", None)
+        num_epochs, size = self._passes(share.total)
+        passes = (minibatches(columns, size, share, generator=generator) for _ in range(num_epochs))
+        for count, (rows_N, mean_NX, std_NX, scaled_N, *aims) in itertools.chain.from_iterable(passes):
+            made = Forward(network, rows_N)
+            now, was = policy.read(made.output_ND), Normals(mean_NX, std_NX)
+            if most is not None:
+                own = mean(scaled_N, was.divergence(now), count)
+                if float(ranks.sum("the divergence", own)) > most:
+                    return
+            loss_N, down_mean_NX, down_log_std_NX = self.loss(now, was, *aims)
+            down_N1 = (scaled_N * (1 / count))[:, None]
+            down_ND = policy.through(made.output_ND, down_N1 * down_mean_NX, down_N1 * down_log_std_NX)
+            found = made.gradients(down_ND), mean(scaled_N, loss_N, count)
+            gradients, (loss,) = ranks.summed("the gradient of the policy", *found)
+            readings.add(policy=loss, grad_norm=self._optimiser.step(network.weights, gradients, loss, "policy"))
 
     def _passes(self, rows: int) -> tuple[int, int]:
         """How many passes over how large minibatches."""
