@@ -152,6 +152,33 @@ def check_many(out: Path, own: str, what: str) -> None:
     print(f"note: --out {out} also holds {files.listing(foreign)}, which no {what} has left; it stays", file=sys.stderr)
 
 
+def table_targets(out: Path, table: str, content: type, what: str, others: Mapping[str, str]) -> list[Path]:
+    """Where the table of many runs may be written, and the files that belong to it if it is beside them.
+
+    Args:
+        content: what the table holds.
+        what, others: what the files must be, to be replaced; of the others by name.
+
+    Raises:
+        PgtsError: something else has one of these names.
+    """
+
+    def is_table(raw: bytes) -> bool:
+        try:
+            TypeAdapter(content).validate_json(raw)
+        except ValidationError:
+            return False
+        return True
+
+    has_table = files.kind(out / table) is not None
+    place = files.target(out / table, is_table, what)
+    beside = [
+        files.target(out / name, lambda raw: has_table, f"{other}: no table is beside it")
+        for name, other in others.items()
+    ]
+    return [place, *beside]
+
+
 def _is_left_over(path: Path) -> bool:
     """Whether a file is left from a run that was killed before it wrote its mark."""
     if files.kind(path) != "file":

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from pgts_torch import files
 from pgts_torch.config import Config, load
 from pgts_torch.errors import PgtsError
 from pgts_torch.experiment.locking import wait_for
-from pgts_torch.experiment.ownership import CONFIG_FILE, check_many
+from pgts_torch.experiment.ownership import CONFIG_FILE, check_many, table_targets
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.statistics import Mean, estimate, interquartile_mean
 
@@ -174,19 +173,9 @@ def describe(answer: Sweep) -> str:
     return "\n".join([*lines, "", f"Interquartile means over seeds; {answer.score_is}: {what}.", f"in {answer.out}"])
 
 
-def _targets(out: Path) -> tuple[Path, Path]:
-    """Where the table and the picture of the curves may be written; a picture belongs to the table beside it."""
-    has_table = files.kind(out / TABLE_FILE) is not None
-    table = files.target(out / TABLE_FILE, _is_table, "the table of a sweep")
-    curves = files.target(out / CURVES_FILE, lambda raw: has_table, "the curves of a sweep: no table is beside it")
-    return table, curves
-
-
-def _is_table(raw: bytes) -> bool:
-    try:
-        return bool(TypeAdapter(Sweep).validate_json(raw))
-    except ValidationError:
-        return False
+def _targets(out: Path) -> list[Path]:
+    """Where the table and the picture of the curves may be written."""
+    return table_targets(out, TABLE_FILE, Sweep, "the table of a sweep", {CURVES_FILE: "the curves of a sweep"})
 
 
 def _rows(finished: "Sequence[tuple[Run, Summary]]", score_is: str) -> Iterator[Row]:

@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from pydantic import TypeAdapter, ValidationError
 
 from pgts_torch import files
 from pgts_torch.config import dump, load
@@ -21,7 +20,7 @@ from pgts_torch.experiment.compare.comparison import WORDS
 from pgts_torch.experiment.compare.drawing import png, shortened
 from pgts_torch.experiment.compare.text import WIDTH, interval
 from pgts_torch.experiment.locking import RunLock
-from pgts_torch.experiment.ownership import check_many
+from pgts_torch.experiment.ownership import check_many, table_targets
 from pgts_torch.experiment.processes import train_all
 from pgts_torch.experiment.report.curves import COLOURS, GREY
 from pgts_torch.experiment.statistics import Mean, estimate
@@ -95,7 +94,8 @@ def tune(
         Stopped: a signal came; the same command goes on.
     """
     check_many(plan.out, OWN, "tuning")
-    targets = _targets(plan.out)
+    others = {PICTURE_FILE: "of a tuning", BEST_FILE: "of a tuning"}
+    table, shown, chosen = table_targets(plan.out, TABLE_FILE, Tuned, "the table of a tuning", others)
     storage = storage or plan.out / STORAGE_FILE
     check(plan, storage)
     with RunLock(plan.out, name="--out"):
@@ -113,30 +113,12 @@ def tune(
         confirmed = None if best is None or not confirm else _confirmed(plan, best, confirm, jobs)
         number = None if best is None else best.number
         answer = Tuned(str(plan.out), plan.metric, plan.seeds, found, number, confirmed, _importance(study, complete))
-        files.replace(targets[TABLE_FILE], (json.dumps(asdict(answer), indent=2) + "\n").encode())
-        files.replace(targets[PICTURE_FILE], png(picture(answer, plan.options)))
+        files.replace(table, (json.dumps(asdict(answer), indent=2) + "\n").encode())
+        files.replace(shown, png(picture(answer, plan.options)))
         if best is not None:
             config = load(plan.path, [*plan.arguments(best.values, {}), "--run.dir=null"])
-            files.replace(targets[BEST_FILE], dump(config).encode())
+            files.replace(chosen, dump(config).encode())
     return answer
-
-
-def _targets(out: Path) -> dict[str, Path]:
-    """Where results may be written; picture and configuration belong to the table beside them."""
-    has_table = files.kind(out / TABLE_FILE) is not None
-    table = files.target(out / TABLE_FILE, _is_table, "the table of a tuning")
-    others = {
-        name: files.target(out / name, lambda raw: has_table, "of a tuning: no table is beside it")
-        for name in (PICTURE_FILE, BEST_FILE)
-    }
-    return {TABLE_FILE: table, **others}
-
-
-def _is_table(raw: bytes) -> bool:
-    try:
-        return bool(TypeAdapter(Tuned).validate_json(raw))
-    except ValidationError:
-        return False
 
 
 def _trial(trial: "optuna.trial.FrozenTrial") -> Trial:
