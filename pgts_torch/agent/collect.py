@@ -1,6 +1,6 @@
 """Episodes of a policy in the environments of a world, each from a reset."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -47,6 +47,7 @@ def rollout(
     seed: int,
     names: tuple[str | int, ...],
     generator: torch.Generator,
+    stepped: Callable[[int], None] = lambda steps: None,
 ) -> Rollout:
     """Run one episode in each environment of a world, from a reset.
 
@@ -57,6 +58,7 @@ def rollout(
         world: the environments; where it has a model the rollout has states, which a lookahead may start from.
         seed, names: the stream that the environments are seeded from.
         generator: for actions and the geometric horizon.
+        stepped: called with the number of steps made in each environment.
 
     Raises:
         PgtsError: an episode is longer than `max_length` of the geometric horizon; or the environment raised an error
@@ -67,7 +69,7 @@ def rollout(
     """
     seeds = seed_sequence(seed, *names, "env").generate_state(world.env.num_envs).tolist()
     with shared_generators(world, seed, names):
-        return _episodes(world, policy, horizon, seeds, generator)
+        return _episodes(world, policy, horizon, seeds, generator, stepped)
 
 
 @contextmanager
@@ -86,7 +88,14 @@ def shared_generators(world: World, seed: int, names: tuple[str | int, ...]) -> 
         )
 
 
-def _episodes(world: World, policy: Policy, horizon: Horizon, seeds: list[int], generator: torch.Generator) -> Rollout:
+def _episodes(
+    world: World,
+    policy: Policy,
+    horizon: Horizon,
+    seeds: list[int],
+    generator: torch.Generator,
+    stepped: Callable[[int], None],
+) -> Rollout:
     num_envs, model_world = world.env.num_envs, world if isinstance(world, ModelWorld) else None
     episodes = Episodes(world.env, gamma=world.gamma, seeds=seeds, masks=world.masks)
     observations: list[Tensor] = []
@@ -104,6 +113,7 @@ def _episodes(world: World, policy: Policy, horizon: Horizon, seeds: list[int], 
     alive_B, weight_B = np.ones(num_envs, dtype=bool), np.ones(num_envs)
     rows: list[tuple[np.ndarray, ...]] = []
     while len(rows) < horizon.limit and alive_B.any():
+        stepped(len(rows))
         action_B = policy.sample(world.perceive(observations[-1]), generator=generator).cpu().numpy()
         with episodes.named(f"in step {len(rows)}"):
             reward_B, discount_B, truncated_B = episodes.step(action_B, alive_B)

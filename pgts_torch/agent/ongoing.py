@@ -1,5 +1,6 @@
 """Episodes that go on from one iteration to the next."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -82,13 +83,20 @@ class OngoingEpisodes:
         return int(seed_sequence(self._seed, "episode", *self._names, b, self._number_B[b]).generate_state(1)[0])
 
     def collect(
-        self, policy: Policy, length: int, *, names: tuple[str | int, ...], generator: torch.Generator
+        self,
+        policy: Policy,
+        length: int,
+        *,
+        names: tuple[str | int, ...],
+        generator: torch.Generator,
+        stepped: Callable[[int], None] = lambda steps: None,
     ) -> Rollout:
         """Take `length` steps in each environment, or fewer where a model that learns is to learn from them at once.
 
         Args:
             names: the stream that the generators of the whole process are seeded from, for environments that use them.
             generator: for actions.
+            stepped: called with the number of steps made in each environment.
 
         Returns:
             A rollout with a column for each episode, or part of one, that lies in these steps; those of the first
@@ -98,13 +106,18 @@ class OngoingEpisodes:
             PgtsError: as `rollout`. After it the present episodes begin again in the next call.
         """
         try:
-            return self._collected(policy, length, names, generator)
+            return self._collected(policy, length, names, generator, stepped)
         except BaseException:
             self._begin_all()
             raise
 
     def _collected(
-        self, policy: Policy, length: int, names: tuple[str | int, ...], generator: torch.Generator
+        self,
+        policy: Policy,
+        length: int,
+        names: tuple[str | int, ...],
+        generator: torch.Generator,
+        stepped: Callable[[int], None],
     ) -> Rollout:
         world, episodes = self._world, self._episodes
         model = world.model if isinstance(world.model, LearningModel) else None
@@ -118,6 +131,7 @@ class OngoingEpisodes:
             begins_B = [not actions for actions in self._actions_B]
             observation_B, read_B = self._observe()
             for t in range(length):
+                stepped(t)
                 action_B = policy.sample(world.perceive(observation_B), generator=generator).cpu().numpy()
                 with episodes.named(f"in step {t}"):
                     reward_B, discount_B, truncated_B = self._step(action_B)

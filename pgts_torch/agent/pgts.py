@@ -169,7 +169,15 @@ class PGTS(Trained):
 
         # Visit states by episodes of pi_k, or of an `Explorer` where the model has optimism: the states where d(s), an
         # estimate of the occupancy d^{pi_k}(s), is positive.
-        experience = visit(self.world, self.parts.visiting, self.episodes, self.horizon, draws, self.ranks)
+        experience = visit(
+            self.world,
+            self.parts.visiting,
+            self.episodes,
+            self.horizon,
+            draws,
+            self.ranks,
+            stepped=self.pricing.stepped,
+        )
         if self.dyna is None:
             batch, losses = self._improve(experience, draws)
         else:
@@ -205,7 +213,8 @@ class PGTS(Trained):
         losses = self.estimator.evaluate(rollout, draws)
 
         # Look m steps ahead from the visited states: (T^m Q^{pi_k})(s, .).
-        batch = self.estimator(rollout, draws)
+        with self.pricing.lookahead():
+            batch = self.estimator(rollout, draws)
 
         # Compare the steps of the environment with the model, before pi is updated (with replay `Dyna.learn` has).
         if self.dyna is None:

@@ -1,12 +1,14 @@
 """What an iteration costs, said before it is paid; and what makes it cheaper."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import final
 
 from tqdm import tqdm
 
+from pgts_torch import compiled
 from pgts_torch.agent.dyna import Dyna
 from pgts_torch.options.replay import UniformReplay
 from pgts_torch.options.rollouts import GeometricHorizon
@@ -18,6 +20,9 @@ from pgts_torch.search.price import Meter
 
 LONG = 30.0
 """An iteration that takes more seconds is said to take long, with what makes it shorter."""
+
+PATIENCE = 3.0
+"""What the episodes of an iteration will take is foreseen after so many seconds."""
 
 SHORT = 1.0
 """What an iteration costs that takes fewer seconds is not said."""
@@ -56,6 +61,7 @@ class Pricing:
     iteration, in which nothing is done for the first time.
 
     price: None as long as it is not known.
+    looking: the seconds of the lookaheads of the latest iteration.
     meter: what the search is measured by; None where nothing is measured.
 
     Args:
@@ -79,14 +85,28 @@ class Pricing:
         self._options, self._search, self._dyna, self._calls, self._ranks = options, search, dyna, calls, ranks
         self._levels, self._iterations, self._updates = levels, 0, 0
         self._calls_before, self._seconds_before = 0, 0.0
+        self.looking, self._begun, self._has_told = 0.0, 0.0, False
         self.price: Price | None = None
         self.meter: Meter | None = None
 
     def begin(self) -> None:
         """An iteration begins."""
+        self.looking, self._begun = 0.0, compiled.clock()
         self._calls_before, self._iterations, self._updates = self._calls(), self._iterations + 1, 0
         if self._search is not None and self.price is None:
             self.meter = self._search.meter = Meter(self._foresee, self._levels)
+
+    def stepped(self, steps: int, most: int | None) -> None:
+        """The episodes of an iteration have made so many steps, of `most`. Once it is said if they take long."""
+        if self._has_told or not steps or most is None or (seconds := compiled.clock() - self._begun) < PATIENCE:
+            return
+        self._has_told = True
+        if (total := seconds * most / steps) > LONG and self._ranks.leads:
+            tqdm.write(
+                f"note: the episodes of an iteration take up to {_seconds(total)}; cheaper: fewer rollout.num_envs, a "
+                "shorter rollout.horizon.length, pgts train --processes N",
+                file=sys.stderr,
+            )
 
     def update(self) -> None:
         """An update begins."""
@@ -95,6 +115,13 @@ class Pricing:
             self._updates += 1
             if self._updates == 1:
                 self._seconds_before = self.meter.seconds
+
+    @contextmanager
+    def lookahead(self) -> Iterator[None]:
+        """The lookahead of an update."""
+        begun = compiled.clock()
+        yield
+        self.looking += compiled.clock() - begun
 
     def end(self, model_calls: int) -> None:
         """An iteration is over, with so many model calls of all processes."""

@@ -1,5 +1,6 @@
 """The configuration to begin with in an environment, with the model that was found and the price that was measured."""
 
+import math
 import re
 import time
 import warnings
@@ -15,6 +16,7 @@ from gymnasium import spaces
 from pgts_torch import files
 from pgts_torch.agent.observations import fit_keys
 from pgts_torch.agent.pgts import PGTS
+from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.config import Config
 from pgts_torch.errors import MissingModel, PgtsError
@@ -23,7 +25,7 @@ from pgts_torch.experiment.resume import plain
 from pgts_torch.experiment.run import build
 from pgts_torch.models.base import LearningModel
 from pgts_torch.models.environments import EnvSource
-from pgts_torch.options.rollouts import Rollouts
+from pgts_torch.options.rollouts import FixedHorizon, Rollouts
 
 PATIENCE = 600.0
 """The seconds that the whole training is to take, as far as its second iteration tells; or twice as long as with the
@@ -36,10 +38,11 @@ LONGEST_EPISODE = 500
 """The most steps of a rollout, where the environment's own time limit is longer; `FixedHorizon` where it has none."""
 
 SLOW = 120.0
-"""Where an iteration of the usual size would take more seconds, a smaller one is proposed, as it was tried first."""
+"""Where an iteration of the usual size would take more seconds, even with few states to look ahead from, a smaller one
+is proposed, as it was tried."""
 
 FIRST = {"num_envs": 4, "length": 100, "max_roots": 50}
-"""The smaller iteration that is tried first, so that a slow simulator is not waited for."""
+"""The smaller iteration in which depths are tried, so that nothing is waited for that is not proposed."""
 
 FEWEST_ROOTS = 16
 """It starts from so many at least."""
@@ -117,17 +120,12 @@ def propose(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Proposal:
     why = ""
     for way in ways:
         try:
-            if way is fixed and (small := _too_slow(general, limit)) is not None:
-                return small
+            if way is fixed:
+                return _known_model(general, way, source.time_limit, limit)
             tried = _Tried.of(general | way, 0 if is_continuous or way is ways[-1] else LEARNED_DEPTH)
         except MissingModel as error:
             why = why or str(error)
             continue
-        if way is fixed:
-            tried = _deepest(tried)
-        if tried.iteration > LONG and tried.roots > FEWEST_ROOTS and way is fixed:
-            fewer = max(FEWEST_ROOTS, int(tried.roots * LONG / tried.iteration))
-            tried = tried.again(max_roots=int(float(f"{fewer:.1g}")))
         return replace(tried.proposal, why=why)
     raise AssertionError("sampled advantages need no model")
 
@@ -136,16 +134,20 @@ def propose(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Proposal:
 class _Tried:
     """A training of two iterations: what it was made from and what it came to.
 
+    steps: if not None, the numbers below are foreseen, for an iteration of so many steps that looks ahead from all
+        states that it visits.
     tables: whether the lookahead reads a table.   branching: actions.   roots: states that the lookahead starts from.
-    iteration: the seconds of the second one.
+    iteration: the seconds of the second one.   looking: those of its lookahead.
     """
 
     data: dict[str, Any]
     proposal: Proposal
+    steps: int | None
     tables: bool
     branching: int
     roots: int
     iteration: float
+    looking: float
 
     @property
     def seconds(self) -> float:
@@ -161,10 +163,10 @@ class _Tried:
         """Try it with other options of the lookahead."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they were shown the first time
-            return _Tried.of(self.data | {"search": self.data.get("search", {}) | search}, self.depth)
+            return _Tried.of(self.data | {"search": self.data.get("search", {}) | search}, self.depth, self.steps)
 
     @classmethod
-    def of(cls, data: dict[str, Any], depth: int) -> "_Tried":
+    def of(cls, data: dict[str, Any], depth: int, steps: int | None = None) -> "_Tried":
         """Try a training; `depth` where `data` names none."""
         data = data | {"search": {"depth": depth} | data.get("search", {})}
         with closing(build(Config.model_validate(data))) as algorithm:
@@ -177,26 +179,55 @@ class _Tried:
             said = f"an iteration takes about {seconds:.2g} s" if not price else str(replace(price, advice=()))
             if price is not None and not price.calls:
                 said = f"an iteration takes about {seconds:.2g} s and no model calls, because the table is known"
+            roots = 0 if iteration.state_N is None else len(iteration.state_N)
+            looking, made = algorithm.pricing.looking, max(iteration.num_steps, 1)
+            if steps is not None:
+                rest = (seconds - looking) * steps / made
+                all_roots = max(roots, _grown(iteration.experience, made, steps))
+                looking, roots, made = looking * all_roots / max(roots, 1), all_roots, steps
+                seconds = rest + looking
             proposal = Proposal(
                 config=config,
                 model=_model(algorithm),
                 why="",
                 shows=f"observations are {_shown(algorithm)}, {_actions(algorithm)}",
                 price=said,
-                seconds=seconds * config.total_steps / max(iteration.num_steps, 1),
+                seconds=seconds * config.total_steps / made,
             )
-            roots = 0 if iteration.state_N is None else len(iteration.state_N)
             tables = isinstance(algorithm.world, TabularWorld) and algorithm.world.mdp is not None
-            return cls(data, proposal, tables, max(algorithm.world.num_actions, 2), roots, seconds)
+            branching = max(algorithm.world.num_actions, 2)
+            return cls(data, proposal, steps, tables, branching, roots, seconds, looking)
 
 
-def _too_slow(general: dict[str, Any], limit: int) -> Proposal | None:
-    """Try a small training, and propose it where one of the usual size would be too slow; None where it would not."""
+def _known_model(general: dict[str, Any], fixed: dict[str, Any], time_limit: int | None, limit: int) -> Proposal:
+    """The proposal with a model that need not be learned. Depths are tried in small iterations; what is proposed is
+    tried at last, with as many states to look ahead from as take a few seconds.
+
+    Raises:
+        MissingModel: there is no such model.
+    """
     length, num_envs = min(FIRST["length"], limit), FIRST["num_envs"]
-    rollout = {"num_envs": num_envs, "horizon": {"type": "fixed", "length": length}}
-    tried = _Tried.of(general | {"rollout": rollout, "search": {"max_roots": FIRST["max_roots"]}}, 0)
-    usual = Rollouts.standing("fixed")["num_envs"] * limit
-    return tried.proposal if tried.iteration * usual / (num_envs * length) > SLOW else None
+    small = {"rollout": {"num_envs": num_envs, "horizon": {"type": "fixed", "length": length}}}
+    search = {"search": {"max_roots": FIRST["max_roots"]}}
+    steps = Rollouts.standing("fixed")["num_envs"] * (limit if time_limit else FixedHorizon().length)
+    first = _Tried.of(general | small | search, 0, steps)
+    if first.iteration - first.looking + first.looking * FEWEST_ROOTS / max(first.roots, FEWEST_ROOTS) > SLOW:
+        return _Tried.of(general | small | search, 0).proposal
+    if first.tables:
+        return _deepest(_Tried.of(general | fixed, LEARNED_DEPTH)).proposal
+    best = _deepest(first)
+    options: dict[str, Any] = {"depth": best.depth}
+    if best.iteration > LONG and best.roots > FEWEST_ROOTS:
+        fewer = max(FEWEST_ROOTS, int(best.roots * LONG / best.looking))
+        if fewer < best.roots:
+            options["max_roots"] = int(float(f"{fewer:.1g}"))
+    return _Tried.of(general | fixed | {"search": options}, best.depth).proposal
+
+
+def _grown(experience: Rollout, made: int, steps: int) -> int:
+    """How many distinct states `steps` steps visit, if their number is a power of that of the steps."""
+    distinct = len(experience.state_UB[:-1].unique()) if experience.state_UB is not None else made
+    return round(steps ** (math.log(max(distinct, 2)) / math.log(max(made, 2)))) if distinct < made else steps
 
 
 def _deepest(first: _Tried) -> _Tried:

@@ -253,3 +253,39 @@ def test_the_seconds_in_which_loops_are_compiled_are_no_part_of_the_price():
     assert counted < passed / 2
     time.sleep(0.05)
     assert meter.seconds - counted >= 0.05
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (FEW | {"depth": 0, "estimator": "sampled"}, "up to 120 s"),
+        (FEW | {"depth": 1}, "up to 120 s"),
+        (
+            {"num_envs": 3, "horizon": {"type": "steps", "length": 40}, "depth": 0, "estimator": "sampled"},
+            "up to 120 s",
+        ),
+        (FEW | {"depth": 0, "estimator": "sampled", "horizon": {"type": "fixed", "length": 9}}, None),
+    ],
+    ids=["without a lookahead", "with one", "episodes that go on", "short"],
+)
+def test_that_episodes_take_long_is_said_after_their_first_steps(monkeypatch, options, said):
+    seconds, notes = [0.0], list[tuple[float, str]]()
+
+    class Slow(Counted):
+        def step(self, action: int):
+            seconds[0] += 1.0
+            return super().step(action)
+
+    training = PGTS(Slow, **options)  # below only the steps of an environment take time
+    monkeypatch.setattr(compiled, "clock", lambda: seconds[0])
+    monkeypatch.setattr(price.tqdm, "write", lambda text, **_: notes.append((seconds[0], text)))
+    before = seconds[0]
+    training.iterate()
+    found = [(at - before, text) for at, text in notes if "episodes" in text]
+    if said is None:
+        assert not found
+    else:
+        ((at, text),) = found
+        assert said in text
+        assert "fewer rollout.num_envs, a shorter rollout.horizon.length" in text
+        assert at == 3.0  # one step in each of three environments

@@ -258,3 +258,27 @@ def test_a_class_is_named_by_its_module_wherever_an_id_is(here):
     assert again.num_env_steps == model.num_env_steps
     observation = np.zeros(1, dtype=np.float32)
     assert again.predict(observation) == model.predict(observation)
+
+
+def test_an_iteration_of_the_usual_size_is_foreseen_from_a_small_one(here):
+    general = {"name": "it", "seed": 0, "env": {"id": "walks:Restored"}}
+    small = general | {"rollout": {"num_envs": 2, "horizon": {"type": "fixed", "length": 20}}}
+    few = initial._Tried.of(small | {"search": {"max_roots": 4}}, 0)
+    foreseen = initial._Tried.of(small | {"search": {"max_roots": 4}}, 0, 4000)
+    assert few.roots <= 4 < foreseen.roots < 400  # the walk has nine states, in which its steps meet again
+    assert foreseen.iteration > foreseen.looking > 0
+    assert foreseen.seconds == pytest.approx(foreseen.iteration * Config().total_steps / 4000)
+
+
+def test_a_long_lookahead_starts_from_few_states_in_what_is_tried_at_the_usual_size_too(here, monkeypatch):
+    tried, of = [], initial._Tried.of
+
+    def noted(data: dict[str, Any], depth: int, steps: int | None = None) -> Any:
+        tried.append((data["rollout"].get("num_envs", 16), data["search"]["max_roots"], steps))
+        return of(data, depth, steps)
+
+    monkeypatch.setattr(initial, "LONG", 1e-9)
+    monkeypatch.setattr(initial._Tried, "of", noted)
+    config, _ = made("walks:Walk-v0")
+    assert config.search.max_roots == 20  # the fewest, to one digit
+    assert {(4, 50, 320), (16, 20, None)} == set(tried)
