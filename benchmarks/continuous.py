@@ -47,14 +47,38 @@ UPHILL: dict[str, Any] = SIMULATED | {
     "search": {"kind": "mcts", "widening": 1, "simulations": 80},
     "num_envs": 1,
     "max_roots": 100,
-    "update": {"type": "mpo", "kl_mean": 0.3, "learning_rate": 3e-3, "minibatch_size": 32, "num_epochs": 20},
+    "update": {
+        "type": "mpo",
+        "kl_mean": 0.3,
+        "kl_std": 1e-4,
+        "learning_rate": 3e-3,
+        "minibatch_size": 32,
+        "num_epochs": 20,
+    },
+}
+HOPPING: dict[str, Any] = {
+    "policy": SIMULATED["policy"],
+    "depth": 0,
+    "actions": 8,
+    "num_envs": 2,
+    "horizon": {"type": "steps", "length": 500},
+    "replay": {
+        "type": "uniform",
+        "capacity": 20_000,
+        "updates_per_step": 0.007,
+        "starts": 32,
+        "length": 32,
+        "search_every": 8,
+        "polyak": 1.0,
+    },
+    "update": {"type": "mpo", "kl_std": 2e-4, "learning_rate": "linear(2e-3, 2e-4, 100000)", "minibatch_size": 32},
 }
 OURS: dict[str, dict[str, Any]] = {
     "Pendulum-v1": {"policy": "gaussian", "depth": 0, "replay": "uniform"},
     "MountainCarContinuous-v0": UPHILL,
     "InvertedPendulum-v5": SIMULATED | {"horizon": {"type": "fixed", "length": 100}},
     "InvertedPendulum-v5 ensemble": {"policy": "gaussian", "depth": 0, "model": "ensemble"},
-    "Hopper-v5": SIMULATED | {"gamma": 0.995, "num_envs": 2, "horizon": {"type": "fixed", "length": 500}},
+    "Hopper-v5": HOPPING,
     "HalfCheetah-v5": SIMULATED,
 }
 """Our settings, by environment, and model where it is not the given one; all others are the defaults."""
@@ -161,13 +185,11 @@ def learning(args: argparse.Namespace) -> None:
     """Print a row for each learner and seed, the return at each multiple of `every` steps."""
     for name in args.learners:
         for seed in range(args.seeds):
-            begin, cells = time.process_time(), []
+            begin = time.process_time()
+            print(f"{args.env} {name:5} seed {seed}", end="", flush=True)
             for steps, mean in LEARNERS[name](args.env, args.steps, args.every, seed):
-                cells.append(f"{steps}: {mean:.0f}")
-            print(
-                f"{args.env} {name:5} seed {seed}  {'  '.join(cells)}  ({time.process_time() - begin:.0f} s)",
-                flush=True,
-            )
+                print(f"  {steps}: {mean:.0f}", end="", flush=True)
+            print(f"  ({time.process_time() - begin:.0f} s)", flush=True)
 
 
 def main() -> None:
