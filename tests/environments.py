@@ -30,6 +30,8 @@ TRIED: dict[str, tuple[str, dict[str, Any]]] = {
     "gym_simplegrid:SimpleGrid-4x4-v0": ("gym-simplegrid", {"depth": 1}),
     "gymnasium_2048:gymnasium_2048/TwentyFortyEight-v0": ("gymnasium-2048", {"depth": 1}),
     "tetris_gymnasium.envs:tetris_gymnasium/Tetris": ("tetris-gymnasium", {"depth": 1}),
+    "flappy_bird_gymnasium:FlappyBird-v0": ("flappy-bird-gymnasium", {"depth": 1}),
+    "gym_anytrading:stocks-v0": ("gym-anytrading", {"depth": 1}),
 }
 """By id: the package, and the arguments of `PGTS`."""
 

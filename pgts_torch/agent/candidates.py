@@ -18,8 +18,8 @@ from pgts_torch.agent.observations import Observations
 from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError, failure, warn
 from pgts_torch.models.actions import all_actions
-from pgts_torch.models.adapters import known_adapter, not_restored
-from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside
+from pgts_torch.models.adapters import not_restored
+from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside, known_or_none
 from pgts_torch.models.attributes import attributes, own_to_each
 from pgts_torch.models.classic import CLASSIC
 from pgts_torch.models.environments import EnvSource
@@ -160,7 +160,7 @@ def simulator_world(request: Request, *, reasons: Sequence[str], layered: bool) 
         layered: whether its wrappers are part of it, because some do more than transform single answers.
     """
     env = request.envs.envs[0]
-    known = known_adapter(env)
+    known = known_or_none(env, request.fresh)
     adapter: SnapshotAdapter = known or PickledAttributes()
     # What wrappers hold is in the snapshot where they are part of the simulator.
     kept = {type(wrapper).__name__ for wrapper in wrappers_of(env)} if layered else set()
@@ -184,7 +184,8 @@ def simulator_world(request: Request, *, reasons: Sequence[str], layered: bool) 
         if layered:
             check_resets(setup)
         if known is None or layered:
-            what = "has wrappers that are part of the model: their" if layered else "has no get_state: its"
+            reason = "a generator of its own" if hasattr(env.unwrapped, "get_state") else "no get_state"
+            what = "has wrappers that are part of the model: their" if layered else f"has {reason}: its"
             size, other = len(setup.snapshot(setup.fresh()).key), f" ({'; '.join(reasons)})" if reasons else ""
             warn(
                 f"{request.name} {what} attributes are pickled, {size} bytes and {1e6 * seconds:.0f} us a call; "

@@ -7,6 +7,7 @@ import inspect
 import pickle
 import struct
 import sys
+import types
 from collections import deque
 from typing import Any, final
 
@@ -16,6 +17,7 @@ import numpy as np
 from pgts_torch.errors import MissingModel
 from pgts_torch.models.adapters_extra import Ale, Mujoco
 from pgts_torch.models.adapters_minigrid import MiniGrid
+from pgts_torch.models.attributes import held_by
 from pgts_torch.models.provenance import overridden
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name, of_key
 
@@ -56,7 +58,8 @@ _SEQUENCES = list, tuple, deque
 
 def same_content(one: Any, other: Any) -> bool:
     """Whether two values hold the same, however numbers are typed. Objects may lead back to themselves, as cars to a
-    road with all cars: a pair that was met before is not looked at again."""
+    road with all cars: a pair that was met before is not looked at again. What cannot be looked into, as an iterator,
+    is the same where its class is."""
     met, left = dict[tuple[int, int], Any](), [(one, other)]
     while left:
         first, second = left.pop()
@@ -80,8 +83,11 @@ def same_content(one: Any, other: Any) -> bool:
                 return False
             met[pair] = first, second
             left += zip(first, second, strict=True)
-        elif type(first) is type(second) and type(first).__eq__ is object.__eq__ and hasattr(first, "__dict__"):
-            left.append((vars(first), vars(second)))
+        elif isinstance(first, types.MethodType) and isinstance(second, types.MethodType):
+            left += [(first.__func__, second.__func__), (first.__self__, second.__self__)]
+        elif type(first) is type(second) and type(first).__eq__ is object.__eq__:
+            met[pair] = first, second
+            left.append((held_by(first), held_by(second)))
         elif not (first == second or (first != first and second != second)):
             return False
     return True

@@ -1,18 +1,22 @@
 """Adapters of what nobody has written one for: the attributes of an environment, and of its wrappers, pickled."""
 
 import collections
+import contextlib
 import copyreg
 import io
 import pickle
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, final
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from pgts_torch.models.adapters import same_content
-from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter
+from pgts_torch.errors import Failed
+from pgts_torch.models.adapters import OwnState, known_adapter, same_content
+from pgts_torch.models.attributes import own_generator
+from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, reseed
+from pgts_torch.models.trial import reset
 from pgts_torch.models.wrappers import only_with_effect, with_effect
 
 _NO_STATE = frozenset(
@@ -41,9 +45,33 @@ _REDUCERS: Mapping[type, Any] = collections.ChainMap(
 those that were not, and equal states would have different bytes."""
 
 
+class _Part:
+    """In what is compared, a part of an environment that stays where it is, or an attribute of it, as a method."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> "_Part":
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _Part(f"{self._name}.{name}")
+
+    def __call__(self) -> None:
+        """What `functools.partial` takes can be called."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Part) and self._name == other._name
+
+    def __hash__(self) -> int:
+        return hash(self._name)
+
+
 @final
 class PickledAttributes(SnapshotAdapter):
-    """All attributes of an environment, but its spaces, its generator, and what does not pickle, as windows.
+    """All attributes of an environment, but its spaces, its generators, and what does not pickle, as windows.
+
+    In states that are restored the one generator `np_random` stands for every generator of numpy that the environment
+    holds, so that all its chance comes from the key that seeds this one.
 
     That this is its whole state is a guess: it can only be used where walks that are restored (`models.restoring`) go
     on bit for bit as at first, and steps are compared with the model for as long as it is used.
@@ -51,11 +79,13 @@ class PickledAttributes(SnapshotAdapter):
     left_out: the attributes that do not pickle.
     """
 
-    name = "its attributes, pickled"
+    name, shares_generators = "its attributes, pickled", True
 
     def __init__(self) -> None:
         self.left_out = set[str]()
         self._fixed: Mapping[str, Any] = {}
+        # Whether there are other generators than np_random; and the one that stands for all of them since set_state.
+        self._has_others, self._shared = False, None
 
     def get_state(self, env: Any) -> Snapshot:
         try:
@@ -71,6 +101,17 @@ class PickledAttributes(SnapshotAdapter):
             for name in self._state(env).keys() - attributes.keys():
                 delattr(env, name)
         vars(env).update(attributes)
+        self._shared = env.np_random
+
+    def seed(self, env: Any, key: int) -> None:
+        reseed(env, key)
+        self.share(env)
+
+    def share(self, env: Any) -> None:
+        """Let np_random stand for the other generators where the state was not restored just now."""
+        if self._has_others and self._shared is not env.np_random:
+            self.set_state(env, self.get_state(env).data)
+        self._shared = None  # a reset may make others
 
     def same_state(self, one: Snapshot, other: Snapshot) -> bool:
         """Pickles of one state may differ, as where an object is met twice; so what they hold is compared."""
@@ -93,7 +134,13 @@ class PickledAttributes(SnapshotAdapter):
         file = io.BytesIO()
         pickler, names = pickle.Pickler(file, protocol=5), {id(part): name for name, part in self._parts(env).items()}
         pickler.dispatch_table = _REDUCERS
-        pickler.persistent_id = lambda part: names.get(id(part))  # type: ignore[method-assign]
+
+        def name_of(part: Any) -> str | None:
+            if (name := names.get(id(part))) is None and isinstance(part, np.random.Generator):
+                self._has_others, name = True, "np_random"
+            return name
+
+        pickler.persistent_id = name_of  # type: ignore[method-assign]
         pickler.dump(value)
         return file.getvalue()
 
@@ -116,6 +163,7 @@ class Layered(SnapshotAdapter):
 
     def __init__(self, inner: SnapshotAdapter) -> None:
         self.name, self.inner = f"{inner.name}, with its wrappers", inner
+        self.shares_generators = inner.shares_generators
         self._each: list[PickledAttributes] = []
 
     def get_state(self, env: Any) -> Snapshot:
@@ -140,6 +188,8 @@ class Layered(SnapshotAdapter):
 
     def seed(self, env: Any, key: int) -> None:
         self.inner.seed(env.unwrapped, key)
+        for adapter, wrapper in self._pairs(env):
+            adapter.share(wrapper)
 
     def same_world(self, env: Any, own: Any) -> bool:
         kinds = [[type(wrapper) for wrapper in with_effect(each)] for each in (env, own)]
@@ -156,13 +206,29 @@ class Layered(SnapshotAdapter):
         return list(zip(self._each, wrappers, strict=False))
 
 
+def known_or_none(env: gymnasium.Env, make: Callable[[], gymnasium.Env]) -> SnapshotAdapter | None:
+    """`known_adapter`; None also where an environment with get_state has generators of its own, which that may return
+    and a search must not restore, and `PickledAttributes` can share them.
+
+    Args:
+        make: makes another instance, which is reset.
+    """
+    known = known_adapter(env)
+    if isinstance(known, OwnState):
+        with contextlib.suppress(Failed):
+            reset(other := make(), seed=0)
+            one, another = (own_generator(other.unwrapped, but=but) for but in ((), (np.random.Generator,)))
+            return None if one and not another else known
+    return known
+
+
 def inside(env: gymnasium.Env, adapter: SnapshotAdapter) -> Any:
     """What of an instance an adapter takes and restores. With `Layered` its other wrappers are taken off."""
     return only_with_effect(env) if isinstance(adapter, Layered) else env.unwrapped
 
 
 def _unpickled(content: bytes, parts: Mapping[str, Any] | None) -> Any:
-    """What was pickled, with parts of an environment in place of their names, or without one with the names."""
+    """What was pickled, with parts of an environment in place of their names; without one with a `_Part` for each."""
     unpickler = pickle.Unpickler(io.BytesIO(content))
-    unpickler.persistent_load = str if parts is None else parts.__getitem__  # type: ignore[method-assign]
+    unpickler.persistent_load = _Part if parts is None else parts.__getitem__  # type: ignore[method-assign]
     return unpickler.load()

@@ -182,13 +182,14 @@ def fingerprint(value: Any, *, besides: Sequence[Any] = ()) -> Any:
     return looks[0] if len(looks) == 1 else looks
 
 
-def own_generator(env: Any) -> str:
-    """The name of a random generator in an environment other than its `np_random`, empty where there is none: for
-    instance "dice", or "box.0.dice" of the first entry of a list."""
+def own_generator(env: Any, *, but: tuple[type, ...] = ()) -> str:
+    """The name of a random generator in an environment other than its `np_random` and those of the types `but`, empty
+    where there is none: for instance "dice", or "box.0.dice" of the first entry of a list."""
     with environment_code():
         known = env.np_random
     inside = _inside(env, [known], left_out=frozenset({"spec"}))
-    return next((where for where, part, _ in inside if isinstance(part, _GENERATORS) and part is not known), "")
+    others = ((where, part) for where, part, _ in inside if isinstance(part, _GENERATORS) and part is not known)
+    return next((where for where, part in others if not isinstance(part, but)), "")
 
 
 def _inside(value: Any, known: Sequence[Any], *, left_out: Set[str]) -> Iterator[tuple[str, Any, Any]]:
@@ -266,14 +267,18 @@ def _parts_of(value: Any, left_out: Set[str]) -> list[tuple[Any, Any]]:
         return [("__func__", value.__func__), ("__self__", value.__self__)]
     if isinstance(value, functools.partial):
         return [("func", value.func), ("args", value.args), ("keywords", value.keywords)]
-    slots = [name for cls in type(value).__mro__ for name in getattr(cls, "__slots__", ()) if hasattr(value, name)]
-    named = {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})
-    if named or isinstance(value, spaces.Space):
+    if (named := held_by(value)) or isinstance(value, spaces.Space):
         return [(name, part) for name, part in named.items() if name not in left_out]
     try:
         return [("pickle", pickle.dumps(value))]
     except Exception:  # a window, a lock, a file: nothing to compare
         return []
+
+
+def held_by(value: Any) -> dict[str, Any]:
+    """The attributes of an object, also those in slots."""
+    slots = [name for cls in type(value).__mro__ for name in getattr(cls, "__slots__", ()) if hasattr(value, name)]
+    return {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})
 
 
 def _class_attributes(cls: type) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from gymnasium import spaces
 from pgts_torch.errors import MissingModel, PgtsError, failure
 from pgts_torch.models import restoring
 from pgts_torch.models.actions import all_actions, sampled_actions
-from pgts_torch.models.adapters import known_adapter, not_restored
-from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside
+from pgts_torch.models.adapters import not_restored
+from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside, known_or_none
 from pgts_torch.models.attributes import own_to_each
 from pgts_torch.models.classic import dynamics_of
 from pgts_torch.models.clocks import check_clock
@@ -146,7 +146,7 @@ def _report(make: Callable[[], gymnasium.Env], *, seed: int, continuations: int,
     first, claims = make(), tuple(_claims(make(), seed=seed))
     name, known, mdp = env_name(first), None, published_table(first, gamma=_GAMMA)
     try:
-        known = known_adapter(first)
+        known = known_or_none(first, make)
     except MissingModel:
         if mdp is None:
             raise

@@ -251,7 +251,7 @@ def restored(walks: Sequence[Walk], others: Sequence[Walk]) -> str:
 def chance(setup: Setup, walks: Sequence[Walk]) -> str:
     """Whether steps use generators other than the one that the key seeds; and how often another key matters."""
     env = setup.fresh()
-    if name := own_generator(env):
+    if name := own_generator(env, but=(np.random.Generator,) if setup.adapter.shares_generators else ()):
         raise MissingModel(f"attribute {name} is a generator of its own: draw from self.np_random only")
     differ = 0
     for walk in walks:

@@ -96,11 +96,13 @@ class SnapshotAdapter(ABC):
             rendering only; None: whatever there is.
         is_plain: whether all snapshots are made by `of_key`, of bytes of the same length that `set_state` copies and
             does not decode: then they can be saved, and loaded from files of others.
+        shares_generators: whether `seed` seeds all generators of numpy that an environment holds, not np_random alone.
     """
 
     name: str
     restored: frozenset[str] | None = None
     is_plain = False
+    shares_generators = False
 
     @abstractmethod
     def get_state(self, env: Any) -> Snapshot:

@@ -95,11 +95,11 @@ class Prophet(Corridor):
 
 
 class OwnGenerator(Corridor):
-    """It draws from a generator of its own."""
+    """It draws from a generator of its own, which is none of numpy's."""
 
     def __init__(self, slip: float = 0.3) -> None:
         super().__init__(slip)
-        self.dice = np.random.default_rng(0)
+        self.dice = random.Random(0)
 
     def draw(self) -> float:
         return self.dice.random()
@@ -110,11 +110,11 @@ class Clairvoyant(Corridor):
 
     def __init__(self, slip: float = 0.3) -> None:
         super().__init__(slip)
-        self.box = [{"dice": np.random.default_rng(0)}]
+        self.box = [{"dice": random.Random(0)}]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         if seed is not None:
-            self.box = [{"dice": np.random.default_rng(seed)}]
+            self.box = [{"dice": random.Random(seed)}]
         return super().reset(seed=seed)
 
     def draw(self) -> float:

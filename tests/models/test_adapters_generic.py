@@ -1,6 +1,8 @@
 """Environments without get_state: their attributes are pickled, where that is enough and as long as it is."""
 
+import functools
 import itertools
+import random
 import threading
 
 import gymnasium
@@ -14,6 +16,7 @@ from pgts_torch.errors import MissingModel, ModelMismatch, PgtsError
 from pgts_torch.models import SimulatorModel, check_model
 from pgts_torch.models.adapters import same_content
 from pgts_torch.models.adapters_generic import PickledAttributes
+from pgts_torch.seeding import sample_keys, stream
 from tests.models.corridors import Bare, Corridor
 
 pytestmark = [
@@ -114,6 +117,45 @@ def test_objects_that_lead_back_to_themselves_are_compared():
     assert not same_content(shared, np.array([longer, None], object))
 
 
+class Slotted:
+    __slots__ = ("value",)
+
+    def __init__(self, value):
+        self.value = value
+
+    def show(self):
+        return self.value
+
+
+def test_methods_slots_and_iterators_are_compared():
+    assert same_content([Slotted(1), Slotted(1).show], [Slotted(1), Slotted(1).show])
+    assert not same_content(Slotted(1), Slotted(2))
+    assert not same_content(Slotted(1).show, Slotted(2).show)
+    assert same_content(itertools.cycle([1, 2]), itertools.cycle([1, 2]))
+    assert not same_content(itertools.cycle([1, 2]), iter([1, 2]))
+
+
+class Bound(Bare):
+    """It holds methods of its own, and an iterator that only a picture would read."""
+
+    def __init__(self):
+        super().__init__(slip=0)
+        self.shown, self.later = self.look, functools.partial(self.look)
+        self.frames = itertools.cycle([0, 1, 2, 1])
+
+    def step(self, action):
+        next(self.frames)
+        super().step(action)
+        return self.shown(), float(self.fuel), self.position == 0, False, {}
+
+
+def test_an_environment_that_holds_its_methods_and_iterators_is_one_with_its_snapshots():
+    training = PGTS(Bound, **SHORT | {"depth": 1})
+    assert isinstance(training.world.model.adapter, PickledAttributes)
+    training.iterate()
+    training.iterate()
+
+
 def test_its_cost_is_said():
     with pytest.warns(UserWarning, match=r"Bare has no get_state: its attributes are pickled, \d+ bytes and \d+ us a"):
         PGTS(Bare, **SHORT)
@@ -129,22 +171,94 @@ class Elsewhere(Bare):
         return look, reward + next(self.steps) % 2, *rest
 
 
-class OwnDice(Bare):
-    """It has a generator of its own, which a restored state would foresee."""
+class OwnRandom(Bare):
+    """It has a generator of its own that is not one of numpy's, which a restored state would foresee."""
 
     def __init__(self):
         super().__init__()
-        self.dice = np.random.default_rng(0)
+        self.dice = random.Random(0)
 
 
 @pytest.mark.parametrize(
     ("env", "why"),
-    [(Elsewhere, "a restored state goes on differently"), (OwnDice, "attribute dice is a generator of its own")],
+    [(Elsewhere, "a restored state goes on differently"), (OwnRandom, "attribute dice is a generator of its own")],
 )
 def test_where_attributes_are_not_enough_the_two_methods_are_named_as_before(env, why):
     for use in (lambda: PGTS(env, **SHORT), lambda: check_model(env)):
         with pytest.raises(MissingModel, match=rf"give {env.__name__} the methods get_state.*are not enough: {why}"):
             use()
+
+
+class Box:
+    """Something that throws a die of its own."""
+
+    def __init__(self, seed):
+        self.dice = np.random.default_rng(seed)
+
+    def throw(self):
+        return int(self.dice.integers(6))
+
+
+class Thrown(gymnasium.Env):
+    """Each step shows what a die has thrown, which belongs to something that a reset makes."""
+
+    observation_space, action_space = spaces.Discrete(6), spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.box = Box(seed)
+        self.face = self.box.throw()
+        return self.face, {}
+
+    def step(self, action):
+        self.face = self.box.throw() if action else self.face
+        return self.face, float(self.face), False, False, {}
+
+
+class Holding(Thrown):
+    """Its two methods hold the die."""
+
+    def get_state(self):
+        return self.box, self.face
+
+    def set_state(self, state):
+        self.box, self.face = state
+
+
+class Doubled(gymnasium.Wrapper):
+    """Pays more by a coin of its own."""
+
+    def reset(self, **given):
+        self.coin = np.random.default_rng(given.get("seed"))
+        return super().reset(**given)
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, reward * (1 + int(self.coin.integers(2))), *rest
+
+
+@pytest.mark.filterwarnings("ignore:.*a generator of its own. its", "ignore:.*wrappers that are part of the model")
+@pytest.mark.parametrize("make", [Thrown, Holding, lambda: Doubled(Thrown())], ids=["own", "held", "wrapped"])
+def test_chance_of_generators_of_its_own_comes_from_the_keys_of_the_search(make):
+    training = PGTS(make, **SHORT | {"depth": 0, "gamma": 0.5})
+    model, env, twin = training.world.model, training.source.like(), training.source.like()
+    for each in (env, twin):
+        each.reset(seed=4)
+    state = int(model.roots([env], [env.unwrapped.face])[0])
+    key_N = sample_keys(3000, generator=stream(0, "keys"))
+    states_N, throw_N = torch.full((3000,), state), torch.ones(3000, dtype=torch.int64)
+    first, again = (model.sample(states_N, throw_N, key_N=key_N) for _ in range(2))
+    faces = torch.tensor(model.observations(first.next_state_N)).reshape(-1)
+    assert torch.equal(first.next_state_N, again.next_state_N)
+    assert torch.bincount(faces, minlength=6).tolist() == pytest.approx([500] * 6, abs=100)  # five deviations
+    assert model.is_random(states_N[:2], torch.tensor([0, 1])).tolist() == [
+        make is not Thrown and make is not Holding,
+        True,
+    ]
+    for _ in range(20):  # nothing that the search did has moved the die of the environment
+        assert env.step(1)[:2] == twin.step(1)[:2]
+    assert check_model(make).usable
 
 
 class Late(Bare):
