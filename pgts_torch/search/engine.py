@@ -23,7 +23,7 @@ from pgts_torch.search.memory import tree_nodes
 from pgts_torch.search.price import Meter
 from pgts_torch.search.sampled import plan_levels, search_samples
 from pgts_torch.search.topology import Topology
-from pgts_torch.search.widening import drawn_actions
+from pgts_torch.search.widening import calls_of_simulation, drawn_actions
 from pgts_torch.seeding import sample_keys
 
 DEFAULT_SAMPLES = Sampled().samples
@@ -96,7 +96,9 @@ class Search(ABC):
 
     @property
     def calls_of_state(self) -> int:
-        """How many model calls expand a state."""
+        """How many model calls expand a state; 1 where nodes are widened, and the meter is told of each call."""
+        if getattr(self.options, "widening", None) is not None:
+            return 1
         return self.model.num_actions * (1 if self.topology is not None else self.num_samples)
 
     @property
@@ -253,7 +255,10 @@ class MCTSSearch(Search):
 
     def most_states(self, roots: int, levels: int) -> float:
         outcomes = self._samples if self.topology is None else getattr(self.model, "num_outcomes", None) or 1
-        in_tree = tree_nodes(1, self.model.num_actions * outcomes, levels - 1)
+        in_tree, actions = tree_nodes(1, self.model.num_actions * outcomes, levels - 1), self.model.num_actions
+        if (widening := self.options.widening) is not None:  # the first simulation expands the root
+            below = (self.options.simulations - 1) * calls_of_simulation(widening)
+            return float(roots * min(actions + below, actions * in_tree))
         return self._within(roots * min(self.options.simulations, in_tree))
 
     def __str__(self) -> str:

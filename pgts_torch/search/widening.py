@@ -1,5 +1,7 @@
 """Trees whose nodes get more of the actions drawn for them the more often they are visited (progressive widening)."""
 
+import math
+from collections.abc import Callable
 from typing import Self, final
 
 import torch
@@ -71,7 +73,7 @@ class WideningTrees:
     def add_roots(self, state_B: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
         """Nodes for these distinct states, with all their actions."""
         node_B = self._add(state_B, torch.zeros_like(state_B))
-        self._widen(node_B, torch.full_like(node_B, self.A))
+        self._measured(len(node_B) * self.A, lambda: self._widen(node_B, torch.full_like(node_B, self.A)))
         self._sum_up(node_B)
         return node_B
 
@@ -90,7 +92,23 @@ class WideningTrees:
     def wave(self, node_B: Int[Tensor, "B"], share_BA: Float[Tensor, "B A"]) -> Float[Tensor, "B"]:
         """A simulation by each action of these roots whose share is 1; how many there were of each root."""
         row_L, action_L = share_BA.nonzero().unbind(1)
-        node_L, lane_L = node_B[row_L], torch.arange(len(row_L), device=node_B.device)
+        self._measured(
+            len(row_L) * calls_of_simulation(self._widening), lambda: self._simulate(node_B[row_L], action_L)
+        )
+        return share_BA.sum(1)
+
+    def _measured(self, calls: int, work: Callable[[], None]) -> None:
+        """Do what takes at most so many calls of the model, and measure it."""
+        if (meter := self._leaves.meter) is None:
+            work()
+        else:
+            apart = torch.empty(0, dtype=torch.int64)
+            each = torch.empty(calls, dtype=torch.int64)
+            meter.query(each, lambda _: work(), lambda _: (apart, apart), known=self.model_calls, divides=False)
+
+    def _simulate(self, node_L: Int[Tensor, "L"], action_L: Int[Tensor, "L"]) -> None:
+        """A simulation by each of these actions of roots."""
+        lane_L = torch.arange(len(node_L), device=node_L.device)
         path, end_L, want_L = list[tuple[Tensor, Tensor]](), torch.zeros_like(node_L), torch.zeros_like(node_L)
         while len(lane_L):  # those lanes of simulations that have not come to their end
             path.append((node_L, action_L))
@@ -113,7 +131,6 @@ class WideningTrees:
         self._sum_up(end_L)
         for node_L, action_L in reversed(path):
             self._back_up(node_L, action_L)
-        return share_BA.sum(1)
 
     def _allowed(self, visits_L: Float[Tensor, "L"]) -> Int[Tensor, "L"]:
         """k(N)."""
@@ -185,6 +202,11 @@ class WideningTrees:
         """`Lookahead.pruned_BA`: 0 where nothing is left to expand below an action, else inf, because a maximum over
         some of the actions is no value that the critic gave."""
         return torch.where(self._open_NA[node_B], torch.inf, 0.0)
+
+
+def calls_of_simulation(widening: float) -> int:
+    """For how many actions a simulation below the root queries the model, at most: a new node has ceil(C)."""
+    return max(1, math.ceil(widening))
 
 
 def drawn_actions(model: Model, options: MCTS) -> DrawnActions:
