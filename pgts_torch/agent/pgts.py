@@ -68,7 +68,8 @@ class PGTS(Trained):
         num_envs: environments, of all processes together. Default: 16, or 1 with the horizon steps; or those of a
             VectorEnv, in each process, beside which another number is an error.
         actions_per_dimension: the number of evenly spaced values, from the lowest to the highest, for each dimension of
-            continuous actions; None: actions are discrete, or MultiDiscrete, whose combinations are numbered.
+            continuous actions; None: actions are Discrete, MultiDiscrete or MultiBinary, whose combinations
+            are numbered.
         max_roots: the most visits that the lookahead of an update starts from, drawn where more states were visited.
         action_repeat, model_check: how often the model repeats each action, and whether it is checked against steps of
             the environment: see there too.

@@ -19,7 +19,7 @@ MOST_ACTIONS = 10_000
 
 
 def all_actions(space: spaces.Space) -> Iterator[Any]:
-    """Every action of a Discrete or MultiDiscrete space.
+    """Every action of a Discrete, MultiDiscrete or MultiBinary space.
 
     Raises:
         PgtsError: the space is another one.
@@ -30,6 +30,9 @@ def all_actions(space: spaces.Space) -> Iterator[Any]:
         shape, start = space.nvec.shape, space.start
         each = itertools.product(*[range(n) for n in space.nvec.reshape(-1)])
         return (np.array(action, dtype=space.dtype).reshape(shape) + start for action in each)
+    if isinstance(space, spaces.MultiBinary):
+        every = itertools.product((0, 1), repeat=math.prod(space.shape))
+        return (np.array(action, dtype=space.dtype).reshape(space.shape) for action in every)
     raise PgtsError(f"the actions of {space} cannot be enumerated: give some, as grid_actions or sampled_actions do")
 
 
@@ -106,9 +109,12 @@ def numbered(env: gymnasium.Env, *, per_dimension: int | None) -> gymnasium.Env:
     """
     space, name = env.action_space, env_name(env)
     if per_dimension is None:
-        if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete) or is_numbered(space):
+        if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary) or is_numbered(space):
             return env
-        if isinstance(space, spaces.MultiDiscrete) and math.prod(space.nvec.reshape(-1).tolist()) > MOST_ACTIONS:
+        each = (
+            2 * np.ones(space.shape, np.int64) if isinstance(space, spaces.MultiBinary) else getattr(space, "nvec", 1)
+        )
+        if math.prod(np.reshape(each, -1).tolist()) > MOST_ACTIONS:
             raise PgtsError(f"the actions of {name} are {space}: more than {MOST_ACTIONS:,} combinations")
         return Numbered(env, list(all_actions(space)))
     if not isinstance(space, spaces.Box):

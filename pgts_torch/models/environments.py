@@ -250,7 +250,10 @@ def check_vector_env(env: VectorEnv, *, vectors: bool = False) -> None:
             "actions_per_dimension, into how many values each dimension of them is divided"
         )
     if not vectors and not is_numbered(space):
-        raise PgtsError(f"the actions of {env_name(env)} are {space}; they must be Discrete(n) counted from 0")
+        raise PgtsError(
+            f"the actions of {env_name(env)} are {space}; they must be Discrete, MultiDiscrete, MultiBinary or "
+            "Box; those of a VectorEnv Discrete(n) counted from 0"
+        )
     mode = env.metadata.get("autoreset_mode")
     if mode != AutoresetMode.DISABLED:
         raise PgtsError(f"the environment resets by {mode}; make it with autoreset_mode=AutoresetMode.DISABLED")

@@ -171,13 +171,20 @@ class Switches(Field):
     action_space = spaces.MultiDiscrete([2, 3], start=[0, 5])
 
 
+class Bits(Field):
+    """Two switches that are on or off."""
+
+    action_space = spaces.MultiBinary(2)
+
+
 @pytest.mark.parametrize("options", [{}, {"depth": 0, "estimator": "sampled"}])
-def test_combinations_of_actions_are_numbered(options):
-    model = PGTS(Switches, **SHORT | options)
+@pytest.mark.parametrize(("env", "second"), [(Switches, (5, 6, 7)), (Bits, (0, 1))])
+def test_combinations_of_actions_are_numbered(env, second, options):
+    model = PGTS(env, **SHORT | options)
     model.iterate()
-    assert model.policy.num_actions == 6
+    assert model.policy.num_actions == 2 * len(second)
     seen = {tuple(action.tolist()) for action in model.predict(np.zeros((200, 2)), deterministic=False)}
-    assert seen == {(x, y) for x in (0, 1) for y in (5, 6, 7)}
+    assert seen == {(x, y) for x in (0, 1) for y in second}
     assert evaluate(model, episodes=2).episodic_return.mean < 0
 
 
@@ -189,12 +196,18 @@ def test_actions_that_are_counted_from_elsewhere_are_numbered(tmp_path):
     assert set(loaded.predict(np.zeros((50, 2)), deterministic=False).tolist()) == {5, 6}
 
 
-def test_more_combinations_of_actions_than_10_000_are_refused():
-    class Panel(Field):
-        action_space = spaces.MultiDiscrete([10] * 5)
-
-    with pytest.raises(PgtsError, match=r"the actions of Panel are MultiDiscrete.*: more than 10,000 combinations"):
-        PGTS(Panel, **SHORT)
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (spaces.MultiDiscrete([10] * 5), r"are MultiDiscrete.*: more than 10,000 combinations"),
+        (spaces.MultiBinary(14), r"are MultiBinary\(14\): more than 10,000 combinations"),
+        (spaces.Tuple([spaces.Discrete(2)]), "must be Discrete, MultiDiscrete, MultiBinary or Box"),
+    ],
+)
+def test_actions_that_cannot_be_numbered_are_refused(space, message):
+    panel = type("Panel", (Field,), {"action_space": space})
+    with pytest.raises(PgtsError, match=f"the actions of Panel .*{message}"):
+        PGTS(panel, **SHORT)
 
 
 def test_environments_that_were_made_take_their_own_actions():
