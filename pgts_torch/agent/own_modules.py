@@ -74,9 +74,10 @@ class OwnLayers(nn.Module):
         shape = (len(input_N), self._num_outputs)
         if not isinstance(output, Tensor) or output.shape != shape or output.dtype != input_N.dtype:
             must = f"{len(input_N)}, {'features' if self._num_outputs is None else self._num_outputs}"
+            asked = " (num_outputs is 1 for a critic, also where the policy's module makes it)"
             raise PgtsError(
                 f"{self.name} returned {found} for {len(input_N)} rows; it must return {input_N.dtype} of the shape "
-                f"({must})"
+                f"({must}){asked * (self._num_outputs == 1)}"
             )
         return output
 

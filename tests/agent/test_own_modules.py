@@ -199,6 +199,21 @@ def test_what_makes_no_module_is_refused_in_one_sentence(make, message):
     assert "\n" not in str(caught.value)
 
 
+class ForPolicies(Plain):
+    """It knows how many actions there are."""
+
+    def __init__(self, space, num_outputs):
+        super().__init__(space, 2)
+
+
+def test_a_module_of_a_policy_that_cannot_be_its_critic_is_told_what_a_critic_needs():
+    with pytest.raises(
+        PgtsError, match=r"of the shape \(5, 1\) \(num_outputs is 1 for a critic, also where the policy"
+    ):
+        PGTS("CartPole-v1", policy=ForPolicies, **SHORT)
+    PGTS("CartPole-v1", policy=ForPolicies, critic=Plain, **SHORT).iterate()
+
+
 @pytest.mark.parametrize("given", [{"policy": Plain, "critic": Plain}, {"policy": "tests.agent.modules:Plain"}])
 def test_a_policy_and_a_critic_may_be_given_as_a_class_or_by_its_name(given, tmp_path):
     model = trained(**given)
