@@ -131,17 +131,9 @@ class PickledAttributes(SnapshotAdapter):
         return self._fixed
 
     def _pickled(self, env: Any, value: Any) -> bytes:
-        file = io.BytesIO()
-        pickler, names = pickle.Pickler(file, protocol=5), {id(part): name for name, part in self._parts(env).items()}
-        pickler.dispatch_table = _REDUCERS
-
-        def name_of(part: Any) -> str | None:
-            if (name := names.get(id(part))) is None and isinstance(part, np.random.Generator):
-                self._has_others, name = True, "np_random"
-            return name
-
-        pickler.persistent_id = name_of  # type: ignore[method-assign]
+        pickler = _Pickler(file := io.BytesIO(), self._parts(env))
         pickler.dump(value)
+        self._has_others |= pickler.has_others
         return file.getvalue()
 
     def _pickles(self, env: Any, value: Any) -> bool:
@@ -227,8 +219,33 @@ def inside(env: gymnasium.Env, adapter: SnapshotAdapter) -> Any:
     return only_with_effect(env) if isinstance(adapter, Layered) else env.unwrapped
 
 
+class _Pickler(pickle.Pickler):
+    """Pickles references to parts of an environment, by identity, as their names, and other generators as np_random.
+
+    persistent_id and persistent_load are methods, because since Python 3.13 they cannot be set on an instance.
+    """
+
+    dispatch_table = _REDUCERS
+
+    def __init__(self, file: io.BytesIO, parts: Mapping[str, Any]) -> None:
+        super().__init__(file, protocol=5)
+        self._names, self.has_others = {id(part): name for name, part in parts.items()}, False
+
+    def persistent_id(self, part: Any) -> str | None:
+        if (name := self._names.get(id(part))) is None and isinstance(part, np.random.Generator):
+            self.has_others, name = True, "np_random"
+        return name
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, content: bytes, part_of: Callable[[str], Any]) -> None:
+        super().__init__(io.BytesIO(content))
+        self._part_of = part_of
+
+    def persistent_load(self, name: str) -> Any:
+        return self._part_of(name)
+
+
 def _unpickled(content: bytes, parts: Mapping[str, Any] | None) -> Any:
     """What was pickled, with parts of an environment in place of their names; without one with a `_Part` for each."""
-    unpickler = pickle.Unpickler(io.BytesIO(content))
-    unpickler.persistent_load = _Part if parts is None else parts.__getitem__  # type: ignore[method-assign]
-    return unpickler.load()
+    return _Unpickler(content, _Part if parts is None else parts.__getitem__).load()
