@@ -134,8 +134,8 @@ def propose(env_id: str, *, kwargs: Mapping[str, Any], seed: int) -> Proposal:
 class _Tried:
     """A training of two iterations: what it was made from and what it came to.
 
-    steps: if not None, the numbers below are foreseen, for an iteration of so many steps that looks ahead from all
-        states that it visits.
+    steps: if not None, the numbers below are foreseen, for an iteration of at most so many steps (fewer where episodes
+        end sooner) that looks ahead from all states that it visits.
     tables: whether the lookahead reads a table.   branching: actions.   roots: states that the lookahead starts from.
     iteration: the seconds of the second one.   looking: those of its lookahead.
     """
@@ -182,6 +182,7 @@ class _Tried:
             roots = 0 if iteration.state_N is None else len(iteration.state_N)
             looking, made = algorithm.pricing.looking, max(iteration.num_steps, 1)
             if steps is not None:
+                steps = _usual_steps(iteration.experience, made, steps)
                 rest = (seconds - looking) * steps / made
                 all_roots = max(roots, _grown(iteration.experience, made, steps))
                 looking, roots, made = looking * all_roots / max(roots, 1), all_roots, steps
@@ -222,6 +223,15 @@ def _known_model(general: dict[str, Any], fixed: dict[str, Any], time_limit: int
         if fewer < best.roots:
             options["max_roots"] = int(float(f"{fewer:.1g}"))
     return _Tried.of(general | fixed | {"search": options}, best.depth).proposal
+
+
+def _usual_steps(experience: Rollout, made: int, most: int) -> int:
+    """How many steps an iteration of the usual number of episodes makes, at most `most`; those that were cut off in the
+    `made` steps of a small one go on to the end."""
+    count, length = FIRST["num_envs"], FIRST["length"]
+    usual, alive_TB = Rollouts.standing("fixed")["num_envs"], experience.alive_TB
+    cut_off = float(alive_TB[-1].double().mean()) if len(alive_TB) >= min(length, most // usual) else 0.0
+    return min(most, round(usual * (made / count + cut_off * max(most / usual - length, 0))))
 
 
 def _grown(experience: Rollout, made: int, steps: int) -> int:
