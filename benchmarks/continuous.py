@@ -80,8 +80,9 @@ OURS: dict[str, dict[str, Any]] = {
     "InvertedPendulum-v5 ensemble": {"policy": "gaussian", "depth": 0, "model": "ensemble"},
     "Hopper-v5": HOPPING,
     "HalfCheetah-v5": SIMULATED,
+    "HalfCheetah-v5 replay": HOPPING,
 }
-"""Our settings, by environment, and model where it is not the given one; all others are the defaults."""
+"""Our settings, by environment, and by a word where it has two; all others are the defaults."""
 
 
 class _Observed:
