@@ -1,5 +1,7 @@
 """Algorithm 1 from rollouts: what one iteration does, and what a training leaves untouched."""
 
+import random
+
 import gymnasium
 import numpy as np
 import pytest
@@ -272,6 +274,14 @@ def test_an_environment_without_a_model_is_refused_with_what_is_missing():
     class Unpublished(gymnasium.Env):
         observation_space = gymnasium.spaces.Discrete(3)
         action_space = gymnasium.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.dice = random.Random(0)  # a generator that is not np_random
+            return 0, {}
+
+        def step(self, action):
+            return int(action), 0.0, False, False, {}
 
     env = gymnasium.vector.SyncVectorEnv([Unpublished], autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED)
     with pytest.raises(MissingModel, match="get_state") as caught:

@@ -1,6 +1,7 @@
 """Worlds: which one an environment gets, that states and observations belong together, and that all of them learn."""
 
 import functools
+import random
 from collections.abc import Callable
 
 import gymnasium
@@ -63,9 +64,17 @@ class Parts(gymnasium.Env):
 
 
 class Unknown(gymnasium.Env):
-    """Nothing is known of it."""
+    """Nothing is known of it, and it has a generator that is not np_random."""
 
     observation_space, action_space = spaces.Box(-1, 1, (2,)), spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.dice = random.Random(0)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.full(2, action, np.float32), 0.0, False, False, {}
 
 
 class Together(VectorEnv):

@@ -82,7 +82,7 @@ def test_what_is_not_finite_in_the_last_evaluation_is_written_down_too(tmp_path,
 def test_a_run_whose_environment_contradicts_its_model_writes_down_what_happened_and_exits_with_2(
     tmp_path, monkeypatch, capsys
 ):
-    def contradicted(*args):
+    def contradicted(*args, **options):
         raise ModelMismatch("state 1 under action 0 led to 3")
 
     monkeypatch.setattr("pgts_torch.agent.pgts.visit", contradicted)
