@@ -66,13 +66,14 @@ def test_each_shipped_configuration_runs_and_leaves_a_whole_folder(name, tmp_pat
     monkeypatch.setattr(EnvSource, "time_limit", 15)
     model, roots = load(config).model, load(config).search.max_roots
     learns, fits = isinstance(model, LEARNED), hasattr(model, "first_updates")
-    less = LESS_REPLAY if learns else FEW_ROOTS if roots is not None else []
+    replays = learns or load(config).replay.type == "uniform"
+    less = LESS_REPLAY if replays else FEW_ROOTS if roots is not None else []
     less = [*less, *(["--model.first_updates", "5"] if fits else [])]
     summary = run.train(few_iterations(tmp_path, *less, config=config))
     folder = tmp_path / "run"
     lines = read_metrics(folder)
     is_table = load(config).policy.type in ("softmax", "simplex") and not learns
-    own = TAGS - OF_EPISODES if learns else TAGS
+    own = TAGS - OF_EPISODES if replays else TAGS
     tags = own | {tag for tag in EXACT_TAGS if is_table or not tag.startswith("exact/")}
     assert len(lines) == summary.iterations >= 2
     for line in lines:
