@@ -41,8 +41,8 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel):
 
     Args:
         env: an id, a spec, an environment that has a spec (another one is made from it) or a function that makes one.
-        gamma: discount in [0, 1] of an outcome that does not terminate. An environment with `metadata["discounts"] =
-            True` may name another one in `info["discount"]`.
+        gamma: discount in [0, 1] of an outcome that does not terminate. An environment whose
+            `metadata["discounts"]` is True may name another one in `info["discount"]`.
         actions: the actions, as the outermost wrapper takes them, in the order of their numbers. Default: all of a
             discrete space; for a continuous one see `grid_actions` and `sampled_actions`.
         action_repeat: how often an action is taken in one outcome, as in `TensorModel`.

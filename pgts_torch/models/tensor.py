@@ -34,9 +34,9 @@ class TensorModel(EnumeratingModel, FollowingModel):
     then the optimality operator T_k of the semi-MDP of these options (Sutton, Precup and Singh 1999):
 
     - with `q_leaf` a search gives T_k^m Q^pi; with `v_leaf` T_k^m Q_k, where Q_k(s, a), the value of a taken k times
-    and pi from there on, is not Q^pi;
+      and pi from there on, is not Q^pi;
     - every value is that of a plan which can be followed, so with an exact critic none is above q*. But pi may be
-    better than each repeated action: max_a need not reach v^pi, and a gap of 0 does not put pi into Pi^m;
+      better than each repeated action: max_a need not reach v^pi, and a gap of 0 does not put pi into Pi^m;
     - upper bounds of v* do not stay such under T_k, so there is no certificate, and `highest_value` must be infinite.
 
     A model call is one (state, action) however often it is repeated; `simulator_steps` counts the steps.
