@@ -120,7 +120,7 @@ def paper(it: Any, out: str) -> None:
 def puzzle(it: Any, out: str) -> None:
     assert "can serve as a model" in out
     at = {name: curve[-1] for name, curve in it.curves.items()}
-    assert at["PPO"][1] == 0
+    assert at["PPO"][1] < 0.7
     assert at["PGTS"][1] == 1
     assert at["PGTS"][0] < it.steps
     assert "moves, reward 1" in out
