@@ -18,7 +18,7 @@ from pgts_torch.agent.observations import Observations
 from pgts_torch.agent.worlds import DynamicsWorld, SimulatedWorld, TabularWorld
 from pgts_torch.errors import Failed, MissingModel, ModelMismatch, PgtsError, failure, warn
 from pgts_torch.models.actions import all_actions
-from pgts_torch.models.adapters import not_restored
+from pgts_torch.models.adapters import known_adapter, not_restored
 from pgts_torch.models.adapters_generic import Layered, PickledAttributes, inside, known_or_none
 from pgts_torch.models.attributes import attributes, own_to_each
 from pgts_torch.models.classic import CLASSIC
@@ -184,7 +184,7 @@ def simulator_world(request: Request, *, reasons: Sequence[str], layered: bool) 
         if layered:
             check_resets(setup)
         if known is None or layered:
-            reason = "a generator of its own" if hasattr(env.unwrapped, "get_state") else "no get_state"
+            reason = "no get_state" if known_adapter(env) is None else "a generator of its own"
             what = "has wrappers that are part of the model: their" if layered else f"has {reason}: its"
             size, other = len(setup.snapshot(setup.fresh()).key), f" ({'; '.join(reasons)})" if reasons else ""
             warn(

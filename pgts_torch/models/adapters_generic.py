@@ -13,9 +13,10 @@ import numpy as np
 from gymnasium import spaces
 
 from pgts_torch.errors import Failed
-from pgts_torch.models.adapters import OwnState, known_adapter, same_content
+from pgts_torch.models.adapters import known_adapter, same_content
 from pgts_torch.models.attributes import own_generator
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, reseed
+from pgts_torch.models.stand_ins import MAKERS, name_of
 from pgts_torch.models.trial import reset
 from pgts_torch.models.wrappers import only_with_effect, with_effect
 
@@ -70,8 +71,8 @@ class _Part:
 class PickledAttributes(SnapshotAdapter):
     """All attributes of an environment, but its spaces, its generators, and what does not pickle, as windows.
 
-    In states that are restored the one generator `np_random` stands for every generator of numpy that the environment
-    holds, so that all its chance comes from the key that seeds this one.
+    In states that are restored every generator of Python or numpy that the environment holds draws from the bits of its
+    `np_random` (`models.stand_ins`), so that all its chance comes from the key that seeds this one.
 
     That this is its whole state is a guess: it can only be used where walks that are restored (`models.restoring`) go
     on bit for bit as at first, and steps are compared with the model for as long as it is used.
@@ -96,26 +97,27 @@ class PickledAttributes(SnapshotAdapter):
         return Snapshot(content, content)
 
     def set_state(self, env: Any, data: Any) -> None:
-        attributes = _unpickled(data, self._parts(env))
+        parts, generator = self._parts(env), env.np_random
+        attributes = _unpickled(data, lambda name: MAKERS[name](generator) if name in MAKERS else parts[name])
         if vars(env).keys() != attributes.keys():
             for name in self._state(env).keys() - attributes.keys():
                 delattr(env, name)
         vars(env).update(attributes)
-        self._shared = env.np_random
+        self._shared = generator
 
     def seed(self, env: Any, key: int) -> None:
         reseed(env, key)
         self.share(env)
 
     def share(self, env: Any) -> None:
-        """Let np_random stand for the other generators where the state was not restored just now."""
+        """Let the other generators draw from np_random where the state was not restored just now."""
         if self._has_others and self._shared is not env.np_random:
             self.set_state(env, self.get_state(env).data)
         self._shared = None  # a reset may make others
 
     def same_state(self, one: Snapshot, other: Snapshot) -> bool:
         """Pickles of one state may differ, as where an object is met twice; so what they hold is compared."""
-        return one.key == other.key or same_content(*(_unpickled(each.data, None) for each in (one, other)))
+        return one.key == other.key or same_content(*(_unpickled(each.data) for each in (one, other)))
 
     def _state(self, env: Any) -> dict[str, Any]:
         held, left_out = vars(env), self.left_out
@@ -175,7 +177,7 @@ class Layered(SnapshotAdapter):
         inside = (Snapshot(inner, one.data[0], clock=clock), Snapshot(other_inner, other.data[0], clock=other_clock))
         pairs = zip(layers, others, strict=True)
         return self.inner.same_state(*inside) and all(
-            same_content(_unpickled(layer, None), _unpickled(another, None)) for layer, another in pairs
+            same_content(_unpickled(layer), _unpickled(another)) for layer, another in pairs
         )
 
     def seed(self, env: Any, key: int) -> None:
@@ -199,17 +201,16 @@ class Layered(SnapshotAdapter):
 
 
 def known_or_none(env: gymnasium.Env, make: Callable[[], gymnasium.Env]) -> SnapshotAdapter | None:
-    """`known_adapter`; None also where an environment with get_state has generators of its own, which that may return
-    and a search must not restore, and `PickledAttributes` can share them.
+    """`known_adapter`; None also where an environment has generators of its own, which its get_state may return and
+    a search must not restore, and `PickledAttributes` can share them.
 
     Args:
         make: makes another instance, which is reset.
     """
-    known = known_adapter(env)
-    if isinstance(known, OwnState):
+    if (known := known_adapter(env)) is not None:
         with contextlib.suppress(Failed):
             reset(other := make(), seed=0)
-            one, another = (own_generator(other.unwrapped, but=but) for but in ((), (np.random.Generator,)))
+            one, another = (own_generator(other.unwrapped, but=but) for but in (None, name_of))
             return None if one and not another else known
     return known
 
@@ -220,7 +221,8 @@ def inside(env: gymnasium.Env, adapter: SnapshotAdapter) -> Any:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickles references to parts of an environment, by identity, as their names, and other generators as np_random.
+    """Pickles references to parts of an environment, by identity, as their names, and other generators as what stands
+    for them.
 
     persistent_id and persistent_load are methods, because since Python 3.13 they cannot be set on an instance.
     """
@@ -232,8 +234,8 @@ class _Pickler(pickle.Pickler):
         self._names, self.has_others = {id(part): name for name, part in parts.items()}, False
 
     def persistent_id(self, part: Any) -> str | None:
-        if (name := self._names.get(id(part))) is None and isinstance(part, np.random.Generator):
-            self.has_others, name = True, "np_random"
+        if (name := self._names.get(id(part))) is None and (name := name_of(part)) is not None:
+            self.has_others = True
         return name
 
 
@@ -246,6 +248,6 @@ class _Unpickler(pickle.Unpickler):
         return self._part_of(name)
 
 
-def _unpickled(content: bytes, parts: Mapping[str, Any] | None) -> Any:
+def _unpickled(content: bytes, part_of: Callable[[str], Any] = _Part) -> Any:
     """What was pickled, with parts of an environment in place of their names; without one with a `_Part` for each."""
-    return _Unpickler(content, _Part if parts is None else parts.__getitem__).load()
+    return _Unpickler(content, part_of).load()

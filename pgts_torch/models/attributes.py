@@ -182,14 +182,14 @@ def fingerprint(value: Any, *, besides: Sequence[Any] = ()) -> Any:
     return looks[0] if len(looks) == 1 else looks
 
 
-def own_generator(env: Any, *, but: tuple[type, ...] = ()) -> str:
-    """The name of a random generator in an environment other than its `np_random` and those of the types `but`, empty
+def own_generator(env: Any, *, but: Callable[[Any], Any] | None = None) -> str:
+    """The name of a random generator in an environment other than its `np_random` and those that `but` knows, empty
     where there is none: for instance "dice", or "box.0.dice" of the first entry of a list."""
     with environment_code():
         known = env.np_random
     inside = _inside(env, [known], left_out=frozenset({"spec"}))
     others = ((where, part) for where, part, _ in inside if isinstance(part, _GENERATORS) and part is not known)
-    return next((where for where, part in others if not isinstance(part, but)), "")
+    return next((where for where, part in others if not (but and but(part))), "")
 
 
 def _inside(value: Any, known: Sequence[Any], *, left_out: Set[str]) -> Iterator[tuple[str, Any, Any]]:

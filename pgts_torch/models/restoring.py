@@ -18,6 +18,7 @@ from pgts_torch.models.attributes import changing, own_generator
 from pgts_torch.models.masks import ActionMasks
 from pgts_torch.models.simulator import SimulatorModel
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, generator_state
+from pgts_torch.models.stand_ins import name_of
 from pgts_torch.models.steps import as_declared, bits, check_observation, check_rewards, number_of
 from pgts_torch.models.trial import Taken, Trial, environment_code, random_walk
 from pgts_torch.seeding import SharedGenerators, sample_keys, stream
@@ -251,7 +252,7 @@ def restored(walks: Sequence[Walk], others: Sequence[Walk]) -> str:
 def chance(setup: Setup, walks: Sequence[Walk]) -> str:
     """Whether steps use generators other than the one that the key seeds; and how often another key matters."""
     env = setup.fresh()
-    if name := own_generator(env, but=(np.random.Generator,) if setup.adapter.shares_generators else ()):
+    if name := own_generator(env, but=name_of if setup.adapter.shares_generators else None):
         raise MissingModel(f"attribute {name} is a generator of its own: draw from self.np_random only")
     differ = 0
     for walk in walks:

@@ -25,6 +25,8 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
+from pgts_torch.errors import MissingModel
+
 _MASK = 2**64 - 1
 _ODD = 0x9E3779B97F4A7C15
 
@@ -96,7 +98,8 @@ class SnapshotAdapter(ABC):
             rendering only; None: whatever there is.
         is_plain: whether all snapshots are made by `of_key`, of bytes of the same length that `set_state` copies and
             does not decode: then they can be saved, and loaded from files of others.
-        shares_generators: whether `seed` seeds all generators of numpy that an environment holds, not np_random alone.
+        shares_generators: whether `seed` seeds all generators of Python and numpy that an environment holds, not
+            np_random alone.
     """
 
     name: str
@@ -154,7 +157,13 @@ def reseed(env: Any, key: int) -> None:
     fifth of what `numpy.random.default_rng(key)` costs.
     """
     generator = env.np_random
-    if type(generator.bit_generator) is not np.random.PCG64:
+    bits = getattr(generator, "bit_generator", None)
+    if type(bits) is not np.random.PCG64:
+        if bits is None:
+            raise MissingModel(
+                f"np_random is a {type(generator).__name__}; super().reset(seed=seed) makes it one of numpy, whose "
+                "bits a search seeds: give a generator of another kind another name"
+            )
         generator = env.np_random = np.random.Generator(np.random.PCG64(0))
     high, low = _avalanche((key + _ODD) & _MASK), _avalanche((key + 2 * _ODD) & _MASK)
     generator.bit_generator.state = {

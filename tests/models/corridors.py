@@ -94,12 +94,16 @@ class Prophet(Corridor):
         self.position, self.fuel, self.np_random.bit_generator.state = state
 
 
+class Dice(random.Random):
+    """A generator of a class of its own, which may have any methods; so none of a search can stand for it."""
+
+
 class OwnGenerator(Corridor):
-    """It draws from a generator of its own, which is none of numpy's."""
+    """It draws from a generator of its own."""
 
     def __init__(self, slip: float = 0.3) -> None:
         super().__init__(slip)
-        self.dice = random.Random(0)
+        self.dice = Dice(0)
 
     def draw(self) -> float:
         return self.dice.random()
@@ -110,11 +114,11 @@ class Clairvoyant(Corridor):
 
     def __init__(self, slip: float = 0.3) -> None:
         super().__init__(slip)
-        self.box = [{"dice": random.Random(0)}]
+        self.box = [{"dice": Dice(0)}]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         if seed is not None:
-            self.box = [{"dice": random.Random(seed)}]
+            self.box = [{"dice": Dice(seed)}]
         return super().reset(seed=seed)
 
     def draw(self) -> float:

@@ -17,7 +17,7 @@ from pgts_torch.models import SimulatorModel, check_model
 from pgts_torch.models.adapters import same_content
 from pgts_torch.models.adapters_generic import PickledAttributes
 from pgts_torch.seeding import sample_keys, stream
-from tests.models.corridors import Bare, Corridor
+from tests.models.corridors import Bare, Corridor, Dice
 
 pytestmark = [
     pytest.mark.usefixtures("unchecked_shapes"),
@@ -172,11 +172,11 @@ class Elsewhere(Bare):
 
 
 class OwnRandom(Bare):
-    """It has a generator of its own that is not one of numpy's, which a restored state would foresee."""
+    """It has a generator of a class of its own, which a restored state would foresee."""
 
     def __init__(self):
         super().__init__()
-        self.dice = random.Random(0)
+        self.dice = Dice(0)
 
 
 @pytest.mark.parametrize(
@@ -207,9 +207,12 @@ class Thrown(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         if seed is not None:
-            self.box = Box(seed)
+            self.box = self.made(seed)
         self.face = self.box.throw()
         return self.face, {}
+
+    def made(self, seed):
+        return Box(seed)
 
     def step(self, action):
         self.face = self.box.throw() if action else self.face
@@ -226,6 +229,41 @@ class Holding(Thrown):
         self.box, self.face = state
 
 
+class Legacy(Thrown):
+    """Its np_random is one of legacy numpy."""
+
+    def made(self, seed):
+        self.np_random = np.random.RandomState(seed)
+        return self
+
+    def throw(self):
+        return self.np_random.randint(6)
+
+
+def test_np_random_that_is_no_generator_is_named():
+    with pytest.raises(MissingModel, match=r"np_random is a RandomState; super\(\)\.reset\(seed=seed\) makes it"):
+        PGTS(Legacy, **SHORT)
+
+
+class OfPython(Thrown):
+    """Dice of `random` and of legacy numpy, which its reset seeds, in lists and dictionaries; bits, and a method."""
+
+    def __init__(self):
+        self.dice = {"a": [random.Random(), np.random.RandomState()]}
+
+    def made(self, seed):
+        for dice in self.dice["a"]:
+            dice.seed(seed)
+        self.bits, self.choose = np.random.MT19937(seed), random.Random(seed).choice
+        return self
+
+    def throw(self):
+        one, two = self.dice["a"]
+        normal = int(100 * (one.gauss(0, 1) + two.normal()))  # both keep half of a pair of numbers
+        drawn = one.randrange(2**70) + two.randint(6) + int(np.random.Generator(self.bits).integers(6)) + normal
+        return (drawn + self.choose(range(6)) + one.randbytes(3)[1]) % 6
+
+
 class Doubled(gymnasium.Wrapper):
     """Pays more by a coin of its own."""
 
@@ -239,7 +277,7 @@ class Doubled(gymnasium.Wrapper):
 
 
 @pytest.mark.filterwarnings("ignore:.*a generator of its own. its", "ignore:.*wrappers that are part of the model")
-@pytest.mark.parametrize("make", [Thrown, Holding, lambda: Doubled(Thrown())], ids=["own", "held", "wrapped"])
+@pytest.mark.parametrize("make", [Thrown, Holding, OfPython, lambda: Doubled(Thrown())])
 def test_chance_of_generators_of_its_own_comes_from_the_keys_of_the_search(make):
     training = PGTS(make, **SHORT | {"depth": 0, "gamma": 0.5})
     model, env, twin = training.world.model, training.source.like(), training.source.like()
@@ -253,7 +291,7 @@ def test_chance_of_generators_of_its_own_comes_from_the_keys_of_the_search(make)
     assert torch.equal(first.next_state_N, again.next_state_N)
     assert torch.bincount(faces, minlength=6).tolist() == pytest.approx([500] * 6, abs=100)  # five deviations
     assert model.is_random(states_N[:2], torch.tensor([0, 1])).tolist() == [
-        make is not Thrown and make is not Holding,
+        env is not env.unwrapped,  # the wrapper draws for both actions
         True,
     ]
     for _ in range(20):  # nothing that the search did has moved the die of the environment
