@@ -63,9 +63,14 @@ def _register_environments() -> None:
                 vector_entry_point=f"pgts_torch.envs.entry_points:{entry_point}_vector",
                 max_episode_steps=max_episode_steps,
             )
-    for name in ("Catch", "minigrid", "atari"):
-        if (id := f"images/{name.title()}-v0") not in gymnasium.registry:
-            gymnasium.register(id, entry_point=f"pgts_torch.envs.images:{name}")
+    for id, entry_point in [
+        ("images/Catch-v0", "images:Catch"),
+        ("images/Minigrid-v0", "images:minigrid"),
+        ("images/Atari-v0", "images:atari"),
+        ("retraced/Env-v0", "retraced:retraced"),
+    ]:
+        if id not in gymnasium.registry:
+            gymnasium.register(id, entry_point=f"pgts_torch.envs.{entry_point}")
 
 
 _register_environments()

@@ -56,7 +56,10 @@ def describe(answer: dict[str, Any]) -> str:
     for model, names in answer["environments"].items():
         lines += textwrap.wrap(f"{model}: {', '.join(names)}", _WIDTH, initial_indent="  ", subsequent_indent="    ")
     lines += textwrap.wrap(
-        "others: a simulator, if they can be restored; pgts check-model ID says so", _WIDTH, initial_indent="  "
+        "others: a simulator, if they can be restored; pgts check-model ID says so. What cannot, in retraced/Env-v0",
+        _WIDTH,
+        initial_indent="  ",
+        subsequent_indent="    ",
     )
     lines += ["", "extras, pip install 'pgts_torch[EXTRA]':"]
     for extra, about in answer["extras"].items():

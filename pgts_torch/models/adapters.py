@@ -215,7 +215,10 @@ def adapter_for(env: gymnasium.Env) -> SnapshotAdapter:
 
 def not_restored(env: gymnasium.Env) -> str:
     """Why an environment without adapter has no model, and what to write."""
-    return f"{env_name(env)} cannot be restored: {methods_for(env.unwrapped)}"
+    return (
+        f"{env_name(env)} cannot be restored: {methods_for(env.unwrapped)}; or wrap it in pgts_torch.envs.Retraced "
+        "(retraced/Env-v0), which restores a state by a reset and all actions since then"
+    )
 
 
 def known_adapter(env: gymnasium.Env) -> SnapshotAdapter | None:

@@ -53,7 +53,7 @@ def spec_of(env_id: str) -> EnvSpec | None:
     return gymnasium.registry.get(name)
 
 
-def registered(env: str | EnvSpec, **kwargs: Any) -> Maker:
+def registered(env: str | EnvSpec, /, **kwargs: Any) -> Maker:
     return lambda **options: gymnasium.make(env, **(options | kwargs))
 
 

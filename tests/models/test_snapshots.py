@@ -266,7 +266,8 @@ def test_an_environment_without_an_adapter_is_told_what_to_implement():
         adapter_for(Bare())
     assert str(refusal.value) == (
         "Bare cannot be restored: give Bare the methods get_state(self), which returns all that step reads or changes "
-        "except self.np_random (bytes, or what pickles), and set_state(self, state), which puts it back"
+        "except self.np_random (bytes, or what pickles), and set_state(self, state), which puts it back; or wrap it in "
+        "pgts_torch.envs.Retraced (retraced/Env-v0), which restores a state by a reset and all actions since then"
     )
 
 
