@@ -38,9 +38,11 @@ TRIED: dict[str, tuple[str, dict[str, Any]]] = {
 
 _MASKS = textwrap.wrap(
     "An action that is not legal is never taken: not by the policy, a search, an imagined episode or an evaluation, "
-    "nor by `predict(observation, action_mask=...)`, which needs the mask. The environment says what is legal, by a "
-    'method `action_masks()` or by `info["action_mask"]` in each reset and step; in a searched state its simulator '
-    "does. A table says it by rewards of -inf, and then policies are tables, too; so does a `TensorModel` "
+    "nor by `predict(observation, action_mask=...)`, which needs the mask. The environment says what is legal, by the "
+    'first of these that it has: a method `action_masks()`; `info["action_mask"]` in each reset and step; '
+    '`observation["action_mask"]`, an entry of dictionaries with a value from 0 to 1 for each action (`Box` or '
+    "`MultiBinary`), of which `predict` takes it and which is no input of policies. In a searched state its simulator "
+    "says it. A table says it by rewards of -inf, and then policies are tables, too; so does a `TensorModel` "
     'with `forbids = True`. `action_masks="off"` ignores masks; `"auto"` ignores `info["action_mask"]` beside a '
     'table that says what each action does (Taxi), and `"on"` does not. '
     "Learned models (`counts`, `ensemble`, `latent`) refuse masks.",
@@ -125,7 +127,7 @@ def document() -> str:
         "",
         *[f"- `{name.partition(',')[0]}`{name[len(name.partition(',')[0]) :]}" for name in ENVIRONMENTS],
         "",
-        f"`info` is searched by each of: {', '.join(search for search in SEARCHES if search != 'none')}.",
+        f"`info` and `observation` are searched by each of: {', '.join(search for search in SEARCHES if search != 'none')}.",
         "",
         "## Environments that were tried",
         "",

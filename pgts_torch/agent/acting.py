@@ -81,6 +81,8 @@ class Acting:
         if action_mask is None and not self._world.shows_masks:
             return observation  # a table knows the legal actions of each state
         if action_mask is None:
+            action_mask = masks.given(observation, {})
+        if action_mask is None:
             raise PgtsError(
                 f"{self._name} has action masks: give the one of this observation, as {masks.what} has it, in "
                 "predict(observation, action_mask=...)"

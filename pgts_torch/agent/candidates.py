@@ -24,7 +24,7 @@ from pgts_torch.models.attributes import attributes, own_to_each
 from pgts_torch.models.classic import CLASSIC
 from pgts_torch.models.environments import EnvSource
 from pgts_torch.models.ids import Maker
-from pgts_torch.models.masks import ActionMasks, has_method, masks_of
+from pgts_torch.models.masks import KEY, ActionMasks, has_method, masks_of
 from pgts_torch.models.published import publishes_table, table_of
 from pgts_torch.models.restoring import Setup, check_alone, check_resets, check_snapshots
 from pgts_torch.models.simulator import SimulatorModel
@@ -52,7 +52,7 @@ class Request:
     fresh: Maker
     env: VectorEnv
     gamma: float
-    observed: Observed
+    options: Observed
     action_repeat: int
     device: torch.device
 
@@ -79,7 +79,7 @@ class Request:
     @cached_property
     def masks(self) -> ActionMasks | Literal["off"] | None:
         """How the action masks of the environments are read, where they are not those of a table."""
-        mode = self.observed.action_masks
+        mode = self.options.action_masks
         if mode == "off":
             return "off"
         # what an environment raises in reset is reported, with its seed, in training
@@ -91,10 +91,20 @@ class Request:
             masks = masks_of(self.env, self.fresh if self.source.makers else None)
             if masks is None and mode == "on":
                 raise PgtsError(
-                    f"action_masks is 'on'; {self.name} has neither a method action_masks() nor info['action_mask']"
+                    f"action_masks is 'on'; {self.name} has no method action_masks(), no info['action_mask'] and no "
+                    "observation['action_mask'] from 0 to 1 for each action"
                 )
             return masks
         return None
+
+    @cached_property
+    def observed(self) -> Observed:
+        """What is seen of observations: nothing of masks in them, unless that is all."""
+        space, masks, keys = self.env.single_observation_space, self.masks, self.options.observation_keys
+        if not isinstance(masks, ActionMasks) or masks.source != "observation" or not isinstance(space, spaces.Dict):
+            return self.options
+        others = [key for key in (space if keys is None else keys) if key != KEY]
+        return self.options.model_copy(update={"observation_keys": others}) if others else self.options
 
     @cached_property
     def own_to_each(self) -> frozenset[str]:
@@ -107,9 +117,9 @@ class Request:
 def table_world(request: Request) -> TabularWorld | None:
     """The world of a published table; None where there is none, or observations are not its states."""
     discrete = isinstance(request.env.single_observation_space, spaces.Discrete)
-    if request.observed.observation_keys is not None or not discrete or not publishes_table(request.envs.envs[0]):
+    if request.options.observation_keys is not None or not discrete or not publishes_table(request.envs.envs[0]):
         return None
-    if request.observed.action_masks == "on" or (request.observed.action_masks == "auto" and has_method(request.env)):
+    if request.options.action_masks == "on" or (request.options.action_masks == "auto" and has_method(request.env)):
         raise MissingModel(f"the table of {request.name} is not used: it says nothing of its action masks")
     if own := request.own_to_each & {"P", "mdp", "initial_state_distrib"}:
         raise MissingModel(
@@ -128,7 +138,7 @@ def table_world(request: Request) -> TabularWorld | None:
 
 def own_masks(mdp: TabularMDP) -> ActionMasks | None:
     """How our environments of a table say which actions it allows; None: all are."""
-    return None if mdp.outcomes.legal_NA.all() else ActionMasks.plain(mdp.num_actions, by_method=False)
+    return None if mdp.outcomes.legal_NA.all() else ActionMasks.plain(mdp.num_actions, source="info")
 
 
 def dynamics_world(request: Request) -> DynamicsWorld | None:
@@ -177,7 +187,7 @@ def simulator_world(request: Request, *, reasons: Sequence[str], layered: bool) 
     actions = [*tried] if own is None else [own(action) for action in tried]
     masks = inner = request.masks if isinstance(request.masks, ActionMasks) else None
     if inner is not None:
-        inner = ActionMasks.of_env(make(), actions, by_method=inner.by_method)
+        inner = ActionMasks.of_env(make(), actions, source=inner.source)
     setup = Setup(make, adapter, actions, request.random, alike=alike, masks=inner)
     try:
         seconds = check_snapshots(setup)

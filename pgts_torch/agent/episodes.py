@@ -91,7 +91,7 @@ class Episodes:
             self._stepping = int(b)
             self._each[b], info = self._env.envs[b].reset(seed=seeds[b])
             if self._masks is not None:
-                self._legal_BA[b] = self._masks.of(self._env.envs[b], info)
+                self._legal_BA[b] = self._masks.of(self._env.envs[b], self._each[b], info)
         self._stepping = None
         self._join()
 
@@ -108,7 +108,7 @@ class Episodes:
         def reads(b: int) -> None:
             self._stepping = b
 
-        legal_BA = self._masks.of_all(self._env, info, needed_B, reads)
+        legal_BA = self._masks.of_all(self._env, self._observation, info, needed_B, reads)
         self._stepping = None
         return legal_BA
 
@@ -157,7 +157,7 @@ class Episodes:
             self._stepping = int(b)
             self._each[b], reward, terminated, truncated_B[b], info = envs[b].step(action_B[b])
             if masks is not None:
-                self._legal_BA[b] = masks.after(envs[b], info, terminated, truncated_B[b])
+                self._legal_BA[b] = masks.after(envs[b], self._each[b], info, terminated, truncated_B[b])
             elif self._unmasked and KEY in info:
                 self._refuse_masks()
             reward_B[b] = number_of("reward", reward)

@@ -11,10 +11,9 @@ import itertools
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Literal
 
 import torch
-from gymnasium.vector import SyncVectorEnv, VectorEnv
+from gymnasium.vector import SyncVectorEnv
 
 from pgts_torch.agent.candidates import (
     Request,
@@ -32,7 +31,7 @@ from pgts_torch.envs.vector import TabularVectorEnv
 from pgts_torch.errors import Failed, MissingModel, PgtsError
 from pgts_torch.models.attributes import unlike
 from pgts_torch.models.environments import SLOW, EnvSource, close_environments, closing_made, kinds_of
-from pgts_torch.models.masks import ActionMasks
+from pgts_torch.models.masks import ActionMasks, entries_in
 from pgts_torch.models.snapshots import each_of
 from pgts_torch.models.squash import squash_of
 from pgts_torch.models.wrapper_trial import check_transforms
@@ -59,7 +58,7 @@ def make_world(
     plain: bool,
     action_repeat: int = 1,
     device: torch.device | str,
-    other: Callable[[VectorEnv, float, ActionMasks | Literal["off"] | None], ModelWorld] | None = None,
+    other: Callable[..., ModelWorld] | None = None,
 ) -> World:
     """Make the world of an environment, with the first model of table, dynamics and simulator that applies to it.
 
@@ -68,8 +67,8 @@ def make_world(
         gamma: discount; None: the environment's own (pgts/*), else 0.99.
         plain: whether no model is needed: then only a table is looked for, and without one the world has no model.
         action_repeat: how often an action is taken in one outcome of the model (`TensorModel`).
-        other: makes the world of environments, their discount and how their action masks are read (`World.masks`), with
-            a model that is learned or the caller's own.
+        other: makes the world of environments, with the `gamma`, `observed`, `masks` and `device` of `World`, and a
+            model that is learned or the caller's own.
 
     Raises:
         PgtsError: the environment does not exist, or no agent can act in it; or actions are to be repeated in a table,
@@ -87,9 +86,9 @@ def make_world(
                 return _chosen(request, plain=plain)
             check_memories(env)
             own = getattr(each_of(env)[0].unwrapped, "mdp", None)
-            return other(
-                env, float(own.outcomes.discount_NAK.max()) if isinstance(own, TabularMDP) else discount, request.masks
-            )
+            if isinstance(own, TabularMDP):
+                discount = float(own.outcomes.discount_NAK.max())
+            return other(env, gamma=discount, observed=request.observed, masks=request.masks, device=request.device)
     except BaseException:
         if source.given is None:
             close_environments(env)
@@ -116,7 +115,7 @@ def _first_model(request: Request, *, plain: bool) -> tuple[ModelWorld | None, l
     env, reasons = request.env, list[str]()
     if type(env) is TabularVectorEnv:
         check_single(request.action_repeat, "in a table")
-        if request.observed.action_masks == "on" and own_masks(env.mdp) is None:
+        if request.options.action_masks == "on" and own_masks(env.mdp) is None:
             raise PgtsError(f"action_masks is 'on'; the table of {request.name} allows all actions")
         return TabularWorld(
             env, env.mdp, observed=request.observed, masks=own_masks(env.mdp), device=request.device
@@ -149,7 +148,11 @@ def _first_model(request: Request, *, plain: bool) -> tuple[ModelWorld | None, l
 
 
 def _check_wrappers(request: Request) -> None:
-    """MissingModel unless the wrappers change nothing but single observations and rewards, without a memory."""
+    """MissingModel unless the wrappers change nothing but single observations and rewards, without a memory, and masks
+    are those of the environment inside."""
+    masks, base = request.masks, request.envs.envs[0].unwrapped
+    if isinstance(masks, ActionMasks) and masks.source == "observation" and not entries_in(base.observation_space):
+        raise MissingModel(f"{request.name} gets {masks.what} from a wrapper")
     if transforms_of(request.envs.envs[0]) != Transforms():
         with suppress(Failed):  # what an environment raises in a trial is reported, with step and seed, in training
             check_transforms(request.fresh(), tried_actions(request), request.random)

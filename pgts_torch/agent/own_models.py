@@ -137,8 +137,8 @@ def own_model(options: OwnModel) -> Model:
 
 def world_of(
     env: VectorEnv,
-    model: Model,
     *,
+    model: Model,
     gamma: float,
     observed: Observed,
     masks: ActionMasks | Literal["off"] | None,

@@ -2,7 +2,7 @@
 
 import copy
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -213,14 +213,13 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
     assert options.rollout.num_envs is not None
     num_envs, given = options.rollout.num_envs, ("gamma", "actions_per_dimension")
     model, device = arguments["model"], torch.device(arguments["device"])
-    shared = {"observed": options.env, "device": device}
-    other = None
+    other: Callable[..., ModelWorld] | None = None
     if isinstance(model, Model):
-        other = partial(_with_model, model, shared)
+        other = partial(world_of, model=model)
     elif isinstance(options.model, OwnModel):
-        other = partial(_with_model, own_model(options.model), shared)
+        other = partial(world_of, model=own_model(options.model))
     elif isinstance(options.model, LEARNED):
-        other = partial(_with_learned, options, shared, arguments["seed"])
+        other = partial(_with_learned, options, arguments["seed"])
     with SharedGenerators(arguments["seed"], "construction"):
         source = EnvSource.of(
             arguments["env"],
@@ -242,8 +241,8 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
             device=device,
             other=other,
         )
-    masks = world.masks
-    if isinstance(masks, ActionMasks) and not masks.by_method and options.env.action_masks == "auto" and ranks.leads:
+    masks, is_auto = world.masks, options.env.action_masks == "auto"
+    if isinstance(masks, ActionMasks) and masks.source != "method" and is_auto and ranks.leads:
         said = f"actions of {source.name} are masked by {masks.what}; action_masks 'off' ignores it"
         print(f"note: {said}", file=sys.stderr)
     if arguments["reward_range"] is not None:
@@ -251,13 +250,7 @@ def _environments(arguments: Mapping[str, Any], options: Training, ranks: Ranks)
     return source, world
 
 
-def _with_model(model: Model, shared: Mapping[str, Any], env: VectorEnv, gamma: float, masks: Any) -> ModelWorld:
-    return world_of(env, model, gamma=gamma, masks=masks, **shared)
-
-
-def _with_learned(
-    options: Training, shared: Mapping[str, Any], seed: int, env: VectorEnv, gamma: float, masks: Any
-) -> ModelWorld:
+def _with_learned(options: Training, seed: int, env: VectorEnv, *, masks: Any, **shared: Any) -> ModelWorld:
     assert isinstance(options.model, LEARNED)
     capacity = options.replay.capacity if isinstance(options.replay, UniformReplay) else UniformReplay().capacity
     repeat = options.search.action_repeat
@@ -267,6 +260,4 @@ def _with_learned(
             f"{masks.what}: take its simulator (model 'auto'), or depth 0 and the estimator 'sampled'; or set "
             "action_masks to 'off', where every action may be taken all the same"
         )
-    return learned_world(
-        env, options.model, gamma=gamma, action_repeat=repeat, capacity=capacity, seed=seed, masks=masks, **shared
-    )
+    return learned_world(env, options.model, action_repeat=repeat, capacity=capacity, seed=seed, masks=masks, **shared)

@@ -77,8 +77,8 @@ class PGTS(Trained):
             gaussian, for continuous actions: see there.
         observation_keys, image_channels: the entries of dictionary observations that are seen (default: all), and where
             images have their channels ("first", "last"; default: as their shape tells).
-        action_masks: whether actions that are not legal, by `action_masks()` of the environment or
-            `info["action_mask"]`, are never taken: "auto", "on" or "off" (`options.environment.Observed`).
+        action_masks: whether actions that are not legal, by `action_masks()` of the environment, `info["action_mask"]`
+            or `observation["action_mask"]`, are never taken: "auto", "on" or "off" (`options.environment.Observed`).
         reward_range: the lowest and the highest reward of a single step; a reward outside of it is an error. `stop_at`
             and an adaptive depth need it where the model has no largest reward (simulators).
         gamma: discount. Default: the environment's own (pgts/*), else 0.99. A VectorEnv of pgts/* has its own.

@@ -1,23 +1,27 @@
 """Action masks: which actions an environment allows in its present state, and how it says so.
 
-    action_masks()         a method of the environment, or of a wrapper around it: the convention of MaskablePPO
-    info["action_mask"]    in what reset and each step return: the convention of Gymnasium and PettingZoo
+    action_masks()                a method of the environment, or of a wrapper around it: the convention of MaskablePPO
+    info["action_mask"]           in what reset and each step return: the convention of Gymnasium and PettingZoo
+    observation["action_mask"]    an entry of dictionary observations with as many values from 0 to 1: the convention
+                                  of PettingZoo, RLlib and Shimmy. It is no part of what policies see
 
-A mask has an entry for each action, 1 (or True) where it is legal. Of MultiDiscrete actions it has an entry for each
-value of each number, those of one number after those of another, or is a tuple with an array for each number; an action
-is legal where all its values are. Masks are those of the layer that gives them: a wrapper outside of it which only
-transforms actions is looked through; one that does so in a `step` of its own gives masks of its own.
+The first of these that an environment has is read. A mask has an entry for each action, 1 (or True) where it is legal.
+Of MultiDiscrete actions it has an entry for each value of each number, those of one number after those of another, or
+is a tuple with an array for each number; an action is legal where all its values are. Masks are those of the layer that
+gives them: a wrapper outside of it which only transforms actions is looked through; one that does so in a `step` of its
+own gives masks of its own.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Self, final
+from typing import Any, Literal, NamedTuple, Self, final
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.spaces import Space
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 from jaxtyping import Bool, Int
 
@@ -28,6 +32,8 @@ from pgts_torch.models.snapshots import env_name
 from pgts_torch.models.wrappers import hook_of, wrappers_of
 
 METHOD, KEY = "action_masks", "action_mask"
+
+Source = Literal["method", "info", "observation"]
 
 _BYTES = np.dtype(np.int8), np.dtype(np.uint8)
 
@@ -45,17 +51,17 @@ class Masked(NamedTuple):
 class ActionMasks:
     """How the masks of an environment are read.
 
-    by_method: whether a method gives them; else `info`.
+    source: what gives them.
     num_entries: of a mask, as it is given.
     index_AJ: the entries that must all be 1 for an action to be legal, a row for each action.
     """
 
-    by_method: bool
+    source: Source
     num_entries: int
     index_AJ: Int[np.ndarray, "A J"]
 
     @classmethod
-    def of_env(cls, env: gymnasium.Env, actions: Sequence[Any], *, by_method: bool) -> Self:
+    def of_env(cls, env: gymnasium.Env, actions: Sequence[Any], *, source: Source) -> Self:
         """How the masks of such an environment are read.
 
         Args:
@@ -67,15 +73,15 @@ class ActionMasks:
         layers: list[Any] = [*wrappers_of(env), env.unwrapped]
         outside: list[Any] = []  # those outside of the layer whose actions the entries stand for
         for layer in layers[:-1]:
-            gives = callable(getattr(layer, METHOD, None)) if by_method else hook_of(layer) is None
+            gives = callable(getattr(layer, METHOD, None)) if source == "method" else hook_of(layer) is None
             if gives:
                 break
             outside.append(layer)
         inside = layers[len(outside) + 1 :]
-        if not by_method and any(hook_of(layer) == "action" for layer in inside[:-1]):
+        if source != "method" and any(hook_of(layer) == "action" for layer in inside[:-1]):
             around = type(layers[len(outside)]).__name__
             raise PgtsError(
-                f"{env_name(env)} has info[{KEY!r}], and a wrapper that changes actions within {around}, which may "
+                f"{env_name(env)} has {source}[{KEY!r}], and a wrapper that changes actions within {around}, which may "
                 f"change the mask: say what is legal by a method {METHOD}()"
             )
         space = layers[len(outside)].action_space
@@ -90,40 +96,41 @@ class ActionMasks:
         sizes = np.reshape(space.n if isinstance(space, spaces.Discrete) else space.nvec, -1)
         # an action as several numbers counted from 0, and where the entries of each number begin
         number_AJ = np.array([np.reshape(action - np.asarray(space.start), -1) for action in actions], dtype=np.int64)
-        return cls(by_method, int(sizes.sum()), number_AJ + (sizes.cumsum() - sizes))
+        return cls(source, int(sizes.sum()), number_AJ + (sizes.cumsum() - sizes))
 
     @classmethod
-    def plain(cls, num_actions: int, *, by_method: bool) -> Self:
+    def plain(cls, num_actions: int, *, source: Source) -> Self:
         """Masks with an entry for each action, in the order of their numbers."""
-        return cls(by_method, num_actions, np.arange(num_actions)[:, None])
+        return cls(source, num_actions, np.arange(num_actions)[:, None])
 
     @property
     def what(self) -> str:
         """The convention, in words."""
-        return f"{METHOD}()" if self.by_method else f"info[{KEY!r}]"
+        return f"{METHOD}()" if self.source == "method" else f"{self.source}[{KEY!r}]"
 
-    def of(self, env: gymnasium.Env, info: Mapping[str, Any]) -> Bool[np.ndarray, "A"]:
+    def of(self, env: gymnasium.Env, observation: Any, info: Mapping[str, Any]) -> Bool[np.ndarray, "A"]:
         """The legal actions in the present state of an environment.
 
         Raises:
             PgtsError: there is no mask, it is none, or no action is legal.
         """
-        return self.read(self.given(env, info))
+        return self.read(env.get_wrapper_attr(METHOD)() if self.source == "method" else self.given(observation, info))
 
-    def given(self, env: gymnasium.Env, info: Mapping[str, Any]) -> Any:
-        """The mask as it is given; None: there is none."""
-        return env.get_wrapper_attr(METHOD)() if self.by_method else info.get(KEY)
+    def given(self, observation: Any, info: Mapping[str, Any]) -> Any:
+        """The mask, or those of several environments, as no method gives it; None: there is none."""
+        given = observation if self.source == "observation" else info
+        return given.get(KEY) if isinstance(given, Mapping) else None
 
     def after(
-        self, env: gymnasium.Env, info: Mapping[str, Any], terminated: bool, truncated: bool
+        self, env: gymnasium.Env, observation: Any, info: Mapping[str, Any], terminated: bool, truncated: bool
     ) -> Bool[np.ndarray, "A"]:
         """The legal actions after a step: none after an end, where no mask is needed. After a truncation they are those
         of the mask, where there is one that allows any."""
         if not terminated:
             if not truncated:
-                return self.of(env, info)
+                return self.of(env, observation, info)
             with suppress(PgtsError):
-                return self.of(env, info)
+                return self.of(env, observation, info)
         return np.zeros(len(self.index_AJ), dtype=bool)
 
     def read(self, given: Any) -> Bool[np.ndarray, "A"]:
@@ -166,7 +173,12 @@ class ActionMasks:
         return array.astype(bool)
 
     def of_all(
-        self, env: VectorEnv, info: Mapping[str, Any], needed_B: Bool[np.ndarray, "B"], allowed: Callable[[int], None]
+        self,
+        env: VectorEnv,
+        observation: Any,
+        info: Mapping[str, Any],
+        needed_B: Bool[np.ndarray, "B"],
+        allowed: Callable[[int], None],
     ) -> Bool[np.ndarray, "B A"]:
         """The legal actions in environments that step together; none where they are not needed and not given.
 
@@ -176,7 +188,7 @@ class ActionMasks:
             allowed: called with the number of each environment before its mask is read.
         """
         legal_BA = np.zeros((env.num_envs, len(self.index_AJ)), dtype=bool)
-        given_B = self._given_by_all(env, info)
+        given_B = self._given_by_all(env, observation, info)
         for b, needed in enumerate(needed_B):
             allowed(b)
             if needed:
@@ -186,25 +198,49 @@ class ActionMasks:
                     legal_BA[b] = self.read(given_B[b])
         return legal_BA
 
-    def _given_by_all(self, env: VectorEnv, info: Mapping[str, Any]) -> Sequence[Any]:
-        if self.by_method:
+    def _given_by_all(self, env: VectorEnv, observation: Any, info: Mapping[str, Any]) -> Sequence[Any]:
+        if self.source == "method":
             own: Any = getattr(env, METHOD, None) or getattr(env.unwrapped, METHOD, None)
             return own() if own is not None else env.unwrapped.call(METHOD)  # type: ignore[attr-defined]
-        rows = info.get(KEY)
-        if rows is None:
+        if (rows := self.given(observation, info)) is None:
             return [None] * env.num_envs
-        is_there = info.get(f"_{KEY}", np.ones(env.num_envs, dtype=bool))
+        is_there = np.ones(env.num_envs, dtype=bool)
+        if self.source == "info":
+            is_there = info.get(f"_{KEY}", is_there)
         return [row if there else None for row, there in zip(rows, is_there, strict=True)]
 
 
 def masks_in(env: gymnasium.Env, actions: Sequence[Any], info: Mapping[str, Any]) -> ActionMasks | None:
-    """How the masks of an environment are read, by its methods and what a reset has returned; None: it has none.
+    """How the masks of an environment are read, by its methods, what a reset has returned and its observation space;
+    None: it has none.
 
     Args:
         actions: as in `ActionMasks.of_env`, which says what is raised.
     """
-    by_method = has_method(env)
-    return ActionMasks.of_env(env, actions, by_method=by_method) if by_method or KEY in info else None
+    if (source := _source(env, env.observation_space, info)) is None:
+        return None
+    return _fitting(ActionMasks.of_env(env, actions, source=source), env.observation_space)
+
+
+def _source(env: gymnasium.Env | VectorEnv, space: Space[Any], info: Mapping[str, Any]) -> Source | None:
+    if has_method(env):
+        return "method"
+    return "info" if KEY in info else "observation" if entries_in(space) else None
+
+
+def _fitting(masks: ActionMasks, space: Space[Any]) -> ActionMasks | None:
+    """None where the entry of observations has another size than masks have, and so is none."""
+    return None if masks.source == "observation" and entries_in(space) != masks.num_entries else masks
+
+
+def entries_in(space: Space[Any]) -> int:
+    """How many entries the masks in such observations have; 0: there are none."""
+    part = space.get(KEY) if isinstance(space, spaces.Dict) else None
+    is_mask = isinstance(part, spaces.MultiBinary) or (
+        isinstance(part, spaces.Box) and (part.low >= 0).all() and (part.high <= 1).all()
+    )
+    shape = (part.shape or ()) if part is not None and is_mask else ()
+    return shape[0] if len(shape) == 1 else 0
 
 
 def has_method(env: gymnasium.Env | VectorEnv) -> bool:
@@ -230,9 +266,11 @@ def masks_of(env: VectorEnv, make: Callable[[], gymnasium.Env] | None) -> Action
     base, space = env.unwrapped, env.single_action_space
     if isinstance(base, TabularVectorEnv | CartPoles) or not isinstance(space, spaces.Discrete):
         return None
-    by_method = has_method(env)
-    if not by_method and KEY not in (env if make is None else make()).reset(seed=0)[1]:
+    info = {} if has_method(env) else (env if make is None else make()).reset(seed=0)[1]
+    if (source := _source(env, env.single_observation_space, info)) is None:
         return None
     if isinstance(base, SyncVectorEnv):
-        return ActionMasks.of_env(base.envs[0], range(int(space.n)), by_method=by_method)
-    return ActionMasks.plain(int(space.n), by_method=by_method)
+        masks = ActionMasks.of_env(base.envs[0], range(int(space.n)), source=source)
+    else:
+        masks = ActionMasks.plain(int(space.n), source=source)
+    return _fitting(masks, env.single_observation_space)

@@ -220,7 +220,7 @@ def check_alone(setup: Setup) -> None:
         if taken.action is not None:
             check_rewards(number_of("reward", taken.reward))
         if setup.masks is not None and not taken.ends:
-            setup.masks.of(env, taken.info)
+            setup.masks.of(env, taken.observation, taken.info)
 
 
 def beside_snapshots(setup: Setup) -> None:

@@ -69,7 +69,8 @@ class Stepper:
         except BaseException as error:
             raise failure(f"{self.name} failed in reset with seed 0", error) from error
         # What makes the observation of the present state, where steps do not.
-        self._show = self.adapter.skip_observations(self.env)
+        shows_masks = masks is not None and masks.source == "observation"
+        self._show = None if shows_masks else self.adapter.skip_observations(self.env)
         self._names_discounts, self._gamma = names_discounts(self.env), gamma
         self._inner_space = self.env.observation_space
         # With discounts of its own a step might read the clock for these too.
@@ -129,7 +130,7 @@ class Stepper:
             reached = reached._replace(cut=True)
         seen = Seen(reached, self._kept(observation) if shown else None)
         if self._masks is not None:
-            seen.legal = self._legal(info, terminated, truncated)
+            seen.legal = self._legal(observation, info, terminated, truncated)
         return Step(total, discount, seen, random, reading if repeat == 1 else None)
 
     def follow_each(
@@ -175,7 +176,7 @@ class Stepper:
                 reached = reached._replace(cut=True)
             seen = Seen(reached, kept)
             if masks is not None:
-                seen.legal = self._legal(info, terminated, truncated)
+                seen.legal = self._legal(observation, info, terminated, truncated)
             add(Step(reward, 0.0 if terminated else gamma, seen, random, reading))
         if rows is not None and not np.isfinite(rows).all():
             first = int(np.flatnonzero(~np.isfinite(rows).reshape(len(rows), -1).all(1))[0])
@@ -202,10 +203,10 @@ class Stepper:
         now = Seen(reached, seen.observation, seen.like or seen, seen.legal)
         return Step(reward, step.discount, now, step.random, reading)
 
-    def _legal(self, info: Any, terminated: bool, truncated: bool) -> bytes | None:
+    def _legal(self, observation: Any, info: Any, terminated: bool, truncated: bool) -> bytes | None:
         """The legal actions after a step, as `Seen` has them."""
         assert self._masks is not None
-        legal_A = self._masks.after(self.made, info, terminated, truncated)
+        legal_A = self._masks.after(self.made, observation, info, terminated, truncated)
         return legal_A.tobytes() if legal_A.any() else None
 
     def _reward(self, paid: Any, rewards: RewardRange | None) -> float:

@@ -80,7 +80,7 @@ class Trial:
     def __init__(self, actions: Sequence[Any], masks: ActionMasks | None) -> None:
         self._actions, self.masks = actions, masks
         # By the id of an environment, because it may have no hash.
-        self._info = dict[int, tuple[weakref.ref[gymnasium.Env], Mapping[str, Any]]]()
+        self._latest = dict[int, tuple[weakref.ref[gymnasium.Env], Taken]]()
 
     def reset(self, env: gymnasium.Env, *, seed: int | None = None) -> Taken:
         return self._noted(env, reset(env, seed=seed))
@@ -90,20 +90,20 @@ class Trial:
 
     def forget(self, env: gymnasium.Env) -> None:
         """Its state is another one now."""
-        self._info.pop(id(env), None)
+        self._latest.pop(id(env), None)
 
     def _noted(self, env: gymnasium.Env, taken: Taken) -> Taken:
-        self._info[id(env)] = weakref.ref(env), taken.info
+        self._latest[id(env)] = weakref.ref(env), taken
         return taken
 
     def legal(self, env: gymnasium.Env) -> Bool[np.ndarray, "A"] | None:
         """The legal actions in the present state; None where that is not known."""
         if self.masks is None:
             return None
-        noted = self._info.get(id(env))
-        info = noted[1] if noted is not None and noted[0]() is env else {}
+        noted = self._latest.get(id(env))
+        latest = noted[1] if noted is not None and noted[0]() is env else Taken(None, None)
         with environment_code(), contextlib.suppress(PgtsError):
-            return self.masks.of(env, info)
+            return self.masks.of(env, latest.observation, latest.info)
         return None
 
     def _legal(self, env: gymnasium.Env, action: Any) -> Any:

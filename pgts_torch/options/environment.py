@@ -33,9 +33,9 @@ class Observed(Part):
     where that does not."""
 
     action_masks: Literal["auto", "on", "off"] = "auto"
-    """Whether actions are never taken that are not legal by action_masks() of the environment or info["action_mask"].
-    off: both are ignored. on: it must have one. auto: as on, where it has one; but info["action_mask"] is ignored
-    beside a table that says what every action does (Taxi)."""
+    """Whether actions are never taken that are not legal by the first of these that an environment has: action_masks(),
+    info["action_mask"], observation["action_mask"]. off: these are ignored. on: it must have one. auto: as on, where it
+    has one; but info["action_mask"] is ignored beside a table that says what every action does (Taxi)."""
 
 
 class Env(Observed, Made):

@@ -22,7 +22,7 @@ class Strict(gymnasium.Env):
     """Six states, seen as a number or as a vector. An illegal action is an error.
 
     Args:
-        says: how it says which actions are legal, "method", "info" or not at all.
+        says: how it says which actions are legal, "info", "observation" or not at all.
         bare: whether it is restored from its attributes, for it has no `get_state`.
     """
 
@@ -33,13 +33,18 @@ class Strict(gymnasium.Env):
         self.says, self.vector = says, vector
         if bare:
             self.get_state = None
-        self.observation_space = spaces.Box(0, 1, (6,), np.float32) if vector else spaces.Discrete(6)
+        seen: Any = spaces.Box(0, 1, (6,), np.float32) if vector else spaces.Discrete(6)
+        mask: Any = spaces.Box(0, 1, (3,), np.int8) if vector else spaces.MultiBinary(3)
+        self.observation_space = seen
+        if says == "observation":
+            self.observation_space = spaces.Dict({"observation": seen, "action_mask": mask})
 
     def _mask(self) -> np.ndarray:
         return LEGAL_SA[self.s] if self.s < 5 else np.zeros(3, np.int8)
 
     def _seen(self) -> Any:
-        return np.eye(6, dtype=np.float32)[self.s] if self.vector else self.s
+        seen = np.eye(6, dtype=np.float32)[self.s] if self.vector else self.s
+        return {"observation": seen, "action_mask": self._mask()} if self.says == "observation" else seen
 
     def _info(self) -> dict[str, Any]:
         return {"action_mask": self._mask()} if self.says == "info" else {}
@@ -109,12 +114,20 @@ ENVIRONMENTS: dict[str, Any] = {
     "info": lambda: Strict("info"),
     "info, observed as vectors": lambda: Strict("info", vector=True),
     "info, without get_state": lambda: Strict("info", bare=True),
+    "observation": lambda: Strict("observation"),
+    "observation, observed as vectors": lambda: Strict("observation", vector=True),
+    "observation, without get_state": lambda: Strict("observation", bare=True),
+    "observation, within an action wrapper": lambda: Turned(Strict("observation")),
     "action_masks(), of a wrapper": lambda: Masker(Strict("nothing")),
     "action_masks(), of a wrapper within an action wrapper": lambda: Turned(Masker(Strict("nothing"))),
     "info, within an action wrapper": lambda: Turned(Strict("info")),
     "action_masks(), within an action wrapper": lambda: Turned(ByMethod()),
 }
-MAKERS: dict[str, Any] = {"method": ByMethod, "info": lambda: Strict("info")}
+MAKERS: dict[str, Any] = {
+    "method": ByMethod,
+    "info": lambda: Strict("info"),
+    "observation": lambda: Strict("observation"),
+}
 SEARCHES: dict[str, dict[str, Any]] = {
     "none": {"depth": 0, "estimator": "sampled"},
     "m = 0": {"depth": 0},

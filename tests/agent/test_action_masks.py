@@ -65,7 +65,7 @@ def probs_by_state(model: PGTS) -> np.ndarray:
 @pytest.mark.filterwarnings("ignore:.*attributes are pickled")
 @pytest.mark.parametrize(
     ("env", "search"),
-    [*itertools.product(ENVIRONMENTS, ["expectimax", "none"]), *[("info", search) for search in SEARCHES]],
+    [*itertools.product(ENVIRONMENTS, ["expectimax", "none"]), *itertools.product(["info", "observation"], SEARCHES)],
 )
 def test_no_illegal_action_is_taken_in_training_evaluation_and_after_loading(env, search, tmp_path):
     make = lambda: TimeLimit(ENVIRONMENTS[env](), 6)  # noqa: E731
@@ -108,11 +108,11 @@ def test_a_critic_of_q_is_searched_with(search):
     ],
 )
 def test_episodes_that_go_on_imagined_ones_and_shared_networks_take_no_illegal_action(options):
-    for says in ("info", "method"):  # their environments raise an error after an illegal action
+    for says in MAKERS:  # their environments raise an error after an illegal action
         assert trained(MAKERS[says], **options).num_env_steps > 0
 
 
-@pytest.mark.parametrize("says", ["method", "info"])
+@pytest.mark.parametrize("says", MAKERS)
 def test_environments_that_are_given_as_a_vector_are_masked(says):
     envs = SyncVectorEnv([MAKERS[says]] * 2, autoreset_mode=AutoresetMode.DISABLED)
     assert trained(envs, num_envs=None, **SEARCHES["m = 0"]).num_env_steps > 0
@@ -138,7 +138,7 @@ def test_without_masks_the_same_training_fails():
 # Values
 
 
-@pytest.mark.parametrize("env", ["action_masks()", "info"])
+@pytest.mark.parametrize("env", ["action_masks()", "info", "observation"])
 def test_a_lookahead_has_the_values_of_the_mdp_without_illegal_actions(env):
     model = PGTS(ENVIRONMENTS[env], **(SHORT | {"depth": 40, "search": "expectimax"}))
     state_N = model.iterate().state_N
@@ -265,7 +265,7 @@ def test_masks_in_steps_alone_and_where_they_must_be_are_errors():
 
     with pytest.raises(Failed, match=r"info has 'action_mask' after a step and had none after a reset"):
         trained(Late, **SAMPLED, policy={"type": "mlp", "hidden": [8]}, seed=3)
-    with pytest.raises(PgtsError, match="action_masks is 'on'; CartPole-v1 has neither"):
+    with pytest.raises(PgtsError, match="action_masks is 'on'; CartPole-v1 has no method"):
         PGTS("CartPole-v1", action_masks="on", **SAMPLED)
 
 
@@ -311,7 +311,7 @@ def test_a_simulator_never_steps_an_illegal_action():
     _, info = env.reset(seed=0)
     masks = masks_in(env, range(3), info)
     model = SimulatorModel(lambda: Strict("info"), gamma=GAMMA, masks=masks)
-    state_N = torch.tensor([model.root(env, legal_A=masks.of(env, info))])
+    state_N = torch.tensor([model.root(env, legal_A=masks.of(env, env.s, info))])
     for _ in range(4):
         outcomes = model.outcomes(state_N)
         legal_NA = torch.tensor(model.legal(state_N))
@@ -319,6 +319,55 @@ def test_a_simulator_never_steps_an_illegal_action():
         state_N = outcomes.child_NAK[legal_NA & (outcomes.discount_NAK[..., 0] > 0)].unique()
     with pytest.raises(PgtsError, match=r"which actions are legal in state .* is not known"):
         model.outcomes(torch.tensor([model.number(model.snapshot(0)._replace(key=b"new"))]))
+
+
+def test_predict_takes_a_mask_from_its_observation():
+    model = trained(MAKERS["observation"], **SAMPLED)
+    assert model.world.observation_space == with_mask(spaces.Discrete(6), 3)  # masks are no input
+    masks, own = LEGAL_SA.astype(bool), {"observation": np.arange(5), "action_mask": LEGAL_SA}
+    assert masks[range(5), model.predict(own, deterministic=False)].all()
+    assert masks[3, int(model.predict({"observation": 3, "action_mask": LEGAL_SA[3]}))]
+    for given in (LEGAL_SA[4], LEGAL_SA[0]):  # what is given counts, whatever the observation says
+        assert given[int(model.predict({"observation": 3, "action_mask": LEGAL_SA[3]}, action_mask=given))]
+    with pytest.raises(PgtsError, match=r"has action masks: give the one of this observation, as observation\["):
+        model.predict({"observation": 3})
+
+
+class Shown(gymnasium.ObservationWrapper):
+    """Shows an entry beside what is observed.
+
+    Args:
+        space, entry: its space, and what it is of an environment and its observation.
+    """
+
+    def __init__(self, env, space, entry):
+        super().__init__(env)
+        self.observation_space = spaces.Dict({"observation": env.observation_space, "action_mask": space})
+        self.entry = entry
+
+    def observation(self, observation):
+        return {"observation": observation, "action_mask": self.entry(self.unwrapped, observation)}
+
+
+def test_an_entry_of_observations_that_is_no_mask_is_seen():
+    other = spaces.MultiBinary(4), spaces.Box(0, 2, (3,), np.int8), spaces.Discrete(3), spaces.MultiBinary((1, 3))
+    legal = LEGAL_SA.astype(bool)
+    for space, says in itertools.product(other, ("info", "method")):
+        inner = (lambda: Strict("info")) if says == "info" else ByMethod
+        make = lambda space=space, inner=inner: Shown(inner(), space, lambda *_: space.sample())  # noqa: E731
+        model = trained(make, **SAMPLED)
+        assert model.world.masks.source == says
+        assert isinstance(model.world.observation_space, spaces.Tuple)
+        seen = {"observation": 1, "action_mask": space.sample()}
+        assert legal[1, int(model.predict(seen, action_mask=legal[1]))]
+
+
+@pytest.mark.filterwarnings("ignore:.*has wrappers that are part of the model")
+@pytest.mark.parametrize("search", ["none", "expectimax"])
+def test_masks_that_a_wrapper_adds_to_observations_are_those_of_its_simulator_too(search):
+    for entry in (lambda env, _: env._mask(), lambda _, seen: LEGAL_SA[min(seen, 4)] * (seen < 5)):
+        make = lambda entry=entry: Shown(Strict("none"), spaces.MultiBinary(3), entry)  # noqa: E731
+        assert trained(make, **SEARCHES[search]).world.masks.source == "observation"
 
 
 def test_masks_of_several_numbers_have_an_entry_for_each_value():

@@ -1,7 +1,6 @@
 """Worlds: which one an environment gets, that states and observations belong together, and that all of them learn."""
 
 import functools
-import random
 from collections.abc import Callable
 
 import gymnasium
@@ -25,6 +24,7 @@ from pgts_torch.options.environment import Observed
 from pgts_torch.seeding import sample_keys, seed_sequence, stream
 from tests.agent import cells
 from tests.agent.helpers import same_bits
+from tests.models.corridors import Dice
 from tests.support import same_values
 
 KEYWORDS = {"num_envs": 3, "gamma": None, "observed": Observed(), "plain": False, "device": "cpu"}
@@ -64,13 +64,13 @@ class Parts(gymnasium.Env):
 
 
 class Unknown(gymnasium.Env):
-    """Nothing is known of it, and it has a generator that is not np_random."""
+    """Nothing is known of it, and it has a generator of a class of its own."""
 
     observation_space, action_space = spaces.Box(-1, 1, (2,)), spaces.Discrete(2)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.dice = random.Random(0)
+        self.dice = Dice(0)
         return np.zeros(2, np.float32), {}
 
     def step(self, action):
