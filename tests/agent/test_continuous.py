@@ -35,10 +35,21 @@ def test_vectors_are_squashed_into_the_bounds_and_into_none_where_there_are_none
     assert image.dtype == np.float32
 
 
+def test_no_action_is_beyond_a_bound_by_rounding_and_one_may_have_no_axes():
+    space = spaces.Box(-0.1, 0.3, (), np.float64)  # -0.1 + (0.3 - -0.1) is above 0.3
+    squash = Squash(space, "it")
+    actions = [squash.actions(np.array([end])) for end in (-50.0, 50.0)]
+    assert actions == [-0.1, 0.3]
+    assert all(action in space for action in actions)
+    assert squash.of_tensors(torch.tensor([[-50.0], [50.0]])).tolist() == [-0.1, 0.3]
+
+
 @pytest.mark.parametrize(
     ("space", "message"),
     [
         (spaces.Discrete(3), "needs continuous ones"),
+        (spaces.Box(-1, 1, (0,), np.float32), "which has no entries"),
+        (spaces.Box(-1e308, 1e308, (2,), np.float64), "entry 0 .* bounded by -1e.308 and 1e.308"),
         (spaces.Box(0, 255, (2,), np.uint8), "needs continuous ones"),
         (spaces.Box(np.array([0.0, -np.inf]), np.array([1.0, 1.0]), dtype=np.float64), "entry 1 .* on one side"),
     ],
@@ -244,6 +255,7 @@ REFUSALS = {
     "q": ("Pendulum-v1", {"critic": {"type": "network", "target": "q"}}, "a value for each numbered action"),
     "cmpo": ("Pendulum-v1", {"update": "cmpo"}, "update.type is cmpo, which needs policy.type mlp, cnn or module"),
     "mpo": ("Pendulum-v1", {"policy": "mlp", "update": "mpo"}, "needs policy.type gaussian"),
+    "one action": ("Pendulum-v1", {"actions": 1}, "actions is 1; it must be a whole number >= 2"),
     "actions": ("CartPole-v1", {"policy": "mlp", "actions": 4}, "actions is 4, which only policy.type gaussian uses"),
     "std": ("Pendulum-v1", {"policy": {"type": "gaussian", "std": 0.1, "min_std": 0.2}}, "must be below policy.std"),
     "numbered model": (
