@@ -13,6 +13,7 @@ from pydantic_core import PydanticCustomError
 INT64_MAX = 2**63 - 1
 
 Count = Annotated[int, Field(ge=1, le=INT64_MAX)]
+Several = Annotated[int, Field(ge=2, le=INT64_MAX)]
 Natural = Annotated[int, Field(ge=0, le=INT64_MAX)]
 Positive = Annotated[float, Field(gt=0)]
 AtLeastOne = Annotated[float, Field(ge=1)]

@@ -5,7 +5,17 @@ from typing import Any, Literal
 
 from pydantic import ValidationInfo
 
-from pgts_torch.options.fields import AtLeastOne, Count, Natural, NonNegative, Samples, UnitInterval, checks, conflict
+from pgts_torch.options.fields import (
+    AtLeastOne,
+    Count,
+    Natural,
+    NonNegative,
+    Samples,
+    Several,
+    UnitInterval,
+    checks,
+    conflict,
+)
 from pgts_torch.options.part import Part, null
 
 MAX_NODES = 10_000_000
@@ -191,8 +201,9 @@ class LookaheadOptions(Part):
     """How often the lookahead repeats each action, so that it looks as many times further ahead. Not in environments
     with numbered states."""
 
-    actions: Count | None = null(gaussian=16)
-    """The number of actions that are drawn in each state of the lookahead where the policy is gaussian."""
+    actions: Several | None = null(gaussian=16)
+    """The number of actions that are drawn in each state of the lookahead where the policy is gaussian; of a single one
+    nothing could be learned."""
 
     proposal_scale: AtLeastOne | None = null(gaussian=2.0)
     """The standard deviation of half of the drawn actions, in that of the policy, which draws the others."""

@@ -165,6 +165,7 @@ SAMPLES: dict[str, st.SearchStrategy[Any]] = {
     "a number > 0": st.floats(0, exclude_min=True, allow_infinity=False),
     "a whole number >= 0 or adaptive": st.just("adaptive") | st.integers(0, 2**63 - 1),
     "a whole number >= 1 or null": st.none() | st.integers(1, 2**63 - 1),
+    "a whole number >= 2 or null": st.none() | st.integers(2, 2**63 - 1),
     "a whole number >= 1 or all or null": st.sampled_from([None, "all", 3]),
     "true or false or null": st.none() | st.booleans(),
     "a whole number >= 1, or a list of such and null, one for each level": st.sampled_from([1, 7, [3, None]]),
