@@ -41,10 +41,13 @@ def made_by(what: str, make: str, *given: Any, **arguments: Any) -> Any:
         PgtsError: its module cannot be imported, or has no such name, or the call fails.
     """
     module, _, name = make.partition(":")
+    of = ""
     try:
-        return getattr(import_named(module), name)(*given, **arguments)
+        maker = getattr(import_named(module), name)
+        of = f" of {' and '.join(map(str, given))}" if given else ""
+        return maker(*given, **arguments)
     except BaseException as error:
-        raise failure(f"{what} {make}, which cannot be made", error) from error
+        raise failure(f"{what} {make}, which cannot be made{of}", error) from error
 
 
 def check_imports(source: object, env: Any, kwargs: Any, **parts: Any) -> None:

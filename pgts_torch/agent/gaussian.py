@@ -14,7 +14,7 @@ from pgts_torch.agent.policies import Policy
 from pgts_torch.agent.world import ModelWorld
 from pgts_torch.errors import NotFinite, PgtsError
 from pgts_torch.models.drawn_actions import Drawn
-from pgts_torch.options.policies import CNN, MLP, Gaussian
+from pgts_torch.options.policies import AutoLayers, Gaussian
 from pgts_torch.seeding import mix, stream, uniform
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -58,7 +58,8 @@ class GaussianPolicy(Policy):
         std = least + (first - least) softplus(y) / softplus(0)
 
     for the second half y of the network's outputs; the first half is the mean. At first mean and y are nearly 0,
-    because the head has gain 0.01. Densities and entropies are those of a before it is squashed.
+    because the head has gain 0.01 (a module of the caller's own without a head returns them as it likes). Densities and
+    entropies are those of a before it is squashed.
 
     num_actions: 0; there are no probabilities of numbered actions.
 
@@ -81,11 +82,11 @@ class GaussianPolicy(Policy):
         device: torch.device | str = "cpu",
     ) -> None:
         generator = stream(seed, "policy")
-        own = options.network
-        layers = own if isinstance(own, MLP | CNN) else default_network(observation_space)
-        trunk = make_trunk(layers, observation_space, generator=generator)
+        given, num_outputs = options.network, 2 * action_size
+        layers = default_network(observation_space) if isinstance(given, AutoLayers) else given
+        trunk = make_trunk(layers, observation_space, generator=generator, num_outputs=num_outputs)
         self.options, self.action_size = options, action_size
-        self.network = Network(trunk, 2 * action_size, gain=0.01, generator=generator).to(device)
+        self.network = Network(trunk, num_outputs, gain=0.01, generator=generator).to(device)
 
     def probs(self, observation_N: Tensor) -> Float[Tensor, "N A"]:
         """PgtsError: a density has no probabilities of actions."""
@@ -165,7 +166,7 @@ class MixtureProposal:
     The actions are drawn from the one and the other by turns, each as a low-discrepancy sequence (Kronecker's, by the
     generalised golden ratio) that is shifted at random in each state (Cranley and Patterson 1976): every action has the
     density that it is drawn from, and the first few, or all together, cover it more evenly than independent ones. For
-    odd K the shares are those of the numbers drawn. Importance weights pi / beta are at most 2 K / (K + 1).
+    odd K the shares are those of the numbers drawn. Importance weights pi / beta are at most 2.
 
     The policy is copied, so that a state has the same actions after an update, until they are drawn again.
 

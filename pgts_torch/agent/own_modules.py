@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -104,29 +104,41 @@ def own_layers(options: OwnModule, encoder: Encoder, num_outputs: int | None, ge
         module = made_by("the network is", options.make, *given, **options.arguments)
         if not isinstance(module, nn.Module):
             raise PgtsError(f"{name} made a {type(module).__name__}; it must be a torch.nn.Module")
-        if complex_ := [key for key, value in module.state_dict().items() if value.is_complex()]:
-            raise PgtsError(f"{name} has complex numbers in {complex_[0]}; networks compute in torch.float32")
+        _check_state(name, module)
         layers = OwnLayers(name, module, encoder.shapes, num_outputs)
         try:
             layers = layers.to("cpu", torch.float32).eval()
             layers(input_N)  # some layers make their weights in their first call
-            copy.deepcopy(layers)
+            layers.load_state_dict(copy.deepcopy(layers).state_dict())
         except (RuntimeError, TypeError, NotImplementedError, AttributeError) as error:
             raise failure(f"{name} cannot be moved to the CPU in float32 and copied", error) from error
-    _check_weights(layers)
+    _check_weights(layers, are_needed=not options.head)
     _check_function(layers, input_N)
     return layers
 
 
-def _check_weights(layers: OwnLayers) -> None:
-    """PgtsError unless all that is saved is finite, and some weights are trained."""
+def _check_state(name: str, module: nn.Module) -> None:
+    """PgtsError unless all that is saved is tensors of real numbers."""
+    for key, value in module.state_dict().items():
+        if not isinstance(value, Tensor):
+            raise PgtsError(f"{name} has the state {key}, a {type(value).__name__}; only tensors are saved")
+        if value.is_complex():
+            raise PgtsError(f"{name} has complex numbers in {key}; networks compute in torch.float32")
+
+
+def _check_weights(layers: OwnLayers, *, are_needed: bool) -> None:
+    """PgtsError unless all that is saved is finite, and, where they are needed, some weights are trained."""
     for name, value in layers.module.state_dict().items():
         if not bool(value.isfinite().all()):
             raise PgtsError(
                 f"{layers.name} holds {name}, which is not finite; register it as a buffer with persistent=False"
             )
-    if not any(weight.requires_grad for weight in layers.parameters()):
+    if are_needed and not _trained(layers):
         raise PgtsError(f"{layers.name} has no weights that are trained (nn.Parameter with requires_grad)")
+
+
+def _trained(layers: OwnLayers) -> list[nn.Parameter]:
+    return [weight for weight in layers.parameters() if weight.requires_grad]
 
 
 def _check_function(layers: OwnLayers, input_N: Float[Tensor, "N ..."]) -> None:
@@ -148,8 +160,7 @@ def _check_function(layers: OwnLayers, input_N: Float[Tensor, "N ..."]) -> None:
         )
     if not _same(output_ND, one_by_one_ND):
         raise PgtsError(f"{name} returns other values for a row where there are others beside it; rows must not mix")
-    if not output_ND.requires_grad:
-        raise PgtsError(f"{name} returns values from which no gradient reaches its weights")
+    _check_gradient(layers, output_ND)
     with SharedGenerators() as generators:
         trained_ND = layers.train()(input_N)
     layers.eval()
@@ -158,6 +169,38 @@ def _check_function(layers: OwnLayers, input_N: Float[Tensor, "N ..."]) -> None:
             f"{name} acts otherwise in training mode, as dropout and batch norm do; networks here have one mode, in "
             "which those would do nothing: take them out, or nn.LayerNorm or nn.GroupNorm in their place"
         )
+
+
+def _check_gradient(layers: OwnLayers, output_ND: Float[Tensor, "N D"]) -> None:
+    """PgtsError unless a gradient reaches the weights of the module, and none else."""
+    name, trained = layers.name, _trained(layers)
+    if output_ND.requires_grad and not set(_reached(output_ND)) <= set(trained):
+        raise PgtsError(
+            f"{name} computes with weights that are not its own, so that they would be neither trained nor saved: keep "
+            "layers in nn.ModuleList or nn.ModuleDict, tensors as nn.Parameter"
+        )
+    if not trained:
+        return
+    if not output_ND.requires_grad:
+        raise PgtsError(f"{name} returns values from which no gradient reaches its weights")
+    try:
+        found = torch.autograd.grad(output_ND.sum(), trained, allow_unused=True)
+    except RuntimeError as error:
+        raise failure(f"{name} has no gradient", error) from error
+    if any(gradient is not None and gradient.layout != torch.strided for gradient in found):
+        raise PgtsError(f"{name} has sparse gradients; they must be dense (nn.Embedding with sparse=False)")
+
+
+def _reached(output_ND: Float[Tensor, "N D"]) -> Iterator[Tensor]:
+    """The tensors that a gradient reaches."""
+    nodes, seen = [output_ND.grad_fn], set()
+    while nodes:
+        if (node := nodes.pop()) is None or node in seen:
+            continue
+        seen.add(node)
+        if (leaf := getattr(node, "variable", None)) is not None:
+            yield leaf
+        nodes += [before for before, _ in node.next_functions]
 
 
 def _same(one_ND: Tensor, other_ND: Tensor) -> bool:

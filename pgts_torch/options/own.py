@@ -45,8 +45,12 @@ class OwnModule(Own):
 
 
 def by_name(value: Any, kind: type[Own]) -> Any:
-    """Return the options of a part that is given as a class, a function or MODULE:NAME; anything else as it is."""
-    section = {"type": value} if isinstance(value, str) else value
-    if isinstance(section, Mapping) and isinstance(name := section.get("type"), str) and ":" in name:
-        return {**section, "type": kind.model_fields["type"].default, "make": name}
-    return {"type": kind.model_fields["type"].default, "make": value} if callable(value) else value
+    """Return the options of a part that is given as a class, a function or MODULE:NAME, or without a type; anything
+    else as it is."""
+    section = {"type": value} if isinstance(value, str) else {"make": value} if callable(value) else value
+    if not isinstance(section, Mapping):
+        return value
+    own = {"type": kind.model_fields["type"].default}
+    if isinstance(name := section.get("type"), str) and ":" in name:
+        return {**section, **own, "make": name}
+    return {**own, **section} if "make" in section else value

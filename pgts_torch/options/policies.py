@@ -1,12 +1,13 @@
 """Options of policies: tables and networks."""
 
 import math
-from typing import Any, Literal
+from functools import partial
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo
+from pydantic import BeforeValidator, Field, ValidationInfo
 
 from pgts_torch.options.fields import Natural, PerLayer, Positive, Share, Sizes, checks, conflict
-from pgts_torch.options.own import OwnModule
+from pgts_torch.options.own import OwnModule, by_name
 from pgts_torch.options.part import Part
 
 
@@ -167,8 +168,12 @@ class Gaussian(Part):
 
     type: Literal["gaussian"] = "gaussian"
 
-    network: AutoLayers | MLP | CNN | NatureCNN = Field(default=AutoLayers(), discriminator="type")
-    """The network that returns means and standard deviations."""
+    network: Annotated[
+        AutoLayers | MLP | CNN | NatureCNN | OwnModule,
+        Field(discriminator="type"),
+        BeforeValidator(partial(by_name, kind=OwnModule)),
+    ] = AutoLayers()
+    """The network that returns means, and as many numbers more of which standard deviations are made."""
 
     std: Positive = 1.0
     """The standard deviation at first, before tanh."""

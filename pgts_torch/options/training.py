@@ -92,10 +92,11 @@ class Training(Part):
             raise conflict(
                 f"critic.network.type is shared; policy.type {policy.type} is a table, which has no network to share"
             )
-        if network == "shared" and isinstance(policy, OwnModule) and not policy.head:
+        layers, key = (policy.network, "policy.network") if isinstance(policy, Gaussian) else (policy, "policy")
+        if network == "shared" and isinstance(layers, OwnModule) and not layers.head:
             raise conflict(
-                f"critic.network.type is shared; policy.make {policy.make} returns logits, which no critic can share: "
-                "set policy.head to true, where it returns features, or give the critic a network of its own"
+                f"critic.network.type is shared; {key}.make {layers.make} returns outputs, which no critic can share: "
+                f"set {key}.head to true, where it returns features, or give the critic a network of its own"
             )
         if isinstance(critic.network, CNN) and isinstance(policy, Table):
             raise conflict(

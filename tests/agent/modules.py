@@ -40,6 +40,14 @@ class Features(nn.Module):
         return self.norm(self.layer(x)).relu()
 
 
+class Frozen(Features):
+    """Features that stay as they are."""
+
+    def __init__(self, space: spaces.Box) -> None:
+        super().__init__(space)
+        self.requires_grad_(False)
+
+
 class Attention(nn.Module):
     """Attention between the two parts of an observation, an image and a one-hot row; some weights are tied, others
     frozen or not used."""
@@ -92,8 +100,12 @@ class Wrong(nn.Module):
         self.layer, self.how = nn.Linear(space.shape[0], num_outputs), how
         self.dropout, self.norm = nn.Dropout(0.5), nn.BatchNorm1d(num_outputs)
         self.register_buffer("calls", torch.zeros(()))
+        self.hidden = [nn.Linear(num_outputs, num_outputs)]
+        self.table = nn.Embedding(1, num_outputs, sparse=True)
         if how == "no weights":
             self.requires_grad_(False)
+        if how == "weights that lie on each other":
+            self.layer.weight = nn.Parameter(torch.zeros(1, 1).expand(num_outputs, space.shape[0]))
         if how == "complex weights":
             self.more = nn.Parameter(torch.zeros(2, dtype=torch.complex64))
         if how == "numbers on no device":
@@ -105,6 +117,12 @@ class Wrong(nn.Module):
         if how == "fails when made":
             raise RuntimeError("no such layer")
 
+    def get_extra_state(self) -> Any:
+        return {} if self.how == "state of its own" else torch.zeros(())
+
+    def set_extra_state(self, state: Any) -> None:
+        """It has none."""
+
     def forward(self, x: Tensor) -> Any:
         y = self.layer(x)
         if self.how == "changes its input":
@@ -112,6 +130,14 @@ class Wrong(nn.Module):
         if self.how == "counts calls":
             self.calls += 1
         return OUTPUTS.get(self.how, lambda _, y: y)(self, y)
+
+
+class NoGradient(torch.autograd.Function):
+    """It cannot be differentiated."""
+
+    @staticmethod
+    def forward(context: Any, y: Tensor) -> Tensor:
+        return y.clone()
 
 
 def _fails(module: Wrong, y: Tensor) -> Tensor:
@@ -136,6 +162,9 @@ OUTPUTS: dict[str, Any] = {
     "dropout": lambda module, y: module.dropout(y),
     "batch norm": lambda module, y: module.norm(y),
     "rows mix": lambda _, y: y - y.mean(0),
+    "layers in a list": lambda module, y: module.hidden[0](y),
+    "sparse gradients": lambda module, y: y + module.table(torch.zeros(len(y), dtype=torch.int64)),
+    "fails backward": lambda _, y: NoGradient.apply(y),
     "fails": _fails,
 }
 GENERATOR = torch.Generator()

@@ -23,7 +23,18 @@ from pgts_torch.errors import Failed, NotFinite, PgtsError
 from pgts_torch.options import MLP, Gradient, NetworkValues, OwnModule
 from pgts_torch.seeding import stream
 from tests.agent.kinds import CELLS, KINDS
-from tests.agent.modules import MAKES_NONE, Attention, Features, Forgetful, Plain, Recurrent, Wrong, deep, makes_nothing
+from tests.agent.modules import (
+    MAKES_NONE,
+    Attention,
+    Features,
+    Forgetful,
+    Frozen,
+    Plain,
+    Recurrent,
+    Wrong,
+    deep,
+    makes_nothing,
+)
 from tests.agent.test_spaces import seen
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -162,10 +173,15 @@ WRONG: dict[str, str] = {
     "counts calls": "changes its inputs or its buffers",
     "no weights": "has no weights that are trained",
     "complex weights": "has complex numbers in more",
+    "state of its own": "has the state _extra_state, a dict; only tensors are saved",
+    "weights that lie on each other": "cannot be moved .* and copied: RuntimeError: Error.* in loading",
+    "layers in a list": "weights that are not its own, .*neither trained nor saved: keep layers in nn.ModuleList",
+    "fails backward": "has no gradient: ",
+    "sparse gradients": "has sparse gradients; .*sparse=False",
     "infinite buffer": "holds mask, which is not finite; register it as a buffer with persistent=False",
     "numbers on no device": "cannot be moved to the CPU in float32 and copied: NotImplementedError",
     "cannot be copied": "cannot be moved .* and copied",
-    "fails when made": "which cannot be made: RuntimeError: no such layer",
+    "fails when made": r"which cannot be made of Box\(.*\(3,\), float32\) and 2: RuntimeError: no such layer",
     "fails": r"failed with inputs of the shape \(5, 3\): RuntimeError: mat1",
 }
 
@@ -233,6 +249,8 @@ def test_a_critic_of_ones_own_may_stand_beside_a_policy_of_ours():
     model = trained(policy="mlp", critic=deep)
     assert isinstance(model.options.policy, MLP)
     assert model.options.critic.network == OwnModule(make="tests.agent.modules:deep")
+    wide = PGTS("CartPole-v1", **SHORT, policy="mlp", critic={"make": Plain, "arguments": {"width": 5}})
+    assert wide.options.critic.network == OwnModule(make="tests.agent.modules:Plain", arguments={"width": 5})
     table = PGTS("pgts/Ladder-v0", policy="softmax", critic=deep, depth=1, num_envs=2).learn(200)
     assert table.options.policy.type == "softmax"
 
@@ -268,6 +286,37 @@ def test_features_are_shared_by_policy_and_critic_and_outputs_are_not():
     assert trained(policy=policy).critic.network.trunk is not model.policy.network.trunk
     with pytest.raises(PgtsError, match=r"critic.network.type is shared; policy.make .* set policy.head to true"):
         trained(policy=Plain, critic={"network": "shared"})
+
+
+def test_of_features_that_stay_as_they_are_the_last_layer_alone_is_trained():
+    model = PGTS("CartPole-v1", **SHORT, policy={"make": Frozen, "head": True})
+    before = model.policy.state_dict()
+    model.iterate()
+    after = model.policy.state_dict()
+    moved = {name for name in after if not torch.equal(before[name], after[name])}
+    assert moved == {"head.weight", "head.bias"}
+    with pytest.raises(PgtsError, match="has no weights that are trained"):
+        network("tests.agent.modules:Wrong", arguments={"how": "no weights"})
+
+
+@pytest.mark.parametrize(
+    "given", [deep, "tests.agent.modules:deep", {"type": "module", "make": Features, "head": True}]
+)
+def test_a_gaussian_policy_may_be_of_such_a_network(given, tmp_path):
+    options = SHORT | {"policy": {"type": "gaussian", "network": given}, "actions": 3}
+    model = PGTS("Pendulum-v1", **options)
+    model.iterate()
+    assert model.options.critic.network == model.options.policy.network
+    model.save(tmp_path / "model.pt")
+    with pytest.raises(PgtsError, match=r"names 'tests.agent.modules:.*' as its policy; that imports"):
+        PGTS.load(tmp_path / "model.pt")
+    loaded = PGTS.load(tmp_path / "model.pt", trust_imports=True)
+    for one in (model, loaded):
+        one.iterate()
+    assert same(model.policy.state_dict(), loaded.policy.state_dict())
+    if given is deep:
+        with pytest.raises(PgtsError, match=r"shared; policy.network.make .* set policy.network.head to true"):
+            PGTS("Pendulum-v1", **options, critic={"network": "shared"})
 
 
 def test_an_update_that_is_not_finite_is_taken_back():
