@@ -41,11 +41,12 @@ def _parts(text: str) -> tuple[str, float, float, float]:
 
 
 def _check(value: Any, *, least: float) -> Any:
-    """A number of at least `least`, or a schedule between two such over a positive number of steps; else ValueError."""
+    """A number of at least `least`, or a schedule over a positive number of steps from or to one, with 0 or more at its
+    other end; else ValueError."""
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise ValueError
-    _, first, last, steps = _parts(value) if isinstance(value, str) else ("", float(value), least, 1.0)
-    if not (least <= first < math.inf and 0 <= last < math.inf and 1 <= steps < math.inf):
+    _, first, last, steps = _parts(value) if isinstance(value, str) else ("", float(value), 0.0, 1.0)
+    if not (0 <= first < math.inf and 0 <= last < math.inf and least <= max(first, last) and 1 <= steps < math.inf):
         raise ValueError
     return value if isinstance(value, str) else first
 
@@ -61,4 +62,4 @@ def _scheduled(words: str, least: float) -> Any:
 
 ScheduledPositive = _scheduled("> 0", math.ulp(0.0))
 ScheduledNonNegative = _scheduled(">= 0", 0.0)
-"""A number, or a schedule, which may end at 0."""
+"""A number, or a schedule, which may begin or end at 0."""

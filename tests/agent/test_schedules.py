@@ -39,7 +39,9 @@ def test_values_on_paper():
     "text",
     [
         "linear(1, 2)",
-        "linear(0, 1, 10)",
+        "linear(0, 0, 10)",
+        "linear(-1, 1, 10)",
+        "linear(nan, 1, 5)",
         "step(1, 2, 3)",
         "linear(1, x, 10)",
         "linear(1, 0, 0)",
@@ -70,6 +72,16 @@ def test_each_update_of_networks_and_the_critic_follow_their_schedule(update):
         assert torch.equal(before, model.critic.network.weights[0]) == (seen[-1] >= 30)
     assert rates == [value_at(RATE, n) for n in seen]
     assert len(set(rates)) > 2
+
+
+def test_a_rate_may_begin_at_0():
+    model = PGTS("CartPole-v1", **SHORT, update=PPO(learning_rate="linear(0, 1e-3, 20)"))
+    states = [model.policy.state_dict()]
+    for _ in range(2):
+        model.iterate()
+        states.append(model.policy.state_dict())
+    assert same_bits(states[0], states[1])
+    assert not same_bits(states[1], states[2])
 
 
 def test_a_clip_range_that_changes_is_the_one_that_is_used():

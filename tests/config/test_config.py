@@ -404,6 +404,7 @@ PARTS = [
     ["--model.members", "2", "--replay.length", "3"],
     ["--policy.type", "gaussian", "--search.actions", "4"],
     ["--policy.type", "gaussian", "--policy.network.type", "mlp", "--update.type", "mpo"],
+    ["--policy.type", "gaussian", "--policy.network", "tests.agent.modules:Plain"],
     ["--policy", "{type: gaussian, network: cnn, std: 0.5}", "--update", "{kl: 0.2}"],
     [
         "--policy",
