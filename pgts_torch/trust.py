@@ -43,7 +43,10 @@ def made_by(what: str, make: str, *given: Any, **arguments: Any) -> Any:
     module, _, name = make.partition(":")
     of = ""
     try:
-        maker = getattr(import_named(module), name)
+        found = import_named(module)
+        if (maker := getattr(found, name, None)) is None:
+            where = getattr(found, "__file__", None)  # it need not be the file that is meant
+            raise AttributeError(f"module {module!r} ({where or 'a folder'}) has no attribute {name!r}")
         of = f" of {' and '.join(map(str, given))}" if given else ""
         return maker(*given, **arguments)
     except BaseException as error:

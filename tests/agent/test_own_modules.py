@@ -204,7 +204,7 @@ def test_a_module_that_is_no_function_of_each_row_alone_is_refused_by_its_name_a
         (functools.partial(Plain, width=3), "an object of the class partial"),
         (MAKES_NONE, "an object of the class partial"),
         (makes_nothing, "made a NoneType; it must be a torch.nn.Module"),
-        ("tests.agent.modules:Missing", "Missing, which cannot be made: AttributeError"),
+        ("tests.agent.modules:Missing", r"Missing, which .*AttributeError: .*modules\.py\) has no attribute 'Missing'"),
         ("no_such_module:Net", "no_such_module:Net, which cannot be made: ModuleNotFoundError"),
         (7, "7; it must be"),
     ],
