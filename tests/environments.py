@@ -127,7 +127,7 @@ def document() -> str:
         "",
         *[f"- `{name.partition(',')[0]}`{name[len(name.partition(',')[0]) :]}" for name in ENVIRONMENTS],
         "",
-        f"`info` and `observation` are searched by each of: {', '.join(search for search in SEARCHES if search != 'none')}.",
+        f"`info` and `observation` are searched by each of: {', '.join(each for each in SEARCHES if each != 'none')}.",
         "",
         "## Environments that were tried",
         "",

@@ -9,7 +9,7 @@ import torch
 from pgts_torch import PGTS
 from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
-from pgts_torch.options import CMPO, PPO, Gradient, Mirror, NetworkValues, Projected, SoftmaxGradient
+from pgts_torch.options import CMPO, MPO, PPO, Gradient, Mirror, NetworkValues, Projected, SoftmaxGradient
 from pgts_torch.options.schedules import at, value_at
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -74,8 +74,13 @@ def test_each_update_of_networks_and_the_critic_follow_their_schedule(update):
     assert len(set(rates)) > 2
 
 
-def test_a_rate_may_begin_at_0():
-    model = PGTS("CartPole-v1", **SHORT, update=PPO(learning_rate="linear(0, 1e-3, 20)"))
+PENDULUM = {"policy": "gaussian", "actions": 3, "depth": 0, "num_envs": 2, "horizon": SHORT["horizon"]}
+
+
+@pytest.mark.parametrize("kind", [PPO, MPO, Gradient])
+def test_a_rate_may_begin_at_0_also_that_of_a_gaussian_policy(kind):
+    env, options = ("CartPole-v1", SHORT) if kind is PPO else ("Pendulum-v1", PENDULUM)
+    model = PGTS(env, **options, update=kind(learning_rate="linear(0, 1e-3, 20)"))
     states = [model.policy.state_dict()]
     for _ in range(2):
         model.iterate()
