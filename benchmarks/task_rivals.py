@@ -27,7 +27,7 @@ def falling(first: float) -> Callable[[float], float]:
 
 
 WIDE = {"net_arch": [256, 256]}
-NUM_ENVS = {"CartPole-v1": 8, "Acrobot-v1": 16, "MountainCar-v0": 16}
+NUM_ENVS = {"CartPole-v1": 8, "Acrobot-v1": 16, "MountainCar-v0": 16, "LunarLander-v3": 16}
 NORMALIZED = ("Acrobot-v1", "MountainCar-v0", "MiniGrid-DoorKey-5x5-v0")
 TUNED: dict[tuple[str, str], dict[str, Any]] = {
     ("ppo", "CartPole-v1"): {
@@ -42,6 +42,14 @@ TUNED: dict[tuple[str, str], dict[str, Any]] = {
     ("ppo", "Acrobot-v1"): {"n_steps": 256, "gae_lambda": 0.94, "gamma": 0.99, "n_epochs": 4},
     ("ppo", "MountainCar-v0"): {"n_steps": 16, "gae_lambda": 0.98, "gamma": 0.99, "n_epochs": 4},
     ("ppo", "MiniGrid-DoorKey-5x5-v0"): {"n_steps": 128, "batch_size": 64, "learning_rate": 2.5e-4},
+    ("ppo", "LunarLander-v3"): {
+        "n_steps": 1024,
+        "gae_lambda": 0.98,
+        "gamma": 0.999,
+        "n_epochs": 4,
+        "ent_coef": 0.01,
+    },
+    ("a2c", "LunarLander-v3"): {"gamma": 0.995, "learning_rate": falling(8.3e-4), "ent_coef": 1e-5},
     ("dqn", "CartPole-v1"): {
         "learning_rate": 2.3e-3,
         "batch_size": 64,
@@ -76,8 +84,20 @@ TUNED: dict[tuple[str, str], dict[str, Any]] = {
         "exploration_final_eps": 0.07,
         "policy_kwargs": WIDE,
     },
+    ("dqn", "LunarLander-v3"): {
+        "learning_rate": 6.3e-4,
+        "batch_size": 128,
+        "buffer_size": 50_000,
+        "learning_starts": 0,
+        "gamma": 0.99,
+        "target_update_interval": 250,
+        "train_freq": 4,
+        "gradient_steps": -1,
+        "exploration_final_eps": 0.1,
+        "policy_kwargs": WIDE,
+    },
 }
-EXPLORATION_STEPS = {"CartPole-v1": 8_000, "Acrobot-v1": 12_000, "MountainCar-v0": 24_000}
+EXPLORATION_STEPS = {"CartPole-v1": 8_000, "Acrobot-v1": 12_000, "MountainCar-v0": 24_000, "LunarLander-v3": 12_000}
 """The zoo's exploration_fraction of its n_timesteps."""
 
 

@@ -50,6 +50,7 @@ TASKS = {
     "acrobot": Task(-100, 100_000, 20),
     "mountain_car": Task(-115, 120_000, 20),
     "door_key": Task(0.9, 100_000, 20),
+    "lunar_lander": Task(200, 100_000, 20, first_look=5_000),
 }
 
 
@@ -98,7 +99,8 @@ def run(key: Key) -> Record:
     watch, gamma = Watch(task), config.env.gamma
     assert gamma is not None, "these configurations say it"
     options = {"seed": key["seed"], "gamma": gamma, "watch": watch, "budget": task.budget}
-    task_rivals.train(key["method"], config.env.id, task.episodes, **options)
+    inside = config.env.kwargs.get("env", config.env.id)
+    task_rivals.train(key["method"], inside, task.episodes, **options)
     return watch.record()
 
 

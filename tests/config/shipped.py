@@ -10,7 +10,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 SHIPPED = {"_".join(path.relative_to(CONFIGS).with_suffix("").parts): path for path in sorted(CONFIGS.rglob("*.yaml"))}
 """By name: that of the file, after that of its folder."""
 
-_PACKAGES = {"minigrid": ("minigrid",), "atari": ("ale_py", "cv2"), "mujoco": ("mujoco",)}
+_PACKAGES = {"minigrid": ("minigrid",), "atari": ("ale_py", "cv2"), "mujoco": ("mujoco",), "lunar": ("Box2D",)}
 
 
 def skip_unless_installed(name: str) -> None:
