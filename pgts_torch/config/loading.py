@@ -30,6 +30,10 @@ class ConfigError(PgtsError):
         self.mistakes = tuple(mistakes)
         super().__init__("\n".join(self.mistakes))
 
+    def __reduce__(self) -> tuple[type["ConfigError"], tuple[Sequence[str]]]:
+        """Arrives whole where another process raised it."""
+        return ConfigError, (self.mistakes,)
+
 
 def load(path: str | Path | None = None, arguments: Sequence[str] = ()) -> Config:
     """Return the configuration: defaults, replaced by a file, replaced by command-line arguments.

@@ -96,8 +96,11 @@ class Schema:
 
     def hint(self, key: str, prefix: str = "") -> str:
         """Return the end of the message about an unknown key, with the key that was probably meant: one with the same
-        last part, or with a similar spelling."""
-        same_end = [known for known in self._keys if known.rpartition(".")[2] == key.rpartition(".")[2]]
+        last part, or with a similar spelling. The variant of a section is its `type`, or its `kind`."""
+        section, _, end = key.rpartition(".")
+        tags = [f"{section}.type", f"{section}.kind"] if end in ("type", "kind") else []
+        same_end = [known for known in self._keys if known in tags]
+        same_end = same_end or [known for known in self._keys if known.rpartition(".")[2] == end]
         close = difflib.get_close_matches(key, same_end or self._keys, n=1, cutoff=0.0 if same_end else 0.7)
         return f"; did you mean {prefix}{close[0]}?" if close else "; `pgts train --help` lists all keys"
 

@@ -1,6 +1,7 @@
 """What a configuration file or a flag is refused for, and in which words."""
 
 import math
+import pickle
 import random
 import time
 from collections.abc import Callable
@@ -155,6 +156,8 @@ def test_a_missing_file_and_a_folder_are_one_clear_line(tmp_path: Path) -> None:
         ("serach: {depth: 4}", "serach is unknown; did you mean search?"),
         ("search: {depht: 4}", "search.depht is unknown; did you mean search.depth?"),
         ("depth: 4", "depth is unknown; did you mean search.depth?"),
+        ("search: {type: sampled}", "search.type is unknown; did you mean search.kind?"),
+        ("policy: {kind: mlp}", "policy.kind is unknown; did you mean policy.type?"),
         ("<<: {seed: 1}", "<< is unknown; `pgts train --help` lists all keys"),
         ("seed: 1\nseed: 2", "the key seed is given twice"),
         ("env: {kwargs: {n: 1, n: 2}}", "the key env.kwargs.n is given twice"),
@@ -388,3 +391,11 @@ def test_numbers_that_are_not_finite_are_refused_wherever_they_stand() -> None:
             with pytest.raises(ConfigError):
                 load(None, [f"--{key}", value])
     assert math.isfinite(load(None, ["--update.step_size", "1e300"]).update.step_size)
+
+
+def test_mistakes_arrive_whole_from_another_process():
+    with pytest.raises(ConfigError) as raised:
+        load(arguments=["--sed", "1", "--serach", "2"])
+    arrived = pickle.loads(pickle.dumps(raised.value))
+    assert arrived.mistakes == raised.value.mistakes
+    assert str(arrived) == str(raised.value)
