@@ -110,7 +110,7 @@ def find(
 
 def names_modules(config: Config) -> bool:
     """Whether a configuration names modules that are imported."""
-    parts = config.model, config.policy, getattr(config.critic, "network", None)
+    parts = config.model, config.policy, *(getattr(part, "network", None) for part in (config.policy, config.critic))
     return ":" in config.env.id or any(isinstance(part, Own) for part in parts)
 
 

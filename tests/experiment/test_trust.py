@@ -10,6 +10,7 @@ from pgts_torch import PGTS
 from pgts_torch.cli.main import main
 from pgts_torch.config import load
 from pgts_torch.errors import PgtsError
+from pgts_torch.experiment.resume import names_modules
 from pgts_torch.experiment.run import build
 from pgts_torch.options import OwnModel
 from pgts_torch.trust import check_imports
@@ -201,3 +202,9 @@ def test_a_module_in_the_working_folder_is_found_and_hides_no_installed_one(here
     finally:
         gymnasium.registry.pop("Pond-v0", None)
         sys.modules.pop("game_of_mine", None)
+
+
+@pytest.mark.parametrize("flags", ["--policy a:Net", "--policy.type gaussian --policy.network a:Net", "--critic a:Net"])
+def test_the_command_that_resumes_a_run_with_a_network_of_ones_own_trusts_it(flags):
+    assert names_modules(load(None, flags.split()))
+    assert not names_modules(load(None, ["--policy.type", "gaussian", "--policy.network.type", "mlp"]))
