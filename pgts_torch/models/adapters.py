@@ -9,15 +9,16 @@ import struct
 import sys
 import types
 from collections import deque
+from collections.abc import Iterator
 from typing import Any, final
 
 import gymnasium
 import numpy as np
+import torch
 
 from pgts_torch.errors import MissingModel
 from pgts_torch.models.adapters_extra import Ale, Mujoco
 from pgts_torch.models.adapters_minigrid import MiniGrid
-from pgts_torch.models.attributes import held_by
 from pgts_torch.models.provenance import overridden
 from pgts_torch.models.snapshots import Snapshot, SnapshotAdapter, env_name, of_key
 
@@ -53,19 +54,21 @@ def _content(pickled: bytes) -> tuple[Any] | None:
         return None
 
 
+_ARRAYS = np.ndarray, np.generic, torch.Tensor
 _SEQUENCES = list, tuple, deque
+_PLAIN = frozenset({type(None), bool, int, float, complex, str, bytes, bytearray, range, set, frozenset})
 
 
 def same_content(one: Any, other: Any) -> bool:
     """Whether two values hold the same, however numbers are typed. Objects may lead back to themselves, as cars to a
-    road with all cars: a pair that was met before is not looked at again. What cannot be looked into, as an iterator,
-    is the same where its class is."""
+    road with all cars: a pair that was met before is not looked at again. Objects are the same where what a pickle has
+    of them is, whatever their class calls equal; iterators, and what does not pickle, where their class is."""
     met, left = dict[tuple[int, int], Any](), [(one, other)]
     while left:
         first, second = left.pop()
-        if (pair := (id(first), id(second))) in met:
+        if first is second or (pair := (id(first), id(second))) in met:
             continue
-        if isinstance(first, np.ndarray | np.generic) or isinstance(second, np.ndarray | np.generic):
+        if isinstance(first, _ARRAYS) or isinstance(second, _ARRAYS):
             first, second = np.asarray(first), np.asarray(second)
             if first.shape != second.shape:
                 return False
@@ -85,12 +88,21 @@ def same_content(one: Any, other: Any) -> bool:
             left += zip(first, second, strict=True)
         elif isinstance(first, types.MethodType) and isinstance(second, types.MethodType):
             left += [(first.__func__, second.__func__), (first.__self__, second.__self__)]
-        elif type(first) is type(second) and type(first).__eq__ is object.__eq__:
+        elif type(first) is type(second) and type(first) not in _PLAIN:
             met[pair] = first, second
-            left.append((held_by(first), held_by(second)))
+            left.append((_reduced(first), _reduced(second)))
         elif not (first == second or (first != first and second != second)):
             return False
     return True
+
+
+def _reduced(value: Any) -> list[Any]:
+    """What a pickle has of an object, for instance its class and its attributes; empty where it is not compared."""
+    try:
+        reduced = () if isinstance(value, Iterator) else value.__reduce_ex__(5)
+    except Exception:  # which errors an object raises that does not pickle is its own affair
+        return []
+    return [list(part) if isinstance(part, Iterator) else part for part in reduced]
 
 
 @final

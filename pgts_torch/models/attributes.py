@@ -267,7 +267,7 @@ def _parts_of(value: Any, left_out: Set[str]) -> list[tuple[Any, Any]]:
         return [("__func__", value.__func__), ("__self__", value.__self__)]
     if isinstance(value, functools.partial):
         return [("func", value.func), ("args", value.args), ("keywords", value.keywords)]
-    if (named := held_by(value)) or isinstance(value, spaces.Space):
+    if (named := _held_by(value)) or isinstance(value, spaces.Space):
         return [(name, part) for name, part in named.items() if name not in left_out]
     try:
         return [("pickle", pickle.dumps(value))]
@@ -275,7 +275,7 @@ def _parts_of(value: Any, left_out: Set[str]) -> list[tuple[Any, Any]]:
         return []
 
 
-def held_by(value: Any) -> dict[str, Any]:
+def _held_by(value: Any) -> dict[str, Any]:
     """The attributes of an object, also those in slots."""
     slots = [name for cls in type(value).__mro__ for name in getattr(cls, "__slots__", ()) if hasattr(value, name)]
     return {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})

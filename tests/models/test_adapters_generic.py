@@ -1,9 +1,13 @@
 """Environments without get_state: their attributes are pickled, where that is enough and as long as it is."""
 
+import collections
+import copy
+import dataclasses
 import functools
 import itertools
 import random
 import threading
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -133,6 +137,38 @@ def test_methods_slots_and_iterators_are_compared():
     assert not same_content(Slotted(1).show, Slotted(2).show)
     assert same_content(itertools.cycle([1, 2]), itertools.cycle([1, 2]))
     assert not same_content(itertools.cycle([1, 2]), iter([1, 2]))
+
+
+@dataclasses.dataclass
+class Level:
+    """As dataclasses are, it is equal to another if a tuple of its fields is, of which arrays cannot be asked that."""
+
+    cells: Any
+    name: str = "first"
+
+
+class Suited:
+    """It calls equal what is not the same."""
+
+    def __init__(self, rank, suit):
+        self.rank, self.suit = rank, suit
+
+    def __eq__(self, other):
+        return self.rank == other.rank
+
+    __hash__ = None
+
+
+def test_objects_with_an_equality_of_their_own_are_looked_into():
+    ones = Level(np.ones(3)), Level(torch.ones(3)), Level({"board": [np.ones(2), None, 1.5]})
+    for level in ones:
+        assert same_content([level], [copy.deepcopy(level)])
+        assert not same_content([level], [Level(np.zeros(3))])
+        assert not same_content([level], [Level(level.cells, "second")])
+    assert same_content(Suited(1, "hearts"), Suited(1, "hearts"))
+    assert not same_content(Suited(1, "hearts"), Suited(1, "spades"))
+    assert not same_content(collections.OrderedDict(a=1), collections.OrderedDict(a=2))
+    assert not same_content({"a": {1, 2}}, {"a": {1, 3}})
 
 
 class Bound(Bare):
