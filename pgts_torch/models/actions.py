@@ -19,13 +19,14 @@ MOST_ACTIONS = 10_000
 
 
 def all_actions(space: spaces.Space) -> Iterator[Any]:
-    """Every action of a Discrete, MultiDiscrete or MultiBinary space.
+    """Every action of a Discrete, MultiDiscrete or MultiBinary space. Numbers are those of numpy, as a VectorEnv hands
+    them to its environments: of numbers of Python a step may make other bits.
 
     Raises:
         PgtsError: the space is another one.
     """
     if isinstance(space, spaces.Discrete):
-        return (int(space.start) + a for a in range(int(space.n)))
+        return iter(np.arange(space.start, space.start + space.n, dtype=np.int64))
     if isinstance(space, spaces.MultiDiscrete):
         shape, start = space.nvec.shape, space.start
         each = itertools.product(*[range(n) for n in space.nvec.reshape(-1)])

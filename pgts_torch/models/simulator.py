@@ -246,7 +246,7 @@ class SimulatorModel(SnapshotModel, EnumeratingModel, SamplingModel):
             raise self._failure(state, action, error, f" with key {key}") from error
 
     def _failure(self, state: int, action: int, error: BaseException, key: str = "") -> BaseException:
-        where = f"{self.name} failed in state {state} under action {action} ({self.actions[action]!r}){key}"
+        where = f"{self.name} failed in state {state} under action {action} ({self.actions[action]}){key}"
         return failure(where, error)
 
     def _known(self, state: int, repeat: int) -> Mapping[int, Step]:

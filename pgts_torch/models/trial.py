@@ -181,7 +181,7 @@ def compare(
     try:
         for taken in random_walk(
             env,
-            range(model.num_actions) if actions is None else actions,
+            [*np.arange(model.num_actions)] if actions is None else actions,
             generator,
             steps=_COMPARED_STEPS,
             longest=_LONGEST_EPISODE,

@@ -48,7 +48,7 @@ def raising(error: Any, where: str) -> type[Clock]:
 ERRORS: dict[Any, str] = {
     SystemExit(3): "SystemExit: 3",
     Leaving("over"): "Leaving: over",
-    GeneratorExit(): "GeneratorExit: ",
+    GeneratorExit(): r"GeneratorExit: raise error \(test_stubborn_envs\.py, line \d+\)",
     Speechless(): r"Speechless, whose text cannot be printed \(RuntimeError\)",
 }
 
@@ -188,6 +188,34 @@ def test_numbers_that_a_space_can_hold_are_no_other_dtype():
         same = type("Same", (Restored,), {"show": staticmethod(lambda o, dtype=dtype: o.astype(dtype))})
         ours, clean = make(same, **LOOKAHEAD), make(Clock, **LOOKAHEAD)
         assert torch.equal(ours.iterate().look.q_BA, clean.iterate().look.q_BA)
+
+
+class Scaled(Clock):
+    """Its bits depend on whether an action is a number of Python or of numpy, as by the rules of NEP 50."""
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, float(np.float32(reward) + action.astype(np.int64) * 0.1), *rest
+
+
+@pytest.mark.parametrize("search", ["expectimax", {"type": "mcts", "simulations": 4}])
+def test_a_lookahead_takes_the_actions_that_its_environment_is_given(search):
+    assert make(Scaled, **LOOKAHEAD, search=search).iterate().model_calls > 0
+    assert check_model(Scaled).usable
+
+
+class Unequal(spaces.Space):
+    """As spaces of one's own are, equal to itself alone."""
+
+    def __init__(self):
+        super().__init__((), str)
+
+
+@pytest.mark.parametrize("name", ["observation_space", "action_space"])
+def test_a_space_that_is_equal_to_no_other_one_is_refused(name):
+    env = type("Own", (Clock,), {name: property(lambda self: Unequal())})
+    with pytest.raises(PgtsError, match=rf"Own has the {name} Unequal, which is equal to no other one: make it one of"):
+        make(env)
 
 
 class Parts(Restored):
