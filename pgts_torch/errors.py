@@ -4,6 +4,7 @@ import sys
 import traceback
 import warnings
 from numbers import Integral
+from pathlib import Path
 
 LOST = 75
 """The exit code of a training whose process hangs, or has lost another one: the same command goes on."""
@@ -69,11 +70,14 @@ def warn(text: str) -> None:
 
 
 def text_of(error: BaseException) -> str:
-    """The message of a PgtsError; for other errors also the name of their class. Some have no printable text."""
+    """The message of a PgtsError; for other errors also the name of their class. Some have no printable text, and of
+    those without any, as of an assertion, the line is given that raised it."""
     if isinstance(error, PgtsError):
         return str(error)
     try:
-        return f"{type(error).__name__}: {error}"
+        if not (text := str(error)) and (raised := traceback.extract_tb(error.__traceback__)):
+            text = f"{raised[-1].line} ({Path(raised[-1].filename).name}, line {raised[-1].lineno})"
+        return f"{type(error).__name__}: {text}"
     except Exception as unprintable:
         return f"{type(error).__name__}, whose text cannot be printed ({type(unprintable).__name__})"
 

@@ -196,8 +196,13 @@ class EnvSource:
         if not isinstance(made, gymnasium.Env):
             raise PgtsError(f"{self.name} gave {made!r}; it must be a Gymnasium environment")
         for name in ("observation_space", "action_space"):
-            if not isinstance(getattr(made, name, None), spaces.Space):
+            if not isinstance(space := getattr(made, name, None), spaces.Space):
                 raise PgtsError(f"{self.name} has no {name}; an environment sets it to one of gymnasium.spaces")
+            if type(space).__eq__ is object.__eq__:  # not even to that of the next environment
+                raise PgtsError(
+                    f"{self.name} has the {name} {type(space).__name__}, which is equal to no other one: make it one "
+                    "of gymnasium.spaces, for instance by a wrapper"
+                )
         self._check_new(made)
         return made
 

@@ -66,9 +66,12 @@ def making(name: str) -> Iterator[None]:
         raise
     except gymnasium.error.DependencyNotInstalled as error:
         raise PgtsError(f"{name} needs something that is not installed: {error}") from error
-    except gymnasium.error.NameNotFound as error:
-        way_out = f" MODULE:{name} imports the module that registers it" * (":" not in name)
-        raise PgtsError(f"{name} cannot be made: {error}{way_out}") from error
+    except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound) as error:
+        own, colon, _ = name.rpartition(":")
+        way_out = f"MODULE:{name} imports the module that registers it"
+        if colon:
+            way_out = f"Importing {own} does not register it: name a module that does, or MODULE:CLASS"
+        raise PgtsError(f"{name} cannot be made: {error} {way_out}") from error
     except (gymnasium.error.Error, ImportError, LookupError, TypeError) as error:
         raise PgtsError(f"{name} cannot be made: {error}") from error
     except BaseException as error:

@@ -41,7 +41,8 @@ def number_of(what: str, value: Any) -> float:
     except (ValueError, TypeError):
         array = np.array(None)
     if array.size != 1:
-        raise PgtsError(f"the {what} has shape {array.shape}; it must be one number")
+        way_out = ", which a gymnasium.RewardWrapper can make of several" * (what == "reward" and array.size > 1)
+        raise PgtsError(f"the {what} has shape {array.shape}; it must be one number{way_out}")
     (single,) = array.reshape(-1).tolist()
     if not isinstance(single, Real | Decimal):
         raise PgtsError(f"the {what} is {value!r}; it must be one number")

@@ -128,8 +128,14 @@ def test_an_id_that_names_its_module_is_imported_from_there(tmp_path, monkeypatc
         PGTS("nothing_of_mine:Field-v0")
     with pytest.raises(PgtsError, match=r"doesn't exist\. MODULE:Meadow-v0 imports the module that registers it$"):
         PGTS("Meadow-v0")
-    with pytest.raises(PgtsError, match=r"Environment `Meadow` doesn't exist\.$"):
+    with pytest.raises(
+        PgtsError, match=r"doesn't exist\. Importing fields_of_mine does not register it: name a module"
+    ):
         PGTS("fields_of_mine:Meadow-v0")
+    with pytest.raises(
+        PgtsError, match=r"proper package for Meadows\? MODULE:Meadows/Green-v0 imports the module that"
+    ):
+        PGTS("Meadows/Green-v0")
 
 
 def test_continuous_actions_need_no_model_where_advantages_are_sampled():

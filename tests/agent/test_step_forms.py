@@ -110,7 +110,9 @@ def test_a_reward_in_any_form_of_one_number_is_that_number(form):
 
 
 BAD_FORMS = {
-    r"the reward has shape \(2,\); it must be one number": lambda r: np.ones(2),
+    r"the reward has shape \(2,\); it must be one number, which a gymnasium.RewardWrapper can make of": lambda r: (
+        np.ones(2)
+    ),
     r"the reward has shape \(0,\); it must be one number": lambda r: [],
     r"the reward has shape \(2, 1\); it must be one number": lambda r: torch.ones(2, 1),
     "the reward is '1'; it must be one number": str,
