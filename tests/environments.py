@@ -20,6 +20,10 @@ ROOT = Path(__file__).parents[1]
 DOCUMENT = ROOT / "docs" / "environments.md"
 RESULTS = ROOT / "tests" / "environment_results.json"
 
+TILES = {"num_rows": 4, "num_cols": 4, "num_colours": 3, "num_moves": 10} | dict.fromkeys(
+    ("colourless_specials", "colour_specials"), ()
+)
+
 TRIED: dict[str, tuple[str, dict[str, Any]]] = {
     "FrozenLake-v1": ("gymnasium", {}),
     "Taxi-v4": ("gymnasium", {}),
@@ -32,6 +36,27 @@ TRIED: dict[str, tuple[str, dict[str, Any]]] = {
     "tetris_gymnasium.envs:tetris_gymnasium/Tetris": ("tetris-gymnasium", {"depth": 1}),
     "flappy_bird_gymnasium:FlappyBird-v0": ("flappy-bird-gymnasium", {"depth": 1}),
     "gym_anytrading:stocks-v0": ("gym-anytrading", {"depth": 1}),
+    "popgym:popgym-HigherLowerEasy-v0": ("popgym", {"depth": 1}),
+    "popgym:popgym-MineSweeperEasy-v0": ("popgym", {"depth": 1}),
+    "minatar.gym:BaseEnv": ("minatar", {"depth": 1, "env_kwargs": {"game": "breakout"}}),
+    "kraken_crossing:KrakenCrossing-v0": ("kraken-crossing", {"depth": 1}),
+    "gym_classics.envs.dyna_maze:DynaMaze": ("gym-classics", {"depth": 1}),
+    "gym_classics.envs.jacks_car_rental:JacksCarRental": ("gym-classics", {"depth": 1}),
+    "numberlink:NumberLinkRGB-v0": ("numberlink", {"depth": 0}),
+    "pgtg:pgtg-v5": ("pgtg", {"depth": 1}),
+    "tile_match_gym:TileMatch-v0": ("tile-match-gym", {"depth": 0, "env_kwargs": TILES}),
+    "connect_four_gymnasium:ConnectFourEnv": ("gymnasium-connect-four", {"depth": 1}),
+    "gymnasium_cartpole_swingup:CartPoleSwingUp-v0": (
+        "gymnasium-cartpole-swingup",
+        {"depth": 0, "policy": "gaussian"},
+    ),
+    "gymnasium_robotics:PointMaze_UMaze-v3": ("gymnasium-robotics", {"depth": 0, "policy": "gaussian"}),
+    "panda_gym:PandaReach-v3": ("panda-gym", {"depth": 0, "policy": "gaussian"}),
+    "space_mining:SpaceMining": ("space-mining", {"depth": 0, "policy": "gaussian"}),
+    "gym_sailing:SailboatDiscrete-v0": ("gym-sailing", {"depth": 1}),
+    "gymnasium_snake_game:Snake-v1": ("gymnasium-snake-game", {"depth": 1}),
+    "pickomino_env:Pickomino-v0": ("pickomino-env", {"depth": 1}),
+    "minihack:MiniHack-Room-5x5-v0": ("minihack", {"depth": 1, "observation_keys": ["chars_crop"]}),
 }
 """By id: the package, and the arguments of `PGTS`."""
 
@@ -66,7 +91,7 @@ def tried(name: str) -> dict[str, Any]:
         try:
             training = PGTS(env, **arguments)
         except MissingModel as missing:
-            why = str(missing).partition(";")[0]
+            why = str(missing).rpartition("are not enough: ")[2].partition(";")[0]
             arguments |= {"depth": 0, "estimator": "sampled"}
             training = PGTS(env, **arguments)
         training.iterate()
