@@ -30,6 +30,8 @@ def import_modules(env_id: str) -> None:
         except ModuleNotFoundError as error:
             why = f"needs {module}: pip install 'pgts_torch[{extra}]'" if extra else f"cannot be made: {error}"
             raise PgtsError(f"{env_id} {why}") from error
+        except BaseException as error:
+            raise failure(f"{env_id} cannot be made, for importing {module} fails", error) from error
 
 
 def maker_named(env_id: str) -> Callable[..., gymnasium.Env] | None:

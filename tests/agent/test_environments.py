@@ -126,6 +126,11 @@ def test_an_id_that_names_its_module_is_imported_from_there(tmp_path, monkeypatc
     assert PGTS.load(tmp_path / "model.pt", trust_imports=True).num_env_steps == 10
     with pytest.raises(PgtsError, match="nothing_of_mine:Field-v0 cannot be made: No module named"):
         PGTS("nothing_of_mine:Field-v0")
+    (tmp_path / "broken_of_mine.py").write_text("import gymnasium\nclass Field(Env): pass")
+    with pytest.raises(
+        PgtsError, match="Field cannot be made, for importing broken_of_mine fails: NameError: name 'Env'"
+    ):
+        PGTS("broken_of_mine:Field")
     with pytest.raises(PgtsError, match=r"doesn't exist\. MODULE:Meadow-v0 imports the module that registers it$"):
         PGTS("Meadow-v0")
     with pytest.raises(
