@@ -67,12 +67,13 @@ class Retraced(gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """That of the environment inside."""
         taken = int(action) if isinstance(self.action_space, spaces.Discrete) else np.array(action)
-        before = self._generator()
+        before, path = self._generator(), self._path
+        self._path = b""  # unknown, should the step fail
         step = self._env.step(taken)
         after = self._generator()
         # What is drawn in an episode that goes on by itself follows from its beginning.
         goes_on = before in (after, self._left)
-        self._path += pickle.dumps((taken, None if goes_on else before), 5)
+        self._path = path + pickle.dumps((taken, None if goes_on else before), 5)
         if after != before:
             self._left = after
         return step
@@ -83,9 +84,10 @@ class Retraced(gymnasium.Env[Any, Any]):
 
     def set_state(self, state: bytes) -> None:
         """Go there, from the present state where it lies on the way; the generator stays as it is."""
-        generator, file = self._generator(), io.BytesIO(state)
-        if self._path and state.startswith(self._path):
-            file.seek(len(self._path))
+        generator, file, here = self._generator(), io.BytesIO(state), self._path
+        self._path = b""
+        if here and state.startswith(here):
+            file.seek(len(here))
             self._draw_from(self._left)
         else:
             seed, before, options = pickle.load(file)

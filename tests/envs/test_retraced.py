@@ -121,6 +121,25 @@ def test_a_state_on_the_way_is_not_begun_from_a_reset():
     assert env.retraced == 4
 
 
+def test_after_a_step_that_failed_nothing_of_it_is_left():
+    env = Retraced(Drift())
+    env.reset(seed=0)
+    states = [env.get_state()]
+    for _ in range(2):
+        walk(env, [1])
+        states.append(env.get_state())
+    position = env._env.position
+    for fails in (lambda: env.step(1), lambda: env.set_state(states[2])):
+        env.set_state(states[1])
+        moved = env._env.step
+        env._env.step = lambda action, moved=moved: (moved(action), 1 / 0)  # halfway
+        with pytest.raises(ZeroDivisionError):
+            fails()
+        env._env.step = moved
+        env.set_state(states[2])
+        assert env._env.position == position
+
+
 def test_what_an_episode_draws_by_itself_takes_no_room():
     env = Retraced(Drift())
     env.reset(seed=0)
