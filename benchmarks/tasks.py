@@ -50,7 +50,7 @@ TASKS = {
     "acrobot": Task(-100, 100_000, 20),
     "mountain_car": Task(-115, 120_000, 20),
     "door_key": Task(0.9, 100_000, 20),
-    "lunar_lander": Task(200, 100_000, 20, first_look=5_000),
+    "lunar_lander": Task(100, 100_000, 20, first_look=5_000),
 }
 
 
