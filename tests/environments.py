@@ -40,8 +40,6 @@ TRIED: dict[str, tuple[str, dict[str, Any]]] = {
     "popgym:popgym-MineSweeperEasy-v0": ("popgym", {"depth": 1}),
     "minatar.gym:BaseEnv": ("minatar", {"depth": 1, "env_kwargs": {"game": "breakout"}}),
     "kraken_crossing:KrakenCrossing-v0": ("kraken-crossing", {"depth": 1}),
-    "gym_classics.envs.dyna_maze:DynaMaze": ("gym-classics", {"depth": 1}),
-    "gym_classics.envs.jacks_car_rental:JacksCarRental": ("gym-classics", {"depth": 1}),
     "numberlink:NumberLinkRGB-v0": ("numberlink", {"depth": 0}),
     "pgtg:pgtg-v5": ("pgtg", {"depth": 1}),
     "tile_match_gym:TileMatch-v0": ("tile-match-gym", {"depth": 0, "env_kwargs": TILES}),
