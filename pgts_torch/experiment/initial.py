@@ -14,6 +14,7 @@ import torch
 from gymnasium import spaces
 
 from pgts_torch import files
+from pgts_torch.agent.components import inputs
 from pgts_torch.agent.observations import fit_keys
 from pgts_torch.agent.pgts import PGTS
 from pgts_torch.agent.rollout import Rollout
@@ -287,6 +288,9 @@ def _shown(algorithm: PGTS) -> str:
     space = algorithm.world.observation_space
     if isinstance(algorithm.world, TabularWorld):
         return "numbered states"
+    if isinstance(space, spaces.Tuple):
+        seen = inputs(space)  # without the legal actions
+        space = seen[0] if len(seen) == 1 else spaces.Tuple(seen)
     if isinstance(space, spaces.Box):
         kind = {1: "vectors", 3: "images"}.get(len(space.shape), "arrays")
         return f"{kind} of {' x '.join(map(str, space.shape))}"
