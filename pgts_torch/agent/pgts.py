@@ -26,6 +26,7 @@ from pgts_torch.agent.rollout import Rollout
 from pgts_torch.agent.trained import Trained
 from pgts_torch.agent.updates import Update
 from pgts_torch.agent.visit import visit
+from pgts_torch.agent.worlds import TabularWorld
 from pgts_torch.errors import PgtsError, check_count
 from pgts_torch.models.base import Model
 from pgts_torch.models.environments import Given
@@ -146,7 +147,13 @@ class PGTS(Trained):
         depth = self.options.search.depth
         levels = depth + (self.critic.target == "v") if isinstance(depth, int) else None
         self.pricing = Pricing(
-            self.options, self.search, self.dyna, levels=levels, calls=lambda: parts.model_calls, ranks=self.ranks
+            self.options,
+            self.search,
+            self.dyna,
+            levels=levels,
+            calls=lambda: parts.model_calls,
+            has_table=isinstance(self.world, TabularWorld),
+            ranks=self.ranks,
         )
         self._arguments = arguments | {"env": self.source.description, "device": str(self.device)}
         self._act = Acting(self.world, self.source)

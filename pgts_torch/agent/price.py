@@ -25,7 +25,7 @@ PATIENCE = 3.0
 """What the episodes of an iteration will take is foreseen after so many seconds."""
 
 SHORT = 1.0
-"""What an iteration costs that takes fewer seconds is not said."""
+"""What an iteration costs that takes fewer seconds is not said of tables, which are read without model calls."""
 
 _AIM = 10.0
 """So many seconds an iteration are to take with the numbers that are named."""
@@ -69,6 +69,7 @@ class Pricing:
         dyna: makes several updates of an iteration; None: there is one.
         levels: how many levels the deepest search of an update expands; None: that depends.
         calls: returns the number of model calls so far in this process.
+        has_table: whether the model is a table, given or counted.
         ranks: the processes that train together; the first one speaks, and takes the others to be alike.
     """
 
@@ -80,10 +81,11 @@ class Pricing:
         *,
         levels: int | None,
         calls: Callable[[], int],
+        has_table: bool,
         ranks: Ranks,
     ) -> None:
         self._options, self._search, self._dyna, self._calls, self._ranks = options, search, dyna, calls, ranks
-        self._levels, self._iterations, self._updates = levels, 0, 0
+        self._levels, self._has_table, self._iterations, self._updates = levels, has_table, 0, 0
         self._calls_before, self._seconds_before = 0, 0.0
         self.looking, self._begun, self._has_told = 0.0, 0.0, False
         self.price: Price | None = None
@@ -131,7 +133,7 @@ class Pricing:
             section = self._options.search
             picked = isinstance(section, AutoSection) and section.max_calls is not None
             self.price = Price(model_calls, self.meter.seconds, search=str(self._search) * picked)
-            if self.price.seconds > SHORT:
+            if self.price.seconds > SHORT or not self._has_table:
                 self.say()
         self.meter = self._search.meter = None
 

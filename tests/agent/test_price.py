@@ -227,13 +227,15 @@ def _described(search: Any) -> dict[str, Any]:
     return {"type": search} if isinstance(search, str) else search
 
 
-@pytest.mark.parametrize(("seconds", "said"), [(0.9, 0), (1.1, 1)])
-def test_an_iteration_is_priced_by_the_second_one_and_that_is_said_where_it_takes_more_than_a_second(
-    seconds, said, capsys, monkeypatch
+@pytest.mark.parametrize(
+    ("env", "seconds", "said"), [("pgts/Ladder-v0", 0.9, 0), ("pgts/Ladder-v0", 1.1, 1), ("CartPole-v1", 0.1, 1)]
+)
+def test_an_iteration_is_priced_by_the_second_one_and_that_is_said_once_of_tables_where_it_takes_more_than_a_second(
+    env, seconds, said, capsys, monkeypatch
 ):
     times = itertools.count(0, seconds / 2)  # read when an iteration begins, when an update does, and at its end
     monkeypatch.setattr(price, "Meter", functools.partial(Meter, clock=lambda: next(times), patience=100))
-    model = PGTS("pgts/Ladder-v0")
+    model = PGTS(env, num_envs=2)
     model.iterate()
     assert model.pricing.price is None
     second = model.iterate()
