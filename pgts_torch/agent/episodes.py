@@ -13,6 +13,7 @@ from pgts_torch.models.masks import KEY, ActionMasks, Masked
 from pgts_torch.models.snapshots import each_of, env_name
 from pgts_torch.models.steps import (
     check_discounts,
+    check_info,
     check_observation,
     check_rewards,
     discount_of,
@@ -71,6 +72,8 @@ class Episodes:
         self._observation, info = self._env.reset(seed=self._seeds)  # type: ignore[arg-type]  # or one seed for all
         if self._one_by_one:
             self._each = list(iterate(self._env.observation_space, self._observation))
+            for b in range(self._env.num_envs):
+                self._check_actions(b)
         if self._masks is not None:
             self._legal_BA = self._read_masks(info, np.ones(self._env.num_envs, dtype=bool))
 
@@ -90,6 +93,7 @@ class Episodes:
         for b in over_B.nonzero()[0]:
             self._stepping = int(b)
             self._each[b], info = self._env.envs[b].reset(seed=seeds[b])
+            self._check_actions(int(b))
             if self._masks is not None:
                 self._legal_BA[b] = self._masks.of(self._env.envs[b], self._each[b], info)
         self._stepping = None
@@ -156,6 +160,7 @@ class Episodes:
         for b in alive_B.nonzero()[0]:
             self._stepping = int(b)
             self._each[b], reward, terminated, truncated_B[b], info = envs[b].step(action_B[b])
+            check_info(info)
             if masks is not None:
                 self._legal_BA[b] = masks.after(envs[b], self._each[b], info, terminated, truncated_B[b])
             elif self._unmasked and KEY in info:
@@ -171,6 +176,17 @@ class Episodes:
         space = self._env.single_observation_space
         rows: Any = create_empty_array(space, n=len(self._each))
         self._observation = concatenate(space, self._each, rows)
+
+    def _check_actions(self, b: int) -> None:
+        """PgtsError if a reset has changed the action space of an environment."""
+        assert isinstance(self._env, SyncVectorEnv)
+        space, known = self._env.envs[b].action_space, self._env.single_action_space
+        if space is not known and space != known:
+            self._stepping = b
+            raise PgtsError(
+                f"its actions are {space} after a reset, and were {known}: they must be the same in all episodes; "
+                "action masks say which of them are legal"
+            )
 
     def _refuse_masks(self) -> None:
         raise PgtsError(

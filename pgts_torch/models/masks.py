@@ -267,6 +267,8 @@ def masks_of(env: VectorEnv, make: Callable[[], gymnasium.Env] | None) -> Action
     if isinstance(base, TabularVectorEnv | CartPoles) or not isinstance(space, spaces.Discrete):
         return None
     info = {} if has_method(env) else (env if make is None else make()).reset(seed=0)[1]
+    if not isinstance(info, Mapping):
+        raise PgtsError(f"{env_name(env)} returns an info that is {info!r} in reset; it must be a dictionary")
     if (source := _source(env, env.single_observation_space, info)) is None:
         return None
     if isinstance(base, SyncVectorEnv):

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from torch import Tensor, float64
 
-from pgts_torch.errors import NotFinite, PgtsError
+from pgts_torch.errors import Failed, NotFinite, PgtsError
 
 LARGEST_REWARD = float(np.finfo(np.float64).max) ** (1 / 3)
 """The largest size of a reward that is learned from: means of squares of returns stay numbers."""
@@ -88,6 +88,12 @@ def check_rewards(reward: float | np.ndarray) -> None:
     if isinstance(reward, float):
         raise NotFinite(f"the reward is {reward}", what="reward")
     raise NotFinite(f"the rewards are {reward.tolist()}; they must be finite", what="reward")
+
+
+def check_info(info: Any) -> None:
+    """Failed unless what a reset or a step says besides is a dictionary."""
+    if not isinstance(info, Mapping):
+        raise Failed(f"info is {info!r}; reset and step must return a dictionary, which may be empty")
 
 
 def names_discounts(env: Any) -> bool:

@@ -15,7 +15,7 @@ from jaxtyping import Bool
 from pgts_torch.errors import Failed, ModelMismatch, PgtsError, text_of
 from pgts_torch.models.exact_model import CONTRADICTED, ExactModel, Happened
 from pgts_torch.models.masks import ActionMasks, masks_in
-from pgts_torch.models.steps import discount_of, names_discounts, number_of
+from pgts_torch.models.steps import check_info, discount_of, names_discounts, number_of
 
 SECONDS = 0.3
 """After these a random walk ends in a slow environment."""
@@ -65,6 +65,7 @@ def step(env: gymnasium.Env, action: Any) -> Taken:
     """Take an action; Failed if the environment raises, or returns something else than five values."""
     with environment_code():
         observation, reward, terminated, truncated, info = env.step(action)
+        check_info(info)
         return Taken(action, observation, reward, bool(terminated), bool(truncated), dict(info))
 
 

@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 
 from pgts_torch import PGTS, EvalCallback
-from pgts_torch.errors import MissingModel, PgtsError
+from pgts_torch.errors import Failed, MissingModel, PgtsError
 from pgts_torch.seeding import seed_sequence
 
 pytestmark = pytest.mark.usefixtures("unchecked_shapes")
@@ -75,6 +75,20 @@ class Terse(Clock):
         return self.shown(), 1.0, False
 
 
+class Silent(Clock):
+    def fourth(self):
+        return self.shown(), 1.0, False, False, None
+
+
+class Changing(Clock):
+    """It has as many actions as its seed says."""
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            self.action_space = spaces.Discrete(2 + seed % 3)
+        return super().reset(seed=seed)
+
+
 class Unborn(Clock):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -107,6 +121,7 @@ FAILURES = {
     Longer: r"in step 3 .* the observation has shape \(3,\); \(2,\) is declared",
     Shorter: r"in step 3 .* the observation has shape \(1,\); \(2,\) is declared",
     Worthless: "in step 3 .* the reward is nan",
+    Silent: "in step 3 .* info is None; reset and step must return a dictionary",
     Terse: "in step 3 .* not enough values to unpack",
     Unborn: r"at the start .* the observation is \[nan, nan\]; it must be finite",
     Misborn: "at the start .* Output array is the wrong shape",
@@ -193,6 +208,19 @@ def test_an_environment_without_a_model_is_refused_where_a_lookahead_needs_one_a
     with pytest.raises(MissingModel, match=r"or take depth 0 and the estimator 'sampled', which need no model"):
         make(Unknown, depth=0, estimator="lookahead")
     assert make(Unknown).iterate().model_calls == 0
+
+
+def test_actions_that_a_reset_changes_are_refused_and_so_is_a_reset_without_info():
+    message = r"Changing failed .* the seed \d+: its actions are Discrete\(\d\) after a reset, and were Discrete\(2\)"
+    with pytest.raises(Failed, match=message):
+        make(Changing, num_envs=8).learn(200)
+
+    class Bare(Clock):
+        def reset(self, *, seed=None, options=None):
+            return super().reset(seed=seed)[0], None
+
+    with pytest.raises(PgtsError, match="Bare returns an info that is None in reset; it must be a dictionary"):
+        make(Bare)
 
 
 @pytest.mark.parametrize("callback", [3, [3], "evaluate", {"every": 3}])
