@@ -1,7 +1,5 @@
 """Algorithm 1 from rollouts: what one iteration does, and what a training leaves untouched."""
 
-import random
-
 import gymnasium
 import numpy as np
 import pytest
@@ -17,6 +15,7 @@ from pgts_torch.seeding import stream
 from pgts_torch.tabular import exact, grid, ladder
 from pgts_torch.tabular.ascent import projected_step
 from tests.agent.helpers import same_bits, vector_env
+from tests.models.corridors import Dice
 from tests.support import right_with
 
 
@@ -277,7 +276,7 @@ def test_an_environment_without_a_model_is_refused_with_what_is_missing():
 
         def reset(self, *, seed=None, options=None):
             super().reset(seed=seed)
-            self.dice = random.Random(0)  # a generator that is not np_random
+            self.dice = Dice(0)  # a generator of a class of its own
             return 0, {}
 
         def step(self, action):
