@@ -30,6 +30,7 @@ TRIED: dict[str, tuple[str, dict[str, Any]]] = {
     "Blackjack-v1": ("gymnasium", {"depth": 1}),
     "Blackjack-v1, counted": ("gymnasium", {"model": "counts"}),
     "MiniGrid-Empty-5x5-v0": ("minigrid", {"depth": 1, "observation_keys": ["image", "direction"]}),
+    "retraced/Env-v0, Box2D": ("gymnasium", {"depth": 0, "max_roots": 16, "env_kwargs": {"env": "LunarLander-v3"}}),
     "highway_env:highway-v0": ("highway-env", {"depth": 1}),
     "gym_simplegrid:SimpleGrid-4x4-v0": ("gym-simplegrid", {"depth": 1}),
     "gymnasium_2048:gymnasium_2048/TwentyFortyEight-v0": ("gymnasium-2048", {"depth": 1}),
