@@ -11,6 +11,7 @@ from gymnasium.core import RenderFrame
 from gymnasium.wrappers import TimeLimit
 
 from pgts_torch.errors import PgtsError
+from pgts_torch.trust import import_named
 
 
 @final
@@ -117,14 +118,24 @@ class Retraced(gymnasium.Env[Any, Any]):
             self.np_random.bit_generator.state = state
 
 
-def retraced(env: str, render_mode: str | None = None, **kwargs: Any) -> gymnasium.Env:
+def retraced(env: str = "", render_mode: str | None = None, **kwargs: Any) -> gymnasium.Env:
     """`Retraced`, of a registered environment; its time limit stays outside.
 
     Args:
-        env: its id.
+        env: its id; MODULE:ID imports the module first.
         kwargs: its arguments.
+
+    Raises:
+        PgtsError: no id is given.
     """
-    limit = gymnasium.spec(env).max_episode_steps
-    inside = gymnasium.make(env, render_mode=render_mode, max_episode_steps=-1, disable_env_checker=True, **kwargs)
+    if not env:
+        raise PgtsError("retraced/Env-v0 needs the id of an environment: --env.kwargs.env LunarLander-v3, for instance")
+    module, colon, id = env.rpartition(":")
+    if colon:
+        import_named(module)
+    options: dict[str, Any] = {"max_episode_steps": -1, "disable_env_checker": True, "render_mode": render_mode}
+    inside = gymnasium.make(id, **options, **kwargs)
+    assert inside.spec is not None
+    limit = gymnasium.spec(inside.spec.id).max_episode_steps
     whole: gymnasium.Env = Retraced(inside)
     return whole if limit is None else TimeLimit(whole, limit)

@@ -181,7 +181,23 @@ def test_a_registered_environment_keeps_its_time_limit_outside():
     assert [short.step(0)[3] for _ in range(2)] == [False, True]
 
 
+def test_a_module_of_the_user_registers_what_is_retraced(tmp_path, monkeypatch):
+    (tmp_path / "drifts_of_mine.py").write_text(
+        "import gymnasium\nfrom gymnasium.envs.classic_control import CartPoleEnv\n"
+        "gymnasium.register('Mine-v3', CartPoleEnv, max_episode_steps=7)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    model = PGTS("retraced/Env-v0", env_kwargs={"env": "drifts_of_mine:Mine-v3"}, depth=0)
+    made = model.source.make_one()
+    made.reset(seed=0)
+    assert [made.step(step % 2)[3] for step in range(7)] == [False] * 6 + [True]
+    made.close()
+    model.close()
+
+
 def test_what_cannot_be_retraced_is_refused():
+    with pytest.raises(PgtsError, match=r"needs the id of an environment: --env\.kwargs\.env LunarLander-v3"):
+        PGTS("retraced/Env-v0", depth=0)
     with pytest.raises(PgtsError, match=r"takes a gymnasium\.Env, not type"):
         Retraced(Drift)
     env = Drift()
