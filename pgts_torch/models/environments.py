@@ -219,12 +219,13 @@ class EnvSource:
     def time_limit(self) -> int | None:
         """The most steps of an episode, as registered or by a TimeLimit around the environment; None: no limit."""
         spec, limits = self.spec, list[int]()
-        if spec is None and self.makers:
+        if (spec is None or spec.max_episode_steps is None) and self.makers:
             with closing_made(self.make_one) as make:
                 env = make() if self.given is None else each_of(self.given)[0]
                 spec = env.spec
                 limits = [each._max_episode_steps for each in wrappers_of(env) if isinstance(each, TimeLimit)]
-        limit = min(limits, default=None) if spec is None else spec.max_episode_steps
+        registered = spec.max_episode_steps if spec is not None else None
+        limit = min(limits, default=None) if registered is None else registered
         return limit if limit is not None and limit > 0 else None
 
     def _check_new(self, env: gymnasium.Env) -> None:

@@ -188,10 +188,7 @@ def test_a_module_of_the_user_registers_what_is_retraced(tmp_path, monkeypatch):
     )
     monkeypatch.chdir(tmp_path)
     model = PGTS("retraced/Env-v0", env_kwargs={"env": "drifts_of_mine:Mine-v3"}, depth=0)
-    made = model.source.make_one()
-    made.reset(seed=0)
-    assert [made.step(step % 2)[3] for step in range(7)] == [False] * 6 + [True]
-    made.close()
+    assert model.source.time_limit == 7
     model.close()
 
 
